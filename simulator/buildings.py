@@ -147,7 +147,7 @@ def _span(flat: Opening, walls: Array) -> tuple[float, float]:
 
 
 def _across(flat: Opening, wall: Array, along: float) -> float:
-    """Measure how far to the left a wall lies, `along` metres along it from the door's middle."""
+    """Measure how far left of a door's axis a wall is, `along` metres from the door's middle."""
     ends = flat.frame(wall.reshape(2, 2))
     return float(np.interp(along, *ends[np.argsort(ends[:, 0])].T))
 

@@ -107,7 +107,7 @@ class Stays:
     def _pass(self, visit: Visit) -> None:
         """Keep one of successive visits that overlap and are too close for two places.
 
-        The visit with the largest support times radius is kept.
+        The visit with the largest product of support (number of scans) and radius is kept.
         """
         last = self._passing
         near = last is not None and are_near(last, visit)

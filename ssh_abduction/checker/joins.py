@@ -1,6 +1,6 @@
 """Find the joins of a map that rest on minimality alone: no axiom and no observation forces them.
 
-A join is two steps that a map has at one place or at one dstate.
+A join is two steps that a map puts at one place or at one dstate.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> from ssh_abduction.data.trace import Trace
@@ -37,7 +37,7 @@ SHOWN = 5  # a sentence names at most this many joins of a kind
 
 @dataclass(frozen=True, slots=True)
 class Join:
-    """Two steps that a map has at one place or at one dstate, though no axiom forces this.
+    """Two steps that a map puts at one place or at one dstate, though no axiom forces this.
 
     Attributes:
         first: The earlier step.

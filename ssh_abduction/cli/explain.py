@@ -62,7 +62,7 @@ def add_parser(verbs: Verbs) -> None:
         "as p7, and perhaps a path such as path2, say on which side of the path the place lies, "
         "and which turn shows it.",
         "Exit codes: 0 explained; 20 the trace has no map; 30 no explanation in time; 1, 2, 130 "
-        "and 143 as for the other verbs.",
+        "and 143 as for the other commands.",
     )
     parser.add(
         "trace",

@@ -46,7 +46,7 @@ def add_parser(verbs: Verbs) -> None:
         "Find the fewest actions, from where the robot is now, after which two maps predict "
         "different views. If there are more than two maps, find a plan: which actions come next "
         "depends on what the robot sees. If known links cannot distinguish the maps, find the "
-        "untried action that distinguishes most of the maps, and the way to this action.",
+        "untried action that distinguishes as many of the maps as possible, and the way to it.",
         "The plan for two maps is as short as possible. The plan for more maps is greedy, "
         "because finding the best one is PSPACE-complete (Lee & Yannakakis 1994). Exit codes: "
         "0 done; 10 a limit ended the search, and a better plan may exist; 30 no plan in "

@@ -84,7 +84,7 @@ class UnderWay:
         self.interrupted = False
 
     def interrupt(self) -> None:
-        """End the current search soon, with its best answer so far, and all later ones."""
+        """End the current search soon, with its best answer so far. End later searches, too."""
         self.interrupted = True
         if self.search is not None:
             self.search.interrupt()

@@ -183,7 +183,7 @@ def evaluate_visits(
 ) -> VisitsEvaluation:
     """Measure the accuracy of maps of a trace by true poses, or by relations.
 
-    Pairs of visits that a map has at one place, and pairs of steps that it has at one dstate, are
+    Pairs of visits that a map puts at one place, and pairs of steps that it has at one dstate, are
     compared with the truth.
 
     Args:

@@ -3,7 +3,7 @@
     see  ->  minimal maps of all that was seen  ->  next experiment  ->  do its actions  ->  see …
 
 A dstate (distinctive state) is a place and the direction that the robot faces there. A *return* is
-two steps that a map has at one place or dstate. `OnlineMapper` keeps the minimal maps of the steps
+two steps that a map puts at one place or dstate. `OnlineMapper` keeps the minimal maps of the steps
 so far.
 
 The explorer looks for a new experiment when the last one is done, when clingo has searched again,

@@ -216,7 +216,7 @@ class IncrementalSolver:
         self._next_search = 0  # no search before the trace has this many steps
 
     def is_due(self, trace: Trace) -> bool:
-        """Whether the trace has grown enough since a search that ran out of time."""
+        """Whether the trace has grown enough to search again, after a search ran out of time."""
         return len(trace) >= self._next_search
 
     def make_due(self) -> None:

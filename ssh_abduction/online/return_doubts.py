@@ -1,6 +1,6 @@
 """Doubt the returns of a map: is the robot really back at the place that the map says?
 
-A return is two steps that a map has at one place or dstate.
+A return is two steps that a map puts at one place or dstate.
 """
 
 from __future__ import annotations

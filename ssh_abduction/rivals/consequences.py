@@ -179,7 +179,7 @@ def _is_four(seen: Seen) -> bool:
 
 
 def is_possible(action: Action, seen: Seen) -> bool:
-    """Tell whether the star that is seen allows an action. Without a star, any action is allowed.
+    """Tell whether a star (the openings seen at a place) allows an action; None allows any.
 
     A travel needs an opening ahead. A turn to a numbered gateway needs that gateway.
     """

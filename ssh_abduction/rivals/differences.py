@@ -197,8 +197,8 @@ def difference(
     named = all_instances("drives", drives, Drive, MapError, mend="take those of a solution")
     if named and named[-1].stop != len(first.dstate_at):
         raise MapError(
-            f"drives: expected drives of {len(first.dstate_at)} steps, as the maps have, got "
-            f"{named[-1].stop}; take those of the solution"
+            f"drives: expected drives of {len(first.dstate_at)} steps in all, as the maps have, "
+            f"got {named[-1].stop}; use the drives of the solution"
         )
     table = Table([first, other], named)
     changes: list[Change] = []

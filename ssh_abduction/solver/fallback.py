@@ -131,7 +131,7 @@ def salvage(parts: Parts) -> None:
 
 
 def best_map(parts: Parts) -> Iterator[Priced]:
-    """Yield the best map known with its cost, after a check, if no map was given so far."""
+    """If no map was yielded yet, check the best known map and yield it with its cost."""
     known, watch = parts.known, parts.watch
     watch.start()
     if known.status in (Status.FEASIBLE, Status.OPTIMAL) and not known.count and known.best:

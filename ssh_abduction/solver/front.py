@@ -136,8 +136,8 @@ def fault_front(
     if theory.rules or theory.without or theory.prefer not in (("dstates",), ("auto",)):
         raise TheoryError(
             "theory: expected the causal axioms alone, fewest dstates first, to find the front "
-            "(the fewest dstates for each number of faults); leave out rules, --set without and "
-            "--set prefer"
+            "(the fewest dstates for each number of faults); leave out the rules and the settings "
+            "without and prefer"
         )
     if not is_whole(most) or not 0 <= most <= 1000:
         raise TheoryError(

@@ -142,7 +142,7 @@ class Prefixes:
         return first_accepted(self._minimise_known, why_refused, self._forbid)
 
     def _forbid(self, equalities: frozenset[Equality]) -> None:
-        """Forbid all maps with all these equalities. If need be, go on with a `StepEngine`."""
+        """Forbid all maps with all these equalities, with a `StepEngine` if this engine cannot."""
         if self._forbid_in_engine(equalities):
             return
         _log.debug(

@@ -147,7 +147,7 @@ class Stages:
         return True
 
     def _settle_dstates_first(self) -> None:
-        """Go on with an engine that finds dstates first, if there is a map to begin with."""
+        """If a map is known, continue from it with an engine that finds dstates first."""
         parts, best = self._parts, self._parts.known.best
         labels = best.dstate_at if best else ()
         parts.candidates.sketch()

@@ -79,7 +79,7 @@ class Theory:
         displacement: Whether displacements are evidence; auto uses them if the trace has any.
         reject: Significance level: the largest probability of rejecting the true map because of
             its displacements.
-        joint: How many returns (two steps that a map has at one place or dstate) are tested
+        joint: How many returns (two steps that a map puts at one place or dstate) are tested
             together. 1: each return alone. 2: also pairs of returns.
         returns: Number of possible returns. Each return is tested at the significance level
             `reject` divided by this number. 0 counts the possible returns of the trace.

@@ -125,7 +125,7 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
             ):
                 raise TheoryError(
                     f"{where}: {atom}: expected {_counted(numbers[name])}, "
-                    f"got {len(atom.arguments)}; write that many"
+                    f"got {len(atom.arguments)}; write as many as expected"
                 )
             if (
                 name in of_steps

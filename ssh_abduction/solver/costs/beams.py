@@ -49,7 +49,7 @@ class Beams:
     def __init__(
         self, parts: Parts, add: Callable[[SSHMap], float], keep_best: Callable[[], None]
     ) -> None:
-        """Prepare the search by beams.
+        """Prepare the beam searches.
 
         `add` computes the cost of a map in nats, and keeps the map if the cost is small.
         `keep_best` makes the cheapest known map the best map of the search.

@@ -1,6 +1,6 @@
 """The misfit of a map to the displacements, and small sets of returns that cause a misfit.
 
-A *return* is two steps that a map has at one place or dstate. Two steps at one dstate have one
+A *return* is two steps that a map puts at one place or dstate. Two steps at one dstate have one
 pose, and two steps at one place have one position. The misfit of a set of returns is the least
 chi-square of the displacements and closures that these allow (`solver/geometry/fit.py`). More
 returns leave less freedom. So a set of returns never has a smaller misfit than a part of the set,

@@ -108,7 +108,8 @@ class Weighing:
     Attributes:
         candidates: The maps found that cost little more than the best one, the best one first.
         bound: A proven lower bound on the cost of every map, in nats.
-        proven: Whether it is proven that the best map is the best and all its rivals are found.
+        proven: Whether it is proven that no map costs less than the best one, and that all its
+            rivals are found.
     """
 
     def __init__(self, parts: Parts) -> None:

@@ -47,7 +47,7 @@ class Doubts:
     def answer(
         self, doubts: Collection[Doubt], read: Callable[[clingo.Model], Answer], mode: str
     ) -> Answer | None:
-        """Return the value that `read` makes of an answer in which a doubt holds; None without."""
+        """Return what `read` makes of an answer that confirms a doubt; None if none does."""
         if not doubts:
             return None
         rules: list[str] = []

@@ -132,7 +132,7 @@ class FaultyEngine:
                 return
 
     def _bound_by_blocks(self) -> None:
-        """Raise the lower bound of a long trace by its blocks (`engines/blocks.py`)."""
+        """Raise the lower bound of a long trace by its short parts (`engines/blocks.py`)."""
         if self.size >= LONG and self._known is not None and self._most_faults is None:
             faults = {
                 kind: [fault.step for fault in self._known.faults if fault.kind == kind]

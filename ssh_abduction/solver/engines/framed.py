@@ -182,7 +182,7 @@ class FramedEngine:
         return self._all_with_paths(cost[0])
 
     def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[NodeLabels]:
-        """Yield all labels that paths fit and that have this many dstates, except `besides`."""
+        """Yield all labels with this many dstates for which there are paths, except `besides`."""
         known: set[Hashable] = {tuple(besides)}
         fitted: dict[tuple[int, ...], Fitted] = {}
 

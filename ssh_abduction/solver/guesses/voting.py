@@ -103,7 +103,7 @@ class Merging:
         self._misfits = self._misfitting(pairs)
 
     def start_from(self, places: Sequence[tuple[int, int] | None]) -> None:
-        """Merge the visits that a map has at one place, given the place and direction of steps."""
+        """Merge the visits that a map puts at one place, given the place and direction of steps."""
         first: dict[int, _Turned] = {}
         for number, visit in enumerate(self.visits):
             step, _ = visit.steps[0]
@@ -282,9 +282,9 @@ class Merging:
     ) -> list[tuple[int, int, int]]:
         """List the pairs of visits to merge next: one action leads to both from the same slot.
 
-        `mine` are groups that become one place, and `its` further groups that become the same
-        place, with their quarters; `its` are turned by `shift` more. Returns triples (visit, visit,
-        turn), as the arguments of `_gain`.
+        A slot is a direction of a place, in quarter turns. `mine` and `its` map groups of visits
+        to their rotations. All become one place; those of `its` are rotated by `shift` more.
+        Returns triples (visit, visit, turn), as the arguments of `_gain`.
         """
         leads = dict(self._leads(mine, 0))
         return [(leads[key], there, 0) for key, there in self._leads(its, shift) if key in leads]
