@@ -1,7 +1,7 @@
 """Joins that every cheap map has, and a lower bound on the cost of all maps.
 
-A join is two visits that a map puts at one place (without frames, two steps at one dstate). Let F be
-joins that every map of a cost below T has. At first F is empty. Each such map costs at least the
+A join is two visits that a map puts at one place (without frames, two steps at one dstate). Let F
+be joins that every map of a cost below T has. At first F is empty. Each such map costs at least the
 misfit of F plus the prices of its dstates and places. Now take a further join. A map without it
 costs at least the misfit of F plus the prices of the dstates and places that are needed without it.
 If this sum is T or more, then every map of a cost below T has the join, and F gets it. Then the

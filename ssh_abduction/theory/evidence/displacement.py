@@ -1,8 +1,8 @@
 """Displacements as evidence: a dstate has one pose, and a place one position.
 
 A *return* is two steps that a map puts at one place or dstate. For a place, they are the first
-steps of two visits. The displacements between the two steps make a loop. By these displacements, the end
-of the loop is some distance from its beginning, and the covariance says how likely that is
+steps of two visits. The displacements between the two steps make a loop. By these displacements,
+the end of the loop is some distance from its beginning, and the covariance says how likely that is
 (`loops.py`).
 The axiom `one_pose` demands that no set of at most `joint` returns is rejected.
 
