@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from unittest.mock import patch
 
 import pytest
+from fault_cases import left_out
 from instances import maze
 
 from ssh_abduction import Theory, Trace, solve
@@ -45,8 +47,9 @@ def test_mended_sketch_is_a_map_with_faults(kind: str) -> None:
     needed = 0
     for seed in range(4):
         trace, theory = flawed(kind, seed)
-        ssh_map = mended_sketch(trace, settle(trace, theory).theory)
-        assert ssh_map is not None
+        guess = mended_sketch(trace, settle(trace, theory).theory)
+        assert guess is not None
+        ssh_map = guess.map
         assert check(trace, ssh_map, theory) == ()
         needed += len(ssh_map.faults)
         short = solve(trace, theory, time_limit=0.001, max_maps=1)
@@ -57,6 +60,20 @@ def test_mended_sketch_is_a_map_with_faults(kind: str) -> None:
 def test_mended_sketch_uses_only_allowed_faults() -> None:
     trace, theory = flawed("misread", 0)
     assert mended_sketch(trace, settle(trace, theory.replace(misread=0)).theory) is None
+
+
+def test_slip_that_only_places_show_is_mended() -> None:
+    """A step is missing, and the causal theory explains the trace without a fault."""
+    walk = maze(2, 2, steps=70, seed=25, stars=True)
+    trace = left_out(walk, random.Random(25))[0].trace
+    theory = Theory(slipped=1.5)
+    with patch.object(Mending, "_by_sketch", return_value=iter(())):
+        before = solve(trace, theory, max_maps=1)
+    found = solve(trace, theory, max_maps=1)
+    assert before.cost
+    assert found.cost
+    assert found.cost.dstates <= len(set(walk.truth)) < before.cost.dstates
+    assert check(trace, found.maps[0], theory) == ()
 
 
 def test_steps_that_contradict_a_sketch_are_checked_for_a_clash() -> None:

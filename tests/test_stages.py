@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from unittest.mock import patch
 
 import pytest
+from clingo import Symbol
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import maze
@@ -15,11 +16,12 @@ from ssh_abduction import OnlineMapper, SSHMap, Theory, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.solver import choosing, fallback, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
+from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import settle
-from ssh_abduction.theory.speedups import SPEEDUPS
+from ssh_abduction.theory.speedups import ALL, SPEEDUPS
 
 THEORIES = {
     "dstates": Theory.topological(),
@@ -124,3 +126,24 @@ def test_shorten_never_extends_a_limit() -> None:
     unlimited = started()
     unlimited.shorten(50)
     assert unlimited.left() <= 50
+
+
+@pytest.mark.parametrize("has_time", [True, False])
+def test_single_steps_are_grounded_if_time_is_short(has_time: bool) -> None:
+    trace = maze(2, 2, steps=17, seed=0, stars=True).trace
+    watch = Watch()
+    engine = choosing.step_engine(Task.of(settle(trace, Theory.topological()), watch, ALL))
+    parts: list[int] = []
+    ground = engine.asker.control.ground
+
+    def noted(given: Sequence[tuple[str, Sequence[Symbol]]]) -> None:
+        parts.append(sum(name == "step" for name, _ in given))
+        ground(given)
+
+    with (
+        patch.object(watch, "allows", return_value=has_time),
+        patch.object(watch, "check"),
+        patch.object(engine.asker.control, "ground", noted),
+    ):
+        engine.grow(len(trace))
+    assert [steps for steps in parts if steps] == ([8, 8, 2] if has_time else 18 * [1])

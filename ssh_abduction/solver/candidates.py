@@ -229,8 +229,8 @@ class Candidates:
 
     def _offer_mended(self) -> None:
         """Offer a map made without a search. Treat steps that contradict it as wrong."""
-        if ssh_map := mended_sketch(self._task.trace, self._task.theory):
-            self.offer(ssh_map)
+        if guess := mended_sketch(self._task.trace, self._task.theory):
+            self.offer(guess.map)
 
     def frame(self, speedups: Speedups) -> None:
         """Offer maps in which places have frames, although the theory does not demand frames."""

@@ -33,6 +33,7 @@ from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.faulty import FaultyEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver.guesses.mended import mended_sketch
 from ssh_abduction.solver.guesses.outliers import wrong_displacements
 from ssh_abduction.solver.guesses.voting import Merging
 from ssh_abduction.solver.judging import Judging
@@ -95,6 +96,7 @@ class Mending:
                 yield from self._by_missing_displacements(labels, [None] * len(labels))
         for mended in self._by_cheapest_causal_maps():
             yield from self._improving(self._minimal(mended)[0], mended)
+        yield from self._by_sketch()
         yield from self._by_rare_dstates()
 
     def minimal_maps(self, most: int) -> tuple[tuple[SSHMap, ...], bool] | None:
@@ -198,6 +200,16 @@ class Mending:
                 found[mended] = None
                 yield mended
         self._cheapest = list(found) if len(causal) < MOST_CAUSAL else []
+
+    def _by_sketch(self) -> Iterator[Found]:
+        """Yield a better map, with the faults of a sketch (a map that is made without a search).
+
+        The causal theory does not notice a fault that only adds links to its map. Such a fault may
+        still contradict the axioms of places. Then no trace that causal maps mend has a map.
+        """
+        proven = self._best is not None and self._best.cost[0] == self.bound
+        if not proven and (guess := mended_sketch(self._task.trace, self._task.theory)):
+            yield from self._improving(self._minimal(guess.trace)[0], guess.trace)
 
     def _by_rare_dstates(self) -> Iterator[Found]:
         """Yield better maps in which an action slipped shortly before a rarely visited dstate.

@@ -29,6 +29,8 @@ AT_FIRST, FIRST_STEPS = 8, 32
 # Later steps take longer, and clingo cannot be stopped during a call. So a call is for one step if
 # the time left is less than SLOWER times the time for AT_FIRST steps like the last ones.
 SLOWER = 4
+# The first call is for one step, too, if there are more names for paths than this.
+FEW_PATHS = 8
 
 
 class StepEngine:
@@ -75,7 +77,8 @@ class StepEngine:
         with self.asker.grounding_timed():
             while self.size < size:
                 seconds = SLOWER * AT_FIRST * self._last_step[0]
-                many = self.size < FIRST_STEPS and self.asker.watch.allows(seconds)
+                is_short = self.size < FIRST_STEPS if self.size else self.paths <= FEW_PATHS
+                many = is_short and self.asker.watch.allows(seconds)
                 self._ground_steps(min(size, self.size + (AT_FIRST if many else 1)))
             self._let_end_with(size - 1)
             if is_new:

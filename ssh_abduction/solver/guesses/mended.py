@@ -7,9 +7,9 @@ The map is a *sketch*: it is made without a search.
 >>> from ssh_abduction.theory.settle import settle
 >>> trace = Trace.from_steps("abcb", ["travel", "around", "around"])
 >>> theory = settle(trace, Theory(slipped=1.0, boundary="none")).theory
->>> mended_sketch(trace, theory).dstate_at
+>>> mended_sketch(trace, theory).map.dstate_at
 (0, 1, 2, 1)
->>> wrong = mended_sketch(trace.with_views("abcd"), theory)
+>>> wrong = mended_sketch(trace.with_views("abcd"), theory).map
 >>> [(fault.step, fault.kind) for fault in wrong.faults]
 [(2, 'slipped')]
 
@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.maps import SSHMap
@@ -33,7 +34,14 @@ from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.theory.theory import Theory
 
 
-def mended_sketch(trace: Trace, theory: Theory) -> SSHMap | None:
+class MendedSketch(NamedTuple):
+    """A map that was made without a search, and the trace with its faults corrected."""
+
+    map: SSHMap
+    trace: Trace
+
+
+def mended_sketch(trace: Trace, theory: Theory) -> MendedSketch | None:
     """Make a map in which most steps are new dstates, with the faults that it needs.
 
     All views of the trace are known. Returns None if a step contradicts the sketch, and the theory
@@ -49,7 +57,7 @@ def mended_sketch(trace: Trace, theory: Theory) -> SSHMap | None:
             ssh_map = with_faults(sketch.map(), trace, mended, theory)
             better = _without_jump(mended, ssh_map, trace, theory) if theory.jumped else None
             if better is None:
-                return ssh_map
+                return MendedSketch(ssh_map, mended)
         if better is None:
             return None
         mended = better
