@@ -9,11 +9,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from coarse import every_second_beam
 
 from perception.errors import LogError
-from perception.places import log_checks
+from perception.places import importing, log_checks
 from perception.places.importing import import_log, tracked
 from perception.readers.scans import RobotLog, Scan
 from simulator.tours import record
@@ -73,6 +74,22 @@ def in_blocks(scans: Scans) -> Scans:
     return [scan for i in (160, 80, 120, 40, 0) for scan in scans[i : i + 40]]
 
 
+def covered(scans: Scans) -> Scans:
+    """The laser sees nothing while the robot is carried."""
+    dark = np.full(len(scans[0].ranges), np.nan)
+    hidden = [replace(scans[100], ranges=dark, time=100 + k) for k in range(50)]
+    first, *last = kidnapped(scans)[100:]
+    return [*kidnapped(scans)[:100], *hidden, first, *last]
+
+
+def some_elsewhere(scans: Scans) -> Scans:
+    """Each tenth scan is somewhere else in the log."""
+    order = [k for k in range(len(scans)) if k % 10]
+    for k in range(0, len(scans), 10):
+        order.insert(k * 7 % len(order), k)
+    return [replace(scans[k], time=float(k)) for k in order]
+
+
 def of_two_lasers(scans: Scans) -> Scans:
     other = [replace(s, laser=replace(s.laser, mount=(0.1, 0.0, 0.0))) for s in scans[60:120]]
     return [*scans[:60], *other]
@@ -94,6 +111,7 @@ def of_two_clocks(scans: Scans) -> Scans:
             lambda scans: kidnapped(scans, 120, 160),
             "before and after scan 120 (line or message 161)",
         ),
+        (covered, "The laser sees no wall in 50 scans, from scan 100 "),
         (of_two_lasers, "The laser changes before scan 60"),
         (of_two_clocks, "The clock starts anew before scan 60"),
         (
@@ -138,6 +156,29 @@ def test_reader_refuses_ranges_in_other_units(
         tracked(RobotLog(tuple(longer), source="drive"))
 
 
+@pytest.mark.parametrize(("count", "unit"), [(100.0, "centimetres"), (1000.0, "millimetres")])
+def test_odometry_of_scans_a_metre_apart_is_converted(
+    scans: Scans, count: float, unit: str
+) -> None:
+    """Scans ten metres apart match nothing, so that they seem to agree with the odometry."""
+    notes = notes_of(with_poses(scans[:200:2], lambda x, y, h: (count * x, count * y, h)))
+    assert f"It is read as {unit}" in notes
+    assert "unreliable" not in notes
+
+
+def test_scans_out_of_order_are_not_taken_for_two_sources(scans: Scans) -> None:
+    notes = notes_of(some_elsewhere(scans[:120]))
+    assert "not in the order of time, sort it" in notes
+    assert "several sources" not in notes
+
+
+def test_few_scans_far_apart_are_not_converted(scans: Scans) -> None:
+    notes = notes_of(scans[::40])
+    assert "It is read as" not in notes
+    assert "drives backwards" not in notes
+    assert "take all scans of the drive" in notes.lower()
+
+
 def test_headings_in_degrees_are_converted(scans: tuple[Scan, ...]) -> None:
     good, other = (
         tracked(RobotLog(tuple(some), source="drive"))[1]
@@ -173,7 +214,7 @@ def test_log_with_unmatched_scans_is_refused(
 def test_refusal_advises_more_beams_if_scans_have_few(
     scans: Scans, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(log_checks, "HOPELESS", -1.0)
+    monkeypatch.setattr(importing, "HOPELESS", -1.0)
     few = every_second_beam(every_second_beam(tuple(scans[:60])))
     assert few[0].laser.beams < log_checks.FEW_BEAMS < scans[0].laser.beams
     for some, advised in ((few, True), (scans[:60], False)):
@@ -184,7 +225,7 @@ def test_refusal_advises_more_beams_if_scans_have_few(
 
 
 def test_error_does_not_repeat_the_notes(scans: Scans, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log_checks, "HOPELESS", -1.0)
+    monkeypatch.setattr(importing, "HOPELESS", -1.0)
     log, told = RobotLog(tuple(backwards(scans[:120])), source="drive"), list[str]()
     with pytest.raises(LogError) as refused:
         import_log(log, tell=told.append)

@@ -30,6 +30,7 @@ from perception.places.stays import AROUND, RIM, SAME, SHARE, SMALL, Stays
 from perception.places.track import Array, Track
 from perception.places.visits import MERGED, Visit, Way
 from perception.readers.scans import Pose, RobotLog, Scan
+from perception.readers.stored import in_turn
 from ssh_abduction.data.odometry import radians_between
 
 # The usual width of a robot in metres. It has to fit through the doors that the robot uses.
@@ -62,7 +63,10 @@ def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visi
     The width of the robot is in metres.
     """
     breaks = set(track.breaks)
-    posed = (Followed(scan, track.pose(i), broken=i in breaks) for i, scan in enumerate(log.scans))
+    posed = (
+        Followed(scan, track.pose(i), broken=i in breaks)
+        for i, scan in enumerate(in_turn(log.scans))
+    )
     return tuple(visits_of(posed, width))
 
 

@@ -14,11 +14,13 @@ was seen before, the robot may be anywhere. Then the track is broken, and a new 
 from __future__ import annotations
 
 import math
+from array import array
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from perception.places.jumps import Doubt, Unknown, unknown_steps
@@ -32,6 +34,7 @@ from perception.places.track import (
     wrapped,
 )
 from perception.readers.scans import Pose, RobotLog, Scan
+from perception.readers.stored import in_turn
 from ssh_abduction.data.odometry import displacement_between, moved
 
 # Number of previous scans to match a scan with.
@@ -72,6 +75,8 @@ CONTRARY, CLEAR = 25.0, 0.8
 # In a bare corridor, moving on and standing still match equally well. If their shares of points on
 # walls differ by at most this, the robot is taken to have moved on.
 ALIKE = 0.03
+# Numbers that a growing track keeps for each scan: pose, covariance and share.
+ROW = 3 + 9 + 1
 
 
 def follow(log: RobotLog, trust: Trust | None = None) -> Track:
@@ -109,15 +114,11 @@ class _Follower:
 
     def followed(self, carried: frozenset[int]) -> Track:
         """Make the track, which is broken before each scan to which the robot was carried."""
-        steps = replace(self.steps, carried=carried)
-        done = list(poses_of_scans(self.log.scans, lambda i, _: steps.doubt_of(i), self.trust))
-        return Track(
-            np.array([one.pose for one in done]),
-            np.array([one.covariance for one in done]),
-            np.array([one.share for one in done]),
-            tuple(i for i, one in enumerate(done) if one.cut),
-            tuple(i for i, one in enumerate(done) if one.broken),
-        )
+        steps, done = replace(self.steps, carried=carried), GrowingTrack()
+        scans = in_turn(self.log.scans)
+        for one in poses_of_scans(scans, lambda i, _: steps.doubt_of(i), self.trust):
+            done.add(one)
+        return done.track
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -129,7 +130,7 @@ class Followed:
         pose: x, y in metres and heading in radians, in the frame of the first scan.
         covariance: (3, 3) covariance of the motion from the previous scan, in the frame of the
             robot at the previous scan.
-        share: Share of the points of the scan that lie on known walls.
+        share: Share of the points of the scan on known walls; NaN if its beams meet nothing.
         cut: Whether the motion from the previous scan is unknown.
         broken: Whether the robot may be anywhere, so that a new trajectory begins.
     """
@@ -140,6 +141,42 @@ class Followed:
     share: float = 1.0
     cut: bool = False
     broken: bool = False
+
+
+class GrowingTrack:
+    """A track to which scans are added. Each needs about 100 bytes.
+
+    Attributes:
+        cuts: Indices of the scans before which the motion is unknown, so far.
+    """
+
+    def __init__(self) -> None:
+        """Start before the first scan."""
+        self.cuts: list[int] = []
+        self._breaks: list[int] = []
+        self._rows = array("d")  # pose, covariance and share of each scan
+
+    def __len__(self) -> int:
+        """The number of scans."""
+        return len(self._rows) // ROW
+
+    def add(self, one: Followed) -> None:
+        """Add the next scan."""
+        self.cuts += [len(self)] if one.cut else []
+        self._breaks += [len(self)] if one.broken else []
+        self._rows.extend((*one.pose, *one.covariance.ravel(), one.share))
+
+    @property
+    def track(self) -> Track:
+        """The track up to the last scan."""
+        rows = np.array(self._rows).reshape(-1, ROW)
+        return Track(
+            rows[:, :3].copy(),
+            rows[:, 3:12].reshape(-1, 3, 3).copy(),
+            rows[:, 12].copy(),
+            tuple(self.cuts),
+            tuple(self._breaks),
+        )
 
 
 def poses_of_scans(
@@ -161,10 +198,13 @@ def poses_of_scans(
             onward = displacement_between(last.scan.odometry, scan.odometry)
             step = _ScanMotion(scan, points, normals, recent, last.pose, onward, before, trust)
             one = step.judged(doubt_of(i, onward))
+            one = one if _in_sight(scan).any() else replace(one, share=math.nan)
             before = displacement_between(last.pose, one.pose)
         if one.broken:
             recent.clear()
-        recent.append((points_moved(one.pose, points), points_turned(one.pose[2], normals)))
+        # Walls are remembered while the laser sees none.
+        if len(points) or not recent:
+            recent.append((points_moved(one.pose, points), points_turned(one.pose[2], normals)))
         last = one
         yield one
 
@@ -273,6 +313,11 @@ def _carried(log: RobotLog, track: Track) -> list[int]:
     return found
 
 
+def share_failing(track: Track) -> float:
+    """Compute the share of the scans that show walls, but hardly match what was seen before."""
+    return float((track.shares < POOR).mean())
+
+
 def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
     """List scans that match well but turned differently from the odometry, by how many radians."""
     found: list[tuple[int, float]] = []
@@ -286,8 +331,7 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
 
 def surfaces(scan: Scan) -> tuple[Array, Array]:
     """Find points on smooth surfaces, (m, 2) metres, and unit normals, in the robot's frame."""
-    laser, ranges = scan.laser, scan.ranges
-    good = np.isfinite(ranges) & (ranges < min(FARTHEST, laser.reach))
+    laser, ranges, good = scan.laser, scan.ranges, _in_sight(scan)
     r = np.where(good, ranges, 0.0)
     points = np.stack([r * np.cos(laser.bearings), r * np.sin(laser.bearings)], axis=1)
     normals = np.full(points.shape, np.nan)
@@ -313,6 +357,11 @@ def surfaces(scan: Scan) -> tuple[Array, Array]:
     return points_moved(laser.mount, points[on_surface]), points_turned(
         laser.mount[2], normals[on_surface]
     )
+
+
+def _in_sight(scan: Scan) -> NDArray[np.bool_]:
+    """Mask of the beams that meet something near enough to be matched, (beams,)."""
+    return np.asarray(np.isfinite(scan.ranges) & (scan.ranges < min(FARTHEST, scan.laser.reach)))
 
 
 def _matched(

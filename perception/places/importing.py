@@ -36,11 +36,12 @@ from perception.places.closures import (
     without_drift,
 )
 from perception.places.distinctive import WIDTH, WINDOW, find_visits
-from perception.places.following import follow, turned_wrongly
+from perception.places.following import follow, share_failing, turned_wrongly
 from perception.places.live import LiveLog
 from perception.places.partings import with_partings
 from perception.places.tracing import DRIFT, to_trace
 from perception.places.track import Track
+from perception.places.units import HOPELESS
 from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Damage, RobotLog, Scan
 from perception.reciprocal import ReciprocalTransformer
@@ -170,7 +171,7 @@ def _refuse_bad(log: RobotLog, track: Track, notes: Sequence[str]) -> None:
             "time, or cut it into drives",
             notes,
         )
-    if (failing := log_checks.share_failing(track)) > log_checks.HOPELESS:
+    if (failing := share_failing(track)) > HOPELESS:
         raise _noted(
             f"{named(log.source)}: expected scans that show what the scans before them showed, got "
             f"{len(log)}, and {100 * failing:.0f} % of them do not; {log_checks.advice(log)}",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from perception.readers.poses import RecordedTrack as Odometry
 from perception.readers.poses import sources_of
 from perception.readers.scans import Pose, RobotLog, Scan
+from perception.readers.stored import in_turn
 from ssh_abduction.data.odometry import displacement_between
 
 if TYPE_CHECKING:
@@ -41,6 +42,8 @@ MISSING = 0.5
 # A clock starts anew if it goes back by more than ANEW_CLOCK seconds or on by more than a DAY, at
 # most SEAMS times in a log.
 ANEW_CLOCK, DAY, SEAMS = 60.0, 86400.0, 3
+# A log is out of order if the times of more than this share of its scans run backwards.
+RUNS_BACK = 0.05
 # While a robot drives, the usual length of a step is the median of this many earlier steps.
 LATELY = 100
 # Limit of ranges in metres, for comparing scans.
@@ -62,7 +65,8 @@ def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
     for number, scan in enumerate(log.scans):
         odometry.add(number, number, scan.odometry)
     sources = sources_of(odometry)
-    if len(sources) == 1:
+    # Scans that are out of order look like poses of several sources.
+    if len(sources) == 1 or times_back(log) > RUNS_BACK * len(log):
         return log, []
     said = (
         f"The poses of several sources alternate in the odometry, {len(sources[0])} and "
@@ -70,6 +74,12 @@ def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
         "better, stop the source that was used, and record again."
     )
     return replace(log, scans=_of_source(log.scans, sources[0])), [said]
+
+
+def times_back(log: RobotLog) -> int:
+    """Count the scans whose time is before that of the scan before them."""
+    times = np.array([scan.time for scan in log.scans if scan.time is not None])
+    return int((np.diff(times) < 0).sum())
 
 
 def seams_of(log: RobotLog) -> list[tuple[int, str]]:
@@ -386,7 +396,7 @@ class StandstillCheck:
 def moves_unseen(log: RobotLog) -> bool:
     """Whether the robot moves while its odometer stands still, as the scans of a log show."""
     standing = StandstillCheck()
-    for scan in log.scans:
+    for scan in in_turn(log.scans):
         standing.add(scan)
     return standing.moved
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import re
-from array import array
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -26,7 +25,7 @@ from perception.errors import LogError
 from perception.places import jumps, log_checks
 from perception.places.agreement import disagreement
 from perception.places.distinctive import WIDTH, visits_of
-from perception.places.following import Followed, poses_of_scans, turned_wrongly
+from perception.places.following import Followed, GrowingTrack, poses_of_scans, turned_wrongly
 from perception.places.track import Track, Trust
 from perception.places.units import LEAST_WAY, Units, units_of
 from perception.places.visits import Visit
@@ -90,9 +89,7 @@ class LiveLog:
         self._begun: list[Scan] = []  # the first COMPARED scans, with their ranges
         self._latest: deque[Scan] = deque(maxlen=log_checks.BESIDE + 1)
         self._poor = self._wanted = 0  # poor matches so far, and scans to keep after the last one
-        self._rows = array("d")  # pose, covariance and share of each scan
-        self._cuts: list[int] = []
-        self._breaks: list[int] = []
+        self._done = GrowingTrack()
 
     def visits(self) -> Iterator[Visit]:
         """Yield each visit with its local map, in order, when it is final."""
@@ -103,7 +100,7 @@ class LiveLog:
 
         Hardly any scan has ranges. Raises LogError if there is no scan.
         """
-        log, track = self._log, self._track
+        log, track = self._log, self._done.track
         if not len(log):
             raise LogError(f"{named(self._source)}: expected scans, got none; record the laser")
         explained = bool(self._tell.notes)
@@ -140,7 +137,7 @@ class LiveLog:
         """Keep a scan with its pose, and its ranges only if a check needs them."""
         number = len(self._scans)
         self._scans.append(without_ranges(one.scan))
-        self._rows.extend((*one.pose, *one.covariance.ravel(), one.share))
+        self._done.add(one)
         if number < COMPARED:
             self._begun.append(one.scan)
         self._latest.append(one.scan)
@@ -149,32 +146,20 @@ class LiveLog:
             self._scans[-len(self._latest) :] = self._latest
         elif self._wanted:
             self._scans[-1], self._wanted = one.scan, self._wanted - 1
-        self._cuts += [number] if one.cut else []
-        self._breaks += [number] if one.broken else []
-        if one.cut and len(self._cuts) <= SAID:
-            self._tell(jumps.describe_cuts(self._log, self._track, []))
+        if one.cut and len(self._done.cuts) <= SAID:
+            self._tell(jumps.describe_cuts(self._log, self._done.track, []))
 
     def _compare(self) -> None:
         """Compare the track with the odometry over the first scans, and forget their ranges."""
         if len(self._begun) > 1 and not self._tell.notes:
-            note = disagreement(RobotLog(tuple(self._begun), source=self._source), self._track)
+            begun = RobotLog(tuple(self._begun), source=self._source)
+            note = disagreement(begun, self._done.track)
             self._tell([note] if note else [])
         self._begun.clear()
 
     @property
     def _log(self) -> RobotLog:
         return RobotLog(tuple(self._scans), tuple(self._damaged), source=self._source)
-
-    @property
-    def _track(self) -> Track:
-        rows = np.array(self._rows).reshape(-1, 13)
-        return Track(
-            rows[:, :3],
-            rows[:, 3:12].reshape(-1, 3, 3),
-            rows[:, 12],
-            tuple(self._cuts),
-            tuple(self._breaks),
-        )
 
 
 @lru_cache

@@ -14,10 +14,11 @@ import numpy as np
 
 from perception.errors import LogError
 from perception.places import jumps
-from perception.places.following import POOR
+from perception.places.following import share_failing
 from perception.places.track import Array, Track, Trust, wrapped
 from perception.places.units import FAR_OFF, LEAST_WAY, SIDEWAYS, SPARSE, ahead, units_of, way_of
 from perception.readers.scans import RobotLog
+from perception.readers.stored import in_turn
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.odometry import displacement_between, moved
 
@@ -28,15 +29,11 @@ LAGS, ALIKE = (2, 4, 8), 1.3
 # In good logs, matches fail in at most 1.5 % of the scans, and contradict the odometer in at most
 # 2 % of the steps. A contradiction is a chi-square above CONTRADICTS (three degrees of freedom).
 FAILING, OVERRIDING, CONTRADICTS = 0.05, 0.08, 25.0
-# A log is refused if more than this share of its scans fails to match.
-HOPELESS = 0.5
 # Scans with fewer beams often match badly: with 20 beams, 40 to 50 % of the scans of good logs fail
 # to match, with 30 beams less than 1 %.
 FEW_BEAMS = 30
 # In good logs, the way by odometry over every second scan is at least 0.98 times the way over all.
 TO_AND_FRO = 0.8
-# A log is out of order if the times of more than this share of its scans run backwards.
-RUNS_BACK = 0.05
 # A robot returns if it comes near a point where it was before, and drove at least AWAY metres in
 # between. Near is within NEAR metres, plus DRIFT metres for each metre driven in between.
 NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
@@ -48,6 +45,8 @@ NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
 # the RARELY-th percentile of the log.
 INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
 INTRUDING_RARELY, WORSE, RARELY = 0.15, 0.25, 1.0
+# The laser is dark if DARK scans in a row show no wall.
+DARK = 5
 # Beams that meet walls are at most this many metres long, in the median of a log. Good logs have up
 # to 3 m.
 FAR_WALLS = 50.0
@@ -55,7 +54,10 @@ FAR_WALLS = 50.0
 
 def refuse_lengths(log: RobotLog) -> None:
     """Raise a LogError if the ranges of a log are too long to be metres."""
-    met = [scan.ranges[(scan.ranges > 0) & (scan.ranges < scan.laser.reach)] for scan in log.scans]
+    met = (
+        scan.ranges[(scan.ranges > 0) & (scan.ranges < scan.laser.reach)]
+        for scan in in_turn(log.scans)
+    )
     usual = float(np.median([float(np.median(some)) for some in met if len(some)] or [0.0]))
     if usual > FAR_WALLS:
         unit, count = ("millimetres", 1000) if usual > 10 * FAR_WALLS else ("centimetres", 100)
@@ -75,8 +77,7 @@ def refuse_shuffled(log: RobotLog) -> None:
     )
     if next_to == 0 or not all(next_to / ALIKE < far < next_to * ALIKE for far in apart):
         return
-    times = np.array([scan.time for scan in log.scans if scan.time is not None])
-    back = int((np.diff(times) < 0).sum())
+    back = jumps.times_back(log)
     clock = f", and their times run back {back} times" if back else ""
     raise LogError(
         f"{named(log.source)}: expected scans in the order of the drive, got {len(log)} in random "
@@ -129,20 +130,20 @@ def _about_seam(log: RobotLog, scan: int, begin: int, what: str) -> str:
 
 def _about_order(log: RobotLog) -> list[str]:
     """Describe scans that are in reverse order, out of order, or too far apart."""
-    notes = []
-    if way_of(log) >= LEAST_WAY and ahead(log) < -SIDEWAYS:
+    notes, usual = [], jumps.usual_step(log)
+    # Between scans that are far apart, the robot may have turned in any way.
+    if usual <= FAR_OFF and way_of(log) >= LEAST_WAY and ahead(log) < -SIDEWAYS:
         notes.append(
             "The robot drives backwards all the way by its odometry, so the scans are probably in "
             "reverse order. Reverse the log, or turn the headings by half a circle."
         )
-    times = np.array([scan.time for scan in log.scans if scan.time is not None])
-    back = int((np.diff(times) < 0).sum())
-    if back > RUNS_BACK * len(log):
+    back = jumps.times_back(log)
+    if back > jumps.RUNS_BACK * len(log):
         notes.append(
             f"The times of the scans run back {back} times in {len(log)} scans. If the log is "
             "not in the order of time, sort it."
         )
-    if (usual := jumps.usual_step(log)) > FAR_OFF:
+    if usual > FAR_OFF:
         notes.append(
             f"The usual step between two scans is {usual:.0f} m by the odometry, so that they "
             "hardly overlap. Take all scans of the drive, at least one per metre. If they are "
@@ -185,7 +186,7 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
     """
     failing, overriding = share_failing(track), _overriding(log, track)
     is_reliable = failing <= FAILING and overriding <= OVERRIDING
-    notes = []
+    notes = _about_darkness(log, track)
     if not is_reliable:
         notes.append(
             f"The track is unreliable: scan matching fails in {100 * failing:.0f} % of the scans, "
@@ -210,9 +211,20 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
     return replace(track, is_reliable=is_reliable), notes
 
 
-def share_failing(track: Track) -> float:
-    """Compute the share of the scans that hardly match what was seen before."""
-    return float((track.shares < POOR).mean())
+def _about_darkness(log: RobotLog, track: Track) -> list[str]:
+    """Describe the first stretch of scans in which the laser sees no wall."""
+    # A stretch begins and ends at an edge of the mask.
+    edges = np.flatnonzero(np.diff([0, *np.isnan(track.shares), 0])).reshape(-1, 2)
+    dark = [(begin, end) for begin, end in edges.tolist() if end - begin >= DARK]
+    if not dark:
+        return []
+    (begin, end), more = dark[0], len(dark) - 1
+    return [
+        f"The laser sees no wall in {end - begin} scans, from scan {begin} (line or message "
+        f"{log.scans[begin].line}) on{f', and in {more} more stretches' if more else ''}. The "
+        "odometry alone says how the robot moved there. If the laser was covered while the robot "
+        "was carried, cut the log there, and map each part."
+    ]
 
 
 def advice(log: RobotLog) -> str:
@@ -275,7 +287,7 @@ def _returns(track: Track) -> bool:
 def _contradictions(log: RobotLog, track: Track) -> list[int]:
     """Find the scans that match badly and lie in the free space of the scans before them."""
     found: list[int] = []
-    rare = float(np.percentile(track.shares, RARELY)) - WORSE
+    rare = float(np.nanpercentile(track.shares, RARELY)) - WORSE
     for i in np.flatnonzero(track.shares < POORLY).tolist():
         pairs = [
             pair

@@ -24,8 +24,8 @@ class Track:
         poses: (n, 3) x, y in metres and heading in radians, in the frame of the first scan.
         covariances: (n, 3, 3) covariance of the motion from the previous scan to each scan, in the
             frame of the robot at the previous scan; zeros for the first scan.
-        shares: (n,) share of the points of each scan that lie on known walls; 1 for the first scan.
-            Empty if nothing was matched.
+        shares: (n,) share of the points of each scan that lie on known walls; 1 for the first scan,
+            NaN for a later scan whose beams meet nothing. Empty if nothing was matched.
         cuts: Indices of scans before which the motion is unknown because the odometer jumped. No
             displacement crosses a cut.
         breaks: Those of `cuts` after which the robot may be anywhere, because the scan shows

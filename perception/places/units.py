@@ -8,15 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perception.places import jumps
-from perception.places.following import follow
+from perception.places.following import follow, share_failing
 from perception.places.track import wrapped
 from perception.readers.scans import RobotLog, Scan
 
 # Units of odometry, and how many make a metre.
 UNITS = {"metres": 1.0, "millimetres": 1000.0, "centimetres": 100.0}
-# STRETCH: number of scans over which odometry is compared with scan matching. UNLIKE: largest
-# relative difference of the two.
-STRETCH, UNLIKE = 80, 0.25
+# STRETCH: number of scans over which odometry is compared with scan matching, at least LEAST_SCANS.
+# UNLIKE: largest relative difference of the two.
+STRETCH, LEAST_SCANS, UNLIKE = 80, 10, 0.25
+# Scans do not match if matching fails for more than this share of them. In a wrong unit they may
+# agree with the odometry, as it alone decides if nothing matches.
+HOPELESS = 0.5
 # Scans that are farther apart than SPARSE metres overlap too little, and those farther apart than
 # FAR_OFF hardly overlap. Good logs have up to 1 m.
 SPARSE, FAR_OFF = 1.5, 5.0
@@ -73,17 +76,17 @@ def _length(log: RobotLog) -> tuple[float, list[str]]:
     far = np.array([scan.odometry[:2] for scan in log.scans])
     begin = int(np.argmax(np.hypot(*np.diff(far, axis=0).T) > usual / 2))
     stretch = replace(log, scans=log.scans[begin : begin + STRETCH])
+    if len(stretch) < LEAST_SCANS:
+        return 1.0, []
 
     # Relative difference between odometry in this unit and scan matching.
     def off(unit: str) -> float:
         tried = Units(UNITS[unit]).convert(stretch)
         measured, seen = np.array([scan.odometry[:2] for scan in tried.scans]), follow(tried)
         ways = [np.hypot(*np.diff(way, axis=0).T) for way in (measured, seen.poses[:, :2])]
-        return (
-            float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9))
-            if not seen.breaks
-            else math.inf
-        )
+        if seen.breaks or share_failing(seen) > HOPELESS:
+            return math.inf
+        return float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9))
 
     # Matching cannot correct metres that are too large to be true.
     found = min([unit for unit in UNITS if unit != "metres" or usual <= FAR_OFF], key=off)

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
-from perception.readers.scans import Scan
+from perception.readers.scans import Scan, shared
+from perception.readers.stored import RangeStore, in_memory, in_turn
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Pose, displacement_between
 
@@ -117,7 +118,7 @@ class LaserOptions:
         if self.mount is not None:
             x, y, degrees = map(float, self.mount)
             laser = replace(laser, mount=(x, y, math.radians(degrees)))
-        return scan if laser is scan.laser else replace(scan, laser=laser)
+        return scan if laser is scan.laser else replace(scan, laser=shared(laser))
 
     def reach(self, reach: float) -> float:
         """Return the reach of a laser in metres: from the user, or else from the log."""
@@ -149,11 +150,11 @@ def interpret_log(
     """Interpret the ranges of a whole log, as the driver wrote them, and note what was found.
 
     `options` override the survey. In the result, ranges are infinite if nothing came back and
-    NaN if nothing is known. Raises LogError if the user gives one mount, but the scans come
-    from several lasers.
+    NaN if nothing is known. They are kept in temporary files (`RangeStore`). Raises LogError if
+    the user gives one mount, but the scans come from several lasers.
     """
     interpret, notes = interpreter_of(scans, options)
-    return tuple(map(interpret, scans)), notes
+    return tuple(map(RangeStore().kept, map(interpret, in_turn(scans)))), notes
 
 
 def interpreter_of(
@@ -179,7 +180,8 @@ def interpreter_of(
     for key, members in groups.items():
         kept = moving(members)
         some = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_SURVEYED)).astype(int))
-        meanings[key], said = _survey([kept[i] for i in some], options)
+        surveyed = [in_memory(scan) for scan in in_turn(kept[i] for i in some)]
+        meanings[key], said = _survey(surveyed, options)
         notes += said
 
     def interpret(scan: Scan) -> Scan:
@@ -224,7 +226,7 @@ def _measured(scan: Scan, meaning: Meaning) -> Scan:
     laser = (
         scan.laser
         if scan.laser.reach == meaning.reach
-        else replace(scan.laser, reach=meaning.reach)
+        else shared(replace(scan.laser, reach=meaning.reach))
     )
     return replace(scan, ranges=ranges, laser=laser)
 

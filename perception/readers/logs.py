@@ -15,6 +15,7 @@ from perception.readers import bag_files, bag_topics, bags, carmen
 from perception.readers.echoes import LaserOptions, interpret_log, interpret_scan, interpreter_of
 from perception.readers.lines import LONGEST_LINE, Piped, lines, opened, piped
 from perception.readers.scans import Damage, RobotLog, Scan, SurveyedLog
+from perception.readers.stored import RangeStore
 from ssh_abduction.data.checks import a_list, a_path, a_text
 from ssh_abduction.data.errors import brief, named
 from ssh_abduction.data.odometry import Pose
@@ -77,9 +78,10 @@ def read_log(
     with _reading(path, format, scan_topic, odom_topic) as reading:
         scans: list[Scan] = []
         damaged: list[Damage] = []
+        store = RangeStore()
         for item in reading.items:
             if isinstance(item, Scan):
-                scans.append(item)
+                scans.append(store.kept(item))
             else:
                 damaged.append(item)
     if not scans:

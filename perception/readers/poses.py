@@ -29,6 +29,8 @@ COMPARED, TIMES = 2.0, 100
 # Poses come from several sources if the source changes at this share of the messages and each
 # source sends this share.
 ALTERNATING = 0.1
+# At most this share of the messages is of no such source.
+ASTRAY = 0.1
 # Largest number of sources to distinguish.
 SOURCES = 4
 
@@ -227,6 +229,8 @@ def sources_of(track: RecordedTrack) -> list[NDArray[np.intp]]:
     found = [np.flatnonzero(np.array(of) == k) for k in range(len(heads))]
     many = [one for one in found if len(one) >= ALTERNATING * len(poses)]
     changes = sum(a != b for a, b in pairwise(of))
-    if len(many) < 2 or changes < ALTERNATING * len(poses):
+    # Single poses that are out of order start many sources.
+    rest = len(poses) - sum(map(len, many))
+    if len(many) < 2 or changes < ALTERNATING * len(poses) or rest > ASTRAY * len(poses):
         return [np.arange(len(poses))]
     return sorted(many, key=len, reverse=True)

@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 from ssh_abduction.data.odometry import Pose
 from ssh_abduction.data.words import counted
 
-__all__ = ["Damage", "LaserScanner", "Pose", "RobotLog", "Scan", "SurveyedLog", "laser_of"]
+__all__ = [
+    "Damage",
+    "LaserScanner",
+    "Pose",
+    "RobotLog",
+    "Scan",
+    "SurveyedLog",
+    "laser_of",
+    "shared",
+]
 
 
 @dataclass(frozen=True)
@@ -62,6 +71,12 @@ class LaserScanner:
 
 # All scans of a log share the few lasers that it has.
 laser_of = lru_cache(maxsize=64)(LaserScanner)
+
+
+@lru_cache(maxsize=64)
+def shared(laser: LaserScanner) -> LaserScanner:
+    """Return the object that stands for all equal lasers. Its bearings are computed once."""
+    return laser
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 
 from perception.places.importing import Imported
 from perception.readers.scans import Pose, RobotLog
+from perception.readers.stored import in_turn
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
@@ -347,7 +348,7 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
     have ended in a square, so that few stray beams are drawn.
     """
     found = []
-    for scan, pose in zip(log.scans, poses, strict=True):
+    for scan, pose in zip(in_turn(log.scans), poses, strict=True):
         x, y, heading = moved(pose, scan.laser.mount)
         near = np.isfinite(scan.ranges) & (scan.ranges < min(DRAWN, scan.laser.reach))
         far, angles = scan.ranges[near], heading + scan.laser.bearings[near]

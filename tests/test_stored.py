@@ -1,0 +1,65 @@
+"""Ranges of a log are kept in temporary files: the same values, and hardly any memory."""
+
+from __future__ import annotations
+
+import math
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.readers import stored
+from perception.readers.logs import read_log
+from perception.readers.scans import LaserScanner, Scan
+from perception.readers.stored import RangeStore, in_turn
+from perception.readers.writers import write_carmen
+
+BEAMS = 360
+LASER = LaserScanner(-math.pi / 2, math.pi / BEAMS, BEAMS, 8.0)
+
+
+def scans_of(count: int) -> list[Scan]:
+    rows = np.random.default_rng(0).uniform(1.0, 7.0, (count, BEAMS)).round(3)
+    return [Scan(row, LASER, (0.01 * k, 0.0, 0.0)) for k, row in enumerate(rows)]
+
+
+def test_kept_ranges_survive_the_release_of_their_memory() -> None:
+    scans, store = scans_of(200), RangeStore()
+    kept = [store.kept(scan) for scan in scans]
+    for _ in range(2):
+        assert all((a.ranges == b.ranges).all() for a, b in zip(in_turn(kept), scans, strict=True))
+    # The ranges lie in several files, one behind the other.
+    assert len({id(scan.ranges.base) for scan in kept}) == 3
+
+
+def no_file() -> None:
+    raise OSError("No space left on device")
+
+
+def test_ranges_stay_in_memory_on_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stored.tempfile, "TemporaryFile", no_file)
+    scans, store = scans_of(3), RangeStore()
+    for kept, scan in zip(in_turn([store.kept(scan) for scan in scans]), scans, strict=True):
+        assert (kept.ranges == scan.ranges).all()
+
+
+def test_read_log_keeps_ranges_out_of_memory(tmp_path: Path) -> None:
+    count = 2000
+    write_carmen(tmp_path / "drive.log", scans_of(count))
+    tracemalloc.start()
+    try:
+        log = read_log(tmp_path / "drive.log")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert len(log) == count
+    assert peak < 8 * BEAMS * count / 2
+
+
+def test_scans_of_a_log_share_one_laser(tmp_path: Path) -> None:
+    """The bearings of a laser need as much memory as the ranges of a scan."""
+    write_carmen(tmp_path / "drive.log", scans_of(20))
+    for choice in (None, 3.0):
+        log = read_log(tmp_path / "drive.log", no_return=choice, mount=choice and (0.1, 0, 0))
+        assert len({id(scan.laser) for scan in log.scans}) == 1
