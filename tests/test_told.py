@@ -215,6 +215,17 @@ def test_misspelt_word_gets_a_suggestion(
     assert capsys.readouterr().err.endswith(f"; did you mean {meant}?\n")
 
 
+@pytest.mark.parametrize(
+    "words", ["solve a.jsonl -o maps.json b.jsonl", "explain a.jsonl --theory causal 0 9"]
+)
+def test_arguments_after_an_option_get_a_hint(
+    words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(words.split())
+    assert capsys.readouterr().err.endswith("; write them before the options\n")
+
+
 def test_setting_without_a_value_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["solve", "trace.jsonl", "--set", "level"])

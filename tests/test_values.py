@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import aces
+import numpy as np
 import pytest
 from worlds import TOURS, drive, rectangle
 
@@ -28,9 +29,19 @@ from ssh_abduction import (
     Theory,
     Trace,
     evaluate,
+    export_map,
     solve,
 )
-from ssh_abduction.data import MapError, RangeError, TraceError, maps
+from ssh_abduction.data import (
+    Action,
+    Corrections,
+    MapError,
+    RangeError,
+    TraceError,
+    load_corrections,
+    maps,
+    save_corrections,
+)
 from ssh_abduction.learning.labels import LearnerError
 from ssh_abduction.solver import Certificate, Search, Status
 from ssh_abduction.solver.judging import InternalError
@@ -502,3 +513,17 @@ def test_incomplete_solution_is_not_saved(tmp_path: Path) -> None:
         with pytest.raises(MapError, match="maps: expected all 4 that the search found"):
             search.solution(some).save(tmp_path / "maps.json")
     assert not list(tmp_path.iterdir())
+
+
+def test_texts_of_numpy_are_kept_as_plain_text(tmp_path: Path) -> None:
+    """YAML cannot store texts of numpy."""
+    name = np.str_("monday")
+    trace = Trace.from_steps(np.array(["a", "b"]), np.array(["travel"]), name=name)
+    assert {type(text) for text in (trace.name, *trace.views, trace.actions[0].name)} == {str}
+    turn = Action(np.str_("veer"), np.str_("turn"), gateway=np.int64(2), turn=np.str_("left"))
+    assert repr(turn) == repr(Action("veer", "turn", "left", gateway=2))
+    text = export_map(solve(trace)[0], "tmap2", name=np.str_("hall"))
+    assert "name: hall" in text
+    said = Corrections.for_drives(trace).with_name(np.str_("kitchen"), "place", name + ":1")
+    save_corrections(said, tmp_path / "corrections.yaml")
+    assert load_corrections(tmp_path / "corrections.yaml").names == said.names

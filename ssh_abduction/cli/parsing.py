@@ -168,6 +168,11 @@ class Parser(argparse.ArgumentParser):
         self.settings[name] = Setting(name, said, **details)
         self.set_defaults(**{name: default})
 
+    @property
+    def takes_many(self) -> bool:
+        """Whether an argument takes many values. They are one after the other."""
+        return any(a.nargs in ("*", "+") and not a.option_strings for a in self._actions)
+
     def format_help(self) -> str:
         """Make the help text, with verbs in groups and with the settings."""
         formatter = self._get_formatter()
@@ -227,6 +232,8 @@ class Parser(argparse.ArgumentParser):
             verb = self.verbs[options.verb] if getattr(options, "verb", None) else self
             wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
             hint = _meant(wrong.partition("=")[0], verb.names)
+            if not wrong.startswith("-") and verb.takes_many:
+                hint = "; write them before the options"
             verb.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return options
 

@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeAlias
 
 from ssh_abduction.data.checks import a_whole_number, an_object
 from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole, is_writable
+from ssh_abduction.data.observation import plain_number, plain_text
 from ssh_abduction.data.star import SPREAD, near_quarter
 
 Kind: TypeAlias = Literal["travel", "turn", "lift", "stairs", "start"]
@@ -80,6 +81,17 @@ class Action:
                 f"action.gateway: expected 1 or more, for a turn right or left, "
                 f"got {brief(self.gateway)}; give the number of the gateway on that side, from 1 on"
             )
+        self._keep_plain_values()
+
+    def _keep_plain_values(self) -> None:
+        """Replace texts and numbers of numpy by Python's own. The fields are checked before."""
+        for plain, names in (
+            (plain_text, ("name", "kind", "turn")),
+            (plain_number, ("gateway", "bearing")),
+        ):
+            for name in names:
+                if (value := getattr(self, name)) is not None:
+                    object.__setattr__(self, name, plain(value))
 
     def _turn_of_bearing(self) -> TurnDirection:
         """Return the direction of a turn by `bearing` degrees, or raise TraceError."""

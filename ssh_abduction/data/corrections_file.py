@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import warnings
@@ -25,7 +26,7 @@ from ssh_abduction.data.corrections import (
 )
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, named
-from ssh_abduction.data.files import read_at_most, save_file
+from ssh_abduction.data.files import json_line, read_at_most, save_file
 from ssh_abduction.data.map_parts import NAMED
 from ssh_abduction.data.maps import SSHMap
 
@@ -133,6 +134,7 @@ def to_yaml(corrections: Corrections) -> str:
         for said in corrections.gateways
     ]
     kept = {name: value for name, value in data.items() if value or name == "drives"}
+    kept = json.loads(json_line(kept))  # YAML knows no texts of numpy
     text: str = yaml.safe_dump(
         kept, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
     )

@@ -34,7 +34,7 @@ def checked_view(value: Any, where: str) -> View:
             f"{where}: expected a text that UTF-8 can hold, got half a character in "
             f"{brief(value)}; rename the view"
         )
-    return value
+    return plain_text(value) if isinstance(value, str) else value
 
 
 def view_or_unknown(value: Any, where: str) -> View | None:
@@ -87,3 +87,8 @@ def frozen_image(value: Any) -> tuple[float, ...] | int:
 def plain_number(x: float) -> float:
     """Return a number as Python's own int or float. JSON cannot store numbers of numpy."""
     return x if type(x) in (int, float) else int(x) if is_whole(x) else float(x)
+
+
+def plain_text(text: str) -> str:
+    """Return a text as Python's own str. YAML cannot store texts of numpy."""
+    return text if type(text) is str else str.__str__(text)

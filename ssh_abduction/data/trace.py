@@ -25,7 +25,7 @@ from ssh_abduction.data.checks import a_list, a_path, a_text, a_whole_number, an
 from ssh_abduction.data.closure import Closure, checked_closures, closures_among
 from ssh_abduction.data.errors import RangeError, TraceError, brief, checked_index, named
 from ssh_abduction.data.files import json_line, save_file
-from ssh_abduction.data.observation import View, checked_probability, view_or_unknown
+from ssh_abduction.data.observation import View, checked_probability, plain_text, view_or_unknown
 from ssh_abduction.data.odometry import Covariance, Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.step import Step, as_list, of_actions
@@ -88,8 +88,9 @@ class Trace:
                 f"add what the robot saw first"
             )
         for name in ("name", "images", "source", "drive"):
-            if getattr(self, name) is not None:
-                a_text(name, getattr(self, name), TraceError, mend="give a text, or leave it out")
+            if (text := getattr(self, name)) is not None:
+                text = a_text(name, text, TraceError, mend="give a text, or leave it out")
+                object.__setattr__(self, name, plain_text(text))
         if self.odometry is not None:
             mend = "make one with Odometry.of, or leave it out"
             an_instance("odometry", self.odometry, Odometry, TraceError, mend=mend)

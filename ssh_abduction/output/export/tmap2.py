@@ -154,6 +154,7 @@ class _Dumper(yaml.SafeDumper):
     """Writes numbers with a decimal point and no exponent, because PyYAML reads 4e-06 as text."""
 
 
+_Dumper.add_multi_representer(str, _Dumper.represent_str)  # also texts of numpy
 _Dumper.add_representer(
     float,
     lambda dumper, number: dumper.represent_scalar(
