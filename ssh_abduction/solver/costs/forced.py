@@ -340,28 +340,20 @@ class Forcing:
     def bounds(self, most: float) -> Iterator[float]:
         """Yield rising lower bounds, at most `most`, on the cost of all maps.
 
-        This leaves `joins` as it is.
+        This leaves `joins` as it is. First try `most` itself. Branching takes much longer, so the first bounds do without.
         """
-        self._laying = self._least_laying(most)
-        low = self._bound(most)
-        yield low
-        while most - low > NEARLY * most:
-            middle = (low + most) / 2
-            # The copy of the visits keeps these joins from becoming `joins`.
-            if self._forced(replace(self.visits), self.joins, middle, {}, 1):
-                low = middle
-                yield low
-            else:
-                most = middle
-
-    def _bound(self, most: float) -> float:
-        """Compute a lower bound, at most `most`, on the cost of every map, without branching."""
-        low, joins, known = 0.0, self.joins, dict[tuple[int, int], float]()
-        while low < most:
-            joins, low, worth = self._grown(self.visits, joins, most, known)
-            if low < most:
-                most = max([low, *(value for _, value in worth)])
-        return most
+        low = 0.0
+        for branches, top in ((0, 2 * most), (1, most)):
+            high = top
+            while low < most and high - low > NEARLY * most:
+                middle = (low + high) / 2
+                self._laying = self._least_laying(middle)
+                # The copy of the visits keeps these joins from becoming `joins`.
+                if self._forced(replace(self.visits), self.joins, middle, {}, branches):
+                    low = middle
+                    yield low
+                else:
+                    high = middle
 
     def force(self, most: float) -> None:
         """Find joins that every map of a cost below `most` has, until no more are found."""
