@@ -382,6 +382,21 @@ def test_maps_with_a_fit_survive_a_round_trip(tmp_path: Path) -> None:
     assert [p.x for p in again.fit.poses] == pytest.approx([p.x for p in found.fit.poses], abs=1e-3)
 
 
+def test_p_values_of_true_maps_are_plausible_if_turns_have_hardly_any_noise() -> None:
+    squares = freedom = 0.0
+    for seed in range(400, 410):
+        noise = Odometry(along=0.05, across=0.005, heading=0.002, turning=0.0, position=0.0)
+        walk = maze(4, 4, steps=24, seed=seed, stars=True, follow=True, odometry=noise)
+        number = {state: i for i, state in enumerate(dict.fromkeys(walk.truth))}
+        labels = tuple(number[state] for state in walk.truth)
+        cells = [state[:2] for state in number if isinstance(state, tuple)]
+        dstates = tuple(DState(i, "", cells.index(cell)) for i, cell in enumerate(cells))
+        found = fit(walk.trace, SSHMap(labels, dstates, ()))
+        assert found.p > 1e-3
+        squares, freedom = squares + found.chi2, freedom + found.dof
+    assert squares == pytest.approx(freedom, rel=0.25)
+
+
 @pytest.mark.parametrize("kept", ["travels", "turns", "most", "few"])
 def test_p_values_of_true_maps_are_plausible_without_turns(kept: str) -> None:
     """20 true maps without reported turns. Headings follow from places that stretches share, or

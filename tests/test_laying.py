@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from unittest.mock import patch
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from onto import walks
 
 from ssh_abduction import Solution, Trace, check, solve
+from ssh_abduction.cli import main
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.drives import onto
 
@@ -91,7 +93,7 @@ def test_onto_costs_as_much_as_solving_all_drives(
     assert laid.weighed.bound <= all_together.weighed.nats
 
 
-def test_interrupted_onto_gives_the_new_drive_its_own_dstates() -> None:
+def test_interrupted_onto_gives_the_new_drive_its_own_dstates(tmp_path: Path) -> None:
     monday, tuesday = (
         around_the_room(0, corners, name, [0.0] * corners)
         for corners, name in ((4, "monday"), (30, "tuesday"))
@@ -99,6 +101,8 @@ def test_interrupted_onto_gives_the_new_drive_its_own_dstates() -> None:
     before = solve(monday)
     with patch.object(onto, "laid", side_effect=KeyboardInterrupt):
         solution = solve(tuesday, onto=before)
+    solution.save(tmp_path / "maps.json")
+    assert main(["check", str(tmp_path / "maps.json")]) == 0  # with the claims of the file
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "interrupted")
     (found,) = solution
     assert found.dstate_at[: len(monday)] == before[0].dstate_at

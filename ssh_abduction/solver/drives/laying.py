@@ -88,7 +88,7 @@ def unproven(
         status=Status.FEASIBLE,
         maps=(found,),
         cost=Cost.of(found),
-        bound=Bound(len(ssh_map.dstates), len(ssh_map.places)),
+        bound=Bound(len(ssh_map.dstates)),
         complete=False,
         theory=problem.theory,
         steps=len(joint),

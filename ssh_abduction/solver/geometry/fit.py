@@ -50,6 +50,8 @@ Array: TypeAlias = NDArray[np.float64]
 
 # With a standard deviation below this, in metres or radians, a displacement counts as exact.
 EXACT = 2e-3
+# But if the mean square error of such displacements is above NOISELESS variances, they have noise.
+NOISELESS = 0.1
 # SWEEPS is the number of iterations of the power method. HELD is the weight that keeps a rotation
 # at its old value. It is small compared with a metre, which has a weight of some hundreds.
 SWEEPS, HELD = 20, 1e-2
@@ -372,12 +374,16 @@ class Poses:
 
         The equations determine neither where each part of the map is nor how it is turned, nor how
         some groups of headings are turned. A displacement with hardly any noise (EXACT) determines
-        as many unknowns as it has equations. So it adds no freedom.
+        as many unknowns as it has equations. So it adds no freedom, unless such displacements have
+        the little noise that they claim.
         """
         said = np.unique(np.concatenate([self._from, self._to]))
         used = np.unique(self._place[said])
         parts = len(np.unique(self._parts()[used]))
         exact = (1 / np.sqrt((self._whitening**2).sum(1)) < EXACT).ravel()
+        errors = self._residuals(unknown)[: len(exact)][exact]
+        if exact.any() and (errors**2).mean() > NOISELESS:
+            exact[:] = False
         settled = 0
         if exact.any():
             look_at_clock()
