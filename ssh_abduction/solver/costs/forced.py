@@ -340,7 +340,8 @@ class Forcing:
     def bounds(self, most: float) -> Iterator[float]:
         """Yield rising lower bounds, at most `most`, on the cost of all maps.
 
-        This leaves `joins` as it is. First try `most` itself. Branching takes much longer, so the first bounds do without.
+        This leaves `joins` as it is. First try `most` itself. Branching takes much longer, so the
+        first bounds do without.
         """
         low = 0.0
         for branches, top in ((0, 2 * most), (1, most)):
