@@ -211,11 +211,11 @@ def test_snapshot_waits_for_the_running_sketch(
     sketches = []
     attempts = Candidates._attempts
 
-    def slowly(candidates: Candidates, beams: bool) -> list[Callable[[], None]]:
+    def slowly(candidates: Candidates) -> list[Callable[[], None]]:
         sketches.append(candidates)
         begun.set()
         time.sleep(0.2)
-        return attempts(candidates, beams)
+        return attempts(candidates)
 
     monkeypatch.setattr(Candidates, "_attempts", slowly)
     search = Search(Trace.load(noisy))

@@ -42,9 +42,9 @@ SKETCH_SHARE = 0.4
 # The sketch that succeeds most often may take this many seconds of processor time even if less time
 # is left. Otherwise a slow or busy machine would find no map.
 SUREST = 1.0
-# The width of a broad beam of hypotheses. Make a beam only for at most LONGEST steps, as its time
-# grows with the cube of their number.
-BROAD, LONGEST = 4, 2000
+# Make a beam of hypotheses only for at most this many steps, as its time grows with the cube of
+# their number.
+LONGEST = 2000
 
 
 class Candidates:
@@ -139,14 +139,14 @@ class Candidates:
             if self._known.best is not before:
                 return
 
-    def sketch(self, seconds: float = math.inf, beams: bool = True) -> None:
+    def sketch(self, seconds: float = math.inf) -> None:
         """Make a sketch (a map without a search), if no map of the whole trace is known.
 
         A sketch extends the best map of a prefix, or begins at the first step. The sketch with the
         most new dstates is large, but the checker accepts it most often and fastest. So it is tried
         first. Then come the others, the smallest first. With a time limit, stop at the first of
         these that is better than the first sketch. `seconds` are for all sketches, and each may use
-        a share of the time left. `beams` says whether to try beams of hypotheses, too.
+        a share of the time left.
         """
         with self._sketching:
             if (
@@ -156,7 +156,7 @@ class Candidates:
             ):
                 return
             whole = Watch().part(seconds)
-            *smaller, surest = self._attempts(beams)
+            *smaller, surest = self._attempts()
             for attempt in (surest, *smaller):
                 # The others take longer than the surest one.
                 if self._known.best is not None and whole.left() < whole.elapsed():
@@ -201,24 +201,17 @@ class Candidates:
                 return self._known.best is not None and len(self._known.best.dstates) == apart
         return False
 
-    def _attempts(self, beams: bool) -> list[Callable[[], None]]:
+    def _attempts(self) -> list[Callable[[], None]]:
         """List functions that each make a map without a search. Those for small maps come first."""
         trace, theory = self._task.trace, self._task.theory
         known = self._known.partial if trace is self._trace else None
-        broad = [partial(self._offer_beam, width) for width in (BROAD, 1) if beams]
         sketches = sketches_of(trace.steps[0], theory)
         if known is not None:
             sketches.insert(0, sketch_beyond(known, trace.prefix(len(known.dstate_at)), theory))
         kinds = [partial(self._go_on_to_end, sketch) for sketch in sketches]
         if theory.misread or theory.slipped or theory.jumped:
             kinds.append(partial(self._offer_mended))
-        return [*broad, self.merge, *kinds]
-
-    def _offer_beam(self, width: int) -> None:
-        """Offer the maps that a beam of hypotheses about the displacements finds."""
-        if beam := self.beam(width):
-            for ssh_map in self.maps_of(beam):
-                self.offer(ssh_map)
+        return [self.merge, *kinds]
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
         """Extend a map to the end of the trace and offer it, unless a step contradicts it."""

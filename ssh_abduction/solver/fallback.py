@@ -47,8 +47,7 @@ def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
     )
     parts.watch.start()  # what is done after the limit counts, too
     with suppress(KeyboardInterrupt):
-        # A search by cost tried beams before.
-        parts.candidates.sketch(overtime(parts), beams=parts.task.theory.weigh == "count")
+        parts.candidates.sketch(overtime(parts))
     if may_salvage:
         salvage(parts)
     answer.count_apart()

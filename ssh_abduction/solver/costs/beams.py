@@ -79,7 +79,7 @@ class Beams:
         watch = self._parts.watch
         time = _Time(watch.elapsed(), watch.left())
         if time.seconds > 0:
-            self._parts.candidates.sketch(SKETCH_SHARE * time.seconds, beams=False)
+            self._parts.candidates.sketch(SKETCH_SHARE * time.seconds)
             self._keep_best()
         may_have_map = self._search_widths(time, clashes)
         if may_have_map:
