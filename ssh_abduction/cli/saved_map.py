@@ -133,6 +133,11 @@ class SavedMap:
                 "gateway: expected a place and a direction such as 'p4 north' or 'monday:12 left', "
                 f"got {brief(text)}; write both"
             )
+        if way not in COMPASS and _THING.fullmatch(where.strip()):
+            raise MapError(
+                f"gateway: expected {', '.join(COMPASS)} after a place, got {brief(way)}; take one "
+                f"of them, or name a step, such as '{step} left'"
+            )
         label = self.map.dstate_at[step_of(self.drives, step)]
         if way not in COMPASS:
             return self._seen_from(label, self._rounded(direction(way), text))
