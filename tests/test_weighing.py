@@ -6,7 +6,8 @@ import math
 from dataclasses import replace
 from itertools import combinations, pairwise, product
 from pathlib import Path
-from unittest.mock import patch
+from types import SimpleNamespace
+from unittest.mock import Mock, patch
 
 import pytest
 import truth
@@ -321,6 +322,39 @@ def test_stopped_search_is_not_sure(route: truth.Known) -> None:
     assert f"among the {len(solution.weighed.rivals)} maps found)" in solution.weighed.sentence
     alone = replace(solution.weighed, rivals=solution.weighed.rivals[:1])
     assert "no other map was found, so it is unknown which joins are doubtful" in alone.sentence
+
+
+@pytest.mark.parametrize(
+    ("seconds", "costs", "asked"),
+    [
+        (600.0, {16: 3.0, 32: 2.0, 64: 2.0}, [16, 32, 64]),
+        (600.0, {16: 3.0, 32: 4.0}, [16, 32]),
+        (math.inf, {16: 3.0}, [16]),
+        (0.05, {16: 3.0}, [16]),  # the beam of 16 takes 0.02 s, and one of 32 would take 0.04 s
+    ],
+)
+def test_wider_beams_follow_while_they_find_better_maps(
+    seconds: float, costs: dict[int, float], asked: list[int]
+) -> None:
+    widths: list[int] = []
+
+    def beam(width: int) -> SimpleNamespace:
+        widths.append(width)
+        return SimpleNamespace(width=width, best=None, refuses=False)
+
+    def maps_of(beam: SimpleNamespace) -> list[int]:
+        clock[0] += beam.width / 800
+        return [beam.width]
+
+    clock = [0.0]
+    watch = SimpleNamespace(elapsed=lambda: clock[0], left=lambda: seconds - clock[0])
+    candidates = SimpleNamespace(sketch=Mock(), beam=beam, maps_of=maps_of)
+    task = SimpleNamespace(theory=Theory())
+    parts = Mock(watch=watch, candidates=candidates, task=task)
+    found = beams.Beams(parts, {1: 5.0, **costs}.__getitem__, Mock())
+    assert found.search(lambda: False)
+    assert widths == [1, *asked]
+    assert found.found(min(costs.values()))
 
 
 def test_misfit_grows_with_returns_and_cores_are_minimal(route: truth.Known) -> None:

@@ -245,7 +245,8 @@ def _nearer(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
     nearer to it.
     """
     moves = np.zeros_like(drive.middles)
-    links = _links(drive, relations, max(visit.radius for visit in drive.visits))
+    widest = max((visit.radius for visit in drive.visits), default=0.0)
+    links = _links(drive, relations, widest)
     shared = {
         k
         for k, near in links.items()

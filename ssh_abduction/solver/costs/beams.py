@@ -1,4 +1,7 @@
-"""Guess maps of little cost by beams of hypotheses, narrow beams first (`guesses/beam.py`)."""
+"""Guess maps of little cost by beams of hypotheses, narrow beams first (`guesses/beam.py`).
+
+If there is a time limit, wider beams follow while they find better maps.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,9 @@ WIDTHS, BREAKING = {1: 0.7, 4: 0.6, 16: 0.7}, 0.8
 # If displacements may be wrong, all beams end at the share JUMPED. Then the best map is often one
 # that they drop, and `wrong_displacements.py` looks for it.
 JUMPED = 0.4
+# With a time limit, beams that are WIDER times as wide as the last one follow while they find
+# better maps. They end at the share WIDENING, as bounds need most of a short time.
+WIDER, WIDENING = 2, 0.3
 # Joining the maps of drives ends after the share JOINING.
 JOINING = 0.5
 # A beam of this width or more nearly always ends with the map of least cost.
@@ -55,11 +61,11 @@ class Beams:
         `keep_best` makes the cheapest known map the best map of the search.
         """
         self._parts, self._add, self._keep_best = parts, add, keep_best
-        # The cost of the best map of the last broad beam, and the estimate of it by the beam.
+        # The cost of the best map of a broad beam, and the estimate of it by this beam.
         self._best = math.inf, math.inf
         self.broken = -math.inf
         self._ended = 0  # the width of the widest beam that ended
-        self._took: list[float] = []  # the seconds of each beam of WIDTHS
+        self._took: list[float] = []  # the seconds of each beam
 
     def found(self, nats: float) -> bool:
         """Whether a broad beam ended with a map of this cost, and `broken` is known.
@@ -118,7 +124,23 @@ class Beams:
             if not self._took and parts.known.best is None and clashes():
                 return False
             self._took.append(watch.elapsed() - began)
+        if time.seconds < math.inf and self._ended == max(WIDTHS):
+            self._widen(time.end(WIDENING))
         return True
+
+    def _widen(self, end: float) -> None:
+        """Search with ever wider beams while they find better maps, up to `end` on the clock."""
+        parts, watch, nats = self._parts, self._parts.watch, math.inf
+        while self._best[0] < nats - EQUAL and watch.elapsed() + WIDER * self._took[-1] < end:
+            began, nats = watch.elapsed(), self._best[0]
+            watch.stage_ends = end
+            beam = parts.candidates.beam(WIDER * self._ended)
+            if beam is None or not self._ends(beam, WIDER * self._ended):
+                break
+            watch.stage_ends = math.inf
+            self._keep_best()
+            parts.report()
+            self._took.append(watch.elapsed() - began)
 
     def _search_without_axioms(self, time: _Time) -> None:
         """If `broken` is unknown, find it with the widest beam that ended."""
@@ -137,7 +159,7 @@ class Beams:
         self._ended = width
         if width >= BROAD:
             estimate = beam.best.nats if beam.best else math.inf
-            self._best = min(nats, default=math.inf), estimate
+            self._best = min(self._best, (min(nats, default=math.inf), estimate))
             # A beam without axioms would be the same if the checker refused nothing.
             self.broken = -math.inf if beam.refuses else 0.0
         return True
