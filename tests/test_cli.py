@@ -391,6 +391,7 @@ def test_setting_level_causal_gives_the_causal_preset(
 ) -> None:
     assert main(["solve", room, "--set", "level=causal"]) == 0
     alone = capsys.readouterr().out
+    assert re.match(r"optimal: \d+ dstates?; 1 minimal map;", alone)  # no places and paths
     assert main(["solve", room, "--theory", "causal"]) == 0
     assert re.sub(r"\d\.\d\d s", "", alone) == re.sub(r"\d\.\d\d s", "", capsys.readouterr().out)
 

@@ -16,7 +16,8 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted as counted  # noqa: PLC0414 - the verbs have it from here
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.solver import Backbone, Solution, Status, stretches
+from ssh_abduction.solver import Backbone, Cost, Solution, Status, stretches
+from ssh_abduction.theory import Theory
 from ssh_abduction.theory.evidence import evidence_of
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         )
     counts = ", ".join(
         counted(v, k) if k != "faults" else f"faults that cost {v:g} dstates"
-        for k, v in solution.cost.to_dict().items()
+        for k, v in _counts_of(solution.cost, solution.theory).items()
     )
     weighed = solution.weighed
     if weighed is not None:
@@ -89,13 +90,21 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         else f"{counted(least, 'maps')} of least cost"
     )
     for level in solution.levels[1:]:
-        parts = (counted(v, k) for k, v in level.cost.to_dict().items())
+        parts = (counted(v, k) for k, v in _counts_of(level.cost, solution.theory).items())
         found += f"; {level.count} with {', '.join(parts)}"
     beyond = f" that cost up to {solution.within} more" if solution.minimal_listed else ""
     return (
         f"optimal: {counts}; "
         f"{found}{'' if solution.complete else f', and there may be more{beyond}{why}'}; {seconds}"
     )
+
+
+def _counts_of(cost: Cost, theory: Theory) -> dict[str, float]:
+    """Return the counts of a cost by name. A causal map has no places and paths to count."""
+    counts = cost.to_dict()
+    if theory.level == "causal":
+        del counts["places"], counts["paths"]
+    return counts
 
 
 def by_displacements(solution: Solution) -> Iterator[str]:
