@@ -474,7 +474,7 @@ def test_verbs_read_the_trace_in_a_file_of_maps(
     assert "steps monday:0 and tuesday:1 are different dstates" in told
     assert "in map 1, the steps are at two places" in told
     for verb in ("evaluate", "train"):  # these need truth, or images
-        assert main([verb, maps, *(["-o", maps] if verb == "train" else [])]) == 1
+        assert main([verb, maps, *(["-o", f"{maps}.skops"] if verb == "train" else [])]) == 1
         assert "trace: expected the trace of" in capsys.readouterr().err
 
 
