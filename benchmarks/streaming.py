@@ -1,10 +1,11 @@
 """How long does it take to find the places of a long drive, and how much memory?
 
-    python benchmarks/streaming.py [KILOMETRES ...] [--seed 1]
+    python benchmarks/streaming.py [KILOMETRES ...] [--seed 1] [--file]
 
 A robot drives at random through a grid of corridors, and its scans are given to `import_live` one
-at a time. The script prints a table in Markdown. The time is the CPU time without the simulation:
-of the track with the places, of the trace with its closures, and of the views. The ratio is that of
+at a time. With --file, a CARMEN log of the drive is read and given to `import_log` instead. The
+script prints a table in Markdown. The time is the CPU time without the simulation: of the track
+with the places, of the trace with its closures, and of the views. The ratio is that of
 the time of the drive to the time of the whole import. The robot drives SPEED metres per second.
 Memory is the growth of the largest resident set since the imports, so each drive has a process of
 its own. The delay is in metres from the end of a visit, by the odometer, until it is final.
@@ -16,14 +17,18 @@ import argparse
 import math
 import multiprocessing
 import resource
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 from time import process_time
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.places.importing import import_live
+from perception.places.importing import import_live, import_log
+from perception.readers.logs import read_log
 from perception.readers.scans import LaserScanner, Scan
+from perception.readers.writers import write_carmen
 from simulator.laser import BEARINGS, meetings
 from simulator.odometer import Odometer
 
@@ -134,17 +139,60 @@ def row_of(task: tuple[float, int]) -> str:
     )
 
 
+def written(task: tuple[float, int]) -> str:
+    """Write the CARMEN log of a drive of some kilometres with a seed, and return its path."""
+    kilometres, seed = task
+    path = Path(tempfile.gettempdir()) / f"drive-{kilometres:g}-{seed}.log"
+    write_carmen(path, Drive(1000 * kilometres, seed).scans())
+    return str(path)
+
+
+def row_of_file(task: tuple[float, str, str]) -> str:
+    """Measure the import of a log of some kilometres, after that of a short log."""
+    kilometres, short, path = task
+    import_log(read_log(short))  # imports
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = process_time()
+    log = read_log(path)
+    read = process_time() - start
+    done = import_log(log)
+    seconds = process_time() - start
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    way = np.array([scan.odometry[:2] for scan in log.scans])
+    driven = float(np.hypot(*np.diff(way, axis=0).T).sum()) / SPEED
+    places = done.seconds["track"] + done.seconds["places"]
+    return (
+        f"| {kilometres:g} | {len(log)} | {len(done.visits)} | {len(done.trace.closures)} | "
+        f"{read:.0f} + {places:.0f} + {done.seconds['trace']:.0f} + {done.seconds['views']:.0f} | "
+        f"{driven:.0f} | 1/{driven / seconds:.0f} | {grown:.0f} |"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("kilometres", nargs="*", type=float, default=[1, 10])
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--file", action="store_true", help="import the log of each drive")
     args = parser.parse_args()
-    print(
-        "| km | scans | visits | closures | CPU s: places, trace, views | driven s | ratio | "
-        "delay in m: median, largest | MiB |\n|---|---|---|---|---|---|---|---|---|"
-    )
+    tasks = [(kilometres, args.seed) for kilometres in args.kilometres]
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
-        for row in pool.imap(row_of, [(kilometres, args.seed) for kilometres in args.kilometres]):
+        if args.file:
+            print(
+                "| km | scans | visits | closures | CPU s: reading, places, trace, views | "
+                "driven s | ratio | MiB |\n|---|---|---|---|---|---|---|---|"
+            )
+            short = pool.apply(written, [(0.06, args.seed)])
+            for task in tasks:
+                path = pool.apply(written, [task])
+                print(pool.apply(row_of_file, [(task[0], short, path)]), flush=True)
+                Path(path).unlink()
+            Path(short).unlink()
+            return
+        print(
+            "| km | scans | visits | closures | CPU s: places, trace, views | driven s | ratio | "
+            "delay in m: median, largest | MiB |\n|---|---|---|---|---|---|---|---|---|"
+        )
+        for row in pool.imap(row_of, tasks):
             print(row, flush=True)
 
 

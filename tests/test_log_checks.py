@@ -129,6 +129,12 @@ def test_warning_for_each_kind_of_bad_log(
     assert told in notes_of(change(scans))
 
 
+def test_missing_odometry_does_not_turn_wrongly(scans: Scans) -> None:
+    notes = notes_of(with_poses(scans[:300:3], lambda x, y, h: (0.0, 0.0, 0.0)))
+    assert "Record the odometry" in notes
+    assert "turn differently" not in notes
+
+
 def test_good_log_gets_no_warning(scans: tuple[Scan, ...]) -> None:
     assert notes_of(scans) == ""
 

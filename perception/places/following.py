@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from perception.places.jumps import Doubt, Unknown, unknown_steps
+from perception.places.jumps import Doubt, Unknown, is_missing, unknown_steps
 from perception.places.track import (
     Array,
     Track,
@@ -319,9 +319,12 @@ def share_failing(track: Track) -> float:
 
 
 def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
-    """List scans that match well but turned differently from the odometry, by how many radians."""
+    """List scans that match well but turned differently from the odometry, by how many radians.
+
+    Without odometry, there is none.
+    """
     found: list[tuple[int, float]] = []
-    for i in range(1, len(log)):
+    for i in range(1, len(log)) if not is_missing(log) else ():
         measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
         off = wrapped(float(track.poses[i, 2] - track.poses[i - 1, 2]) - measured)
         if abs(off) > TURNED and track.shares[i] >= POOR and i not in track.cuts:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from perception.places.importing import Imported
-from perception.readers.scans import Pose, RobotLog
+from perception.readers.scans import Pose, RobotLog, Scan
 from perception.readers.stored import in_turn
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.groups import firsts, gathered
@@ -40,6 +40,8 @@ Point = tuple[float, float]
 
 # The picture has at most one point of a wall in each square with sides of this many metres.
 GRAIN = 0.1
+# The ends of the beams of this many scans are counted at once.
+AT_ONCE = 300
 # A metre has this many units of the page, or fewer, so that the picture is at most LARGEST wide.
 METRE, LARGEST = 24.0, 1500.0
 # Beams longer than this many metres are not drawn: their ends are too far apart to show a wall.
@@ -347,15 +349,25 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
     The squares have sides of GRAIN metres. In a log of more than 100 scans, at least two beams must
     have ended in a square, so that few stray beams are drawn.
     """
-    found = []
-    for scan, pose in zip(in_turn(log.scans), poses, strict=True):
-        x, y, heading = moved(pose, scan.laser.mount)
-        near = np.isfinite(scan.ranges) & (scan.ranges < min(DRAWN, scan.laser.reach))
-        far, angles = scan.ranges[near], heading + scan.laser.bearings[near]
-        found.append(np.stack([x + far * np.cos(angles), y + far * np.sin(angles)], axis=1))
-    cells = np.rint(np.concatenate(found) / GRAIN).astype(int)
-    kept, counts = np.unique(cells, axis=0, return_counts=True)
-    return np.asarray(kept[counts > (1 if len(log) > 100 else 0)] * GRAIN)
+    squares = np.zeros((0, 2), int)
+    counts: Array = np.zeros(0)
+    # The ends of all beams of a long log would need much memory.
+    for begin in range(0, len(log), AT_ONCE):
+        some = slice(begin, begin + AT_ONCE)
+        ends = map(_ends, in_turn(log.scans[some]), poses[some])
+        cells = np.rint(np.concatenate(list(ends)) / GRAIN).astype(int)
+        every, weights = np.concatenate([squares, cells]), np.append(counts, np.ones(len(cells)))
+        squares, numbers = np.unique(every, axis=0, return_inverse=True)
+        counts = np.bincount(numbers.ravel(), weights).astype(float)
+    return np.asarray(squares[counts > (1 if len(log) > 100 else 0)] * GRAIN)
+
+
+def _ends(scan: Scan, pose: Pose) -> Array:
+    """The points, in metres, at which the beams of a scan ended: (n, 2)."""
+    x, y, heading = moved(pose, scan.laser.mount)
+    near = np.isfinite(scan.ranges) & (scan.ranges < min(DRAWN, scan.laser.reach))
+    far, angles = scan.ranges[near], heading + scan.laser.bearings[near]
+    return np.stack([x + far * np.cos(angles), y + far * np.sin(angles)], axis=1)
 
 
 def _pose(row: Array) -> Pose:
