@@ -377,7 +377,7 @@ def test_report_says_why_there_is_no_map_or_proof() -> None:
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["-o", "{file}"], "expected a folder to write, got a file"),
+        (["-o", "{file}"], "expected another file to write than the one to read"),
         (["-o", "{file}/x"], "expected a folder to write, got a file"),
         (["-o", "x", "--time-limit", "-1"], "--time-limit: expected a number of seconds above 0"),
         (["-o", "x", "--maps", "-1"], "--maps: expected a number of minimal maps to list"),
