@@ -155,6 +155,7 @@ def drives_at_bearings(draw: st.DrawFn) -> Trace:
     return Trace(tuple(steps))
 
 
+@pytest.mark.slow
 @settings(max_examples=6)
 @given(drives_at_bearings(), st.sampled_from([0.5, 1.0, 2.0]))
 def test_maps_with_changes_at_bearings_equal_the_brute_force(trace: Trace, price: float) -> None:

@@ -115,6 +115,7 @@ def true_map(known: truth.Known) -> SSHMap:
     return SSHMap(labels, tuple(dstates.values()), (), ())
 
 
+@pytest.mark.slow
 def test_forced_bound_counts_the_price_of_laying_drives() -> None:
     noise = truth.Noise(Odometry(**truth.NOISE))
     (known,) = together.of_mazes(4, 60, [4], noise, 3)

@@ -74,6 +74,7 @@ def test_joined_map_names_the_gateways_that_changed(seed: int) -> None:
     assert not [*violations(problem.trace, best, problem.theory)]
 
 
+@pytest.mark.slow
 def test_two_places_at_one_position_prevent_a_probability() -> None:
     """A gateway is closed on the second drive. If gateways may not change, a place is two."""
     drives = [

@@ -167,6 +167,7 @@ def test_map_of_a_maze_with_jumps_costs_at_most_the_true_cost() -> None:
     assert solution.weighed.proven or solution.weighed.confidence < 0.5
 
 
+@pytest.mark.slow
 def test_annealing_with_a_jump_costs_at_most_the_true_cost() -> None:
     """It begins with a map that believes all displacements, and changes one guess at a time."""
     walk, jump = maze(3, 3, steps=16, seed=12, stars=True, follow=True, odometry=NOISE), 6

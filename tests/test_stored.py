@@ -44,6 +44,7 @@ def test_ranges_stay_in_memory_on_a_full_disk(monkeypatch: pytest.MonkeyPatch) -
         assert (kept.ranges == scan.ranges).all()
 
 
+@pytest.mark.slow
 def test_read_log_keeps_ranges_out_of_memory(tmp_path: Path) -> None:
     count = 2000
     write_carmen(tmp_path / "drive.log", scans_of(count))

@@ -132,6 +132,7 @@ def subsets(steps: list[int]) -> list[tuple[int, ...]]:
     return [some for size in range(len(steps) + 1) for some in combinations(steps, size)]
 
 
+@pytest.mark.slow
 @settings(max_examples=4)
 @given(st.data())
 def test_faults_and_misfit_are_weighed_together(data: st.DataObject) -> None:
