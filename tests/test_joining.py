@@ -189,6 +189,14 @@ def test_drive_is_joined_where_later_steps_agree() -> None:
     assert not [*violations(problem.trace, ssh_map, problem.theory)]
 
 
+def test_map_that_keeps_drives_apart_is_not_sure_if_they_may_share_a_dstate() -> None:
+    """Laying costs 32 nats, and one dstate with its place saves 16. A tenth of that counts."""
+    apart = solve(along("abc", "a"))
+    assert apart.weighed is not None
+    assert apart.probability(0, 3) == pytest.approx(1 / (1 + math.exp(1.6)), abs=1e-4)
+    assert [rival.nats - apart.weighed.nats for rival in apart.weighed.rivals] == [0.0, 16.0]
+
+
 def test_drives_with_one_common_view_are_joined_only_by_a_closure() -> None:
     """One place may look like another by chance. A closure between them says that they are one."""
     joint = along("abcda", "ax")

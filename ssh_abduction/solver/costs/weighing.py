@@ -43,6 +43,7 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.costs.beams import Beams
 from ssh_abduction.solver.costs.estimating import (
+    CERTAIN,
     Course,
     doubt_of,
     dstates_and_places,
@@ -61,11 +62,12 @@ from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.solver.solution.weighed import EQUAL, Rival, Weighed
+from ssh_abduction.solver.solution.weighed import CHANCE, EQUAL, Rival, Weighed
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
+from ssh_abduction.theory.overlap import groups_of
 from ssh_abduction.theory.settle import Problem, displacement_of
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
@@ -125,6 +127,8 @@ class Weighing:
         self.proven = False
         self._of_labels: OfLabels | None = None
         self._beams = Beams(parts, self.add, self.keep_best)
+        # For each number of groups of drives that share dstates, the cheapest map.
+        self._of_groups: dict[int, Candidate] = {}
         self._improved = 0.0  # the seconds on the clock when the best map was found
 
     @property
@@ -273,6 +277,8 @@ class Weighing:
         nats = self._misfit.nats_of(ssh_map)
         if self.candidates and nats < self.candidates[0].nats - EQUAL:
             self._improved = self._parts.watch.elapsed()
+        if self._parts.task.theory.several_drives:
+            self._keep_for_groups(Candidate(ssh_map, nats))
         if all(known.map != ssh_map for known in self.candidates):
             self.candidates.append(Candidate(ssh_map, nats))
             self.candidates.sort(key=lambda candidate: candidate.nats)
@@ -282,6 +288,18 @@ class Weighing:
             most = self.candidates[0].nats + max(self._within, EQUAL)
             self.candidates = [c for c in self.candidates if c.nats < most][:RIVALS]
         return nats
+
+    def _keep_for_groups(self, candidate: Candidate) -> None:
+        """Keep a map if no known map costs less that has as many groups of drives.
+
+        Drives in a group share dstates.
+        """
+        drives = drives_of(self._parts.task.trace)
+        of_step = [i for i, drive in enumerate(drives) for _ in range(drive.first, drive.stop)]
+        rival = rival_of(candidate.map, candidate.nats)
+        groups = groups_of(rival.dstates, of_step, range(len(drives)))
+        if groups not in self._of_groups or candidate.nats < self._of_groups[groups].nats:
+            self._of_groups[groups] = candidate
 
     def too_expensive(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
         """Add a map. Return equalities that exclude it, but no map worth finding.
@@ -339,7 +357,9 @@ class Weighing:
         if not self.candidates:
             return None
         rivals: dict[Course, Rival] = {}
-        for candidate in self.candidates:
+        most = self.candidates[0].nats + CHANCE * CERTAIN
+        groups = sorted(self._of_groups.values(), key=lambda candidate: candidate.nats)
+        for candidate in (*self.candidates, *(c for c in groups if c.nats < most)):
             rival = rival_of(candidate.map, candidate.nats)
             rivals.setdefault((rival.dstates, rival.places), rival)
         found, excess = list(rivals.values()), self._excess()
