@@ -131,6 +131,7 @@ def test_forced_bound_counts_the_price_of_laying_drives() -> None:
     assert bounds[0] > 0.92 * cost  # more drives must be laid in maps below a cost that is lower
 
 
+@pytest.mark.slow
 def test_forcing_tries_single_missing_joins_to_raise_the_bound() -> None:
     known = truth.random_walk(6, 150, 3002, truth.Noise(Odometry(**FINE)))
     ssh_map, problem = true_map(known), settle(known.trace)

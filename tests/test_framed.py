@@ -306,6 +306,7 @@ def test_mazes_with_stars_have_true_maps(seed: int, counts: tuple[int, int, int]
         assert check(walk.trace, ssh_map, Theory.topological()) == ()
 
 
+@pytest.mark.slow
 def test_pinning_segments_keeps_all_maps() -> None:
     trace = maze(4, 4, steps=100, seed=41, stars=True).trace
     given: list[tuple[list[int], Sequence[int]]] = []

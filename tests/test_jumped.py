@@ -67,6 +67,7 @@ def small_traces(draw: st.DrawFn) -> Trace:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=5)
 @given(small_traces(), st.booleans(), st.sampled_from([0.4, 1.0, 1.7]))
 def test_maps_with_jumps_equal_the_best_subset_of_displacements(

@@ -73,6 +73,7 @@ ERRORS = st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3)
     st.tuples(st.integers(0, 3), st.integers(1, 3), ERRORS),
     st.tuples(st.integers(0, 3), st.integers(1, 3), ERRORS),
 )
+@pytest.mark.slow
 def test_onto_costs_as_much_as_solving_all_drives(
     monday: tuple[int, int, list[float]], tuesday: tuple[int, int, list[float]]
 ) -> None:

@@ -120,6 +120,7 @@ def test_verbs_accept_the_folder_of_a_map(
     assert said.out
 
 
+@pytest.mark.slow
 def test_explain_prints_the_probability_of_a_join(
     runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -268,6 +268,7 @@ def maze(seed: int, side: int = 4, steps: int = 150) -> SSHMap:
     return with_regions(found.renumbered(), trace)
 
 
+@pytest.mark.slow
 def test_route_by_regions_agrees_with_the_plain_route() -> None:
     ssh_map = maze(2)
     assert ssh_map.regions

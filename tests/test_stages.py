@@ -38,6 +38,7 @@ def started(limit: float | None = None) -> Watch:
     return watch
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(st.data())
 def test_change_of_engine_changes_no_answer(data: st.DataObject) -> None:
