@@ -186,6 +186,7 @@ def test_completion_refuses_an_action_that_leads_to_two_dstates() -> None:
     assert completed(trace, theory, [0, 1, 0, 2], [0, 1, 1], [0.0, 0.0, math.pi]) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [203])
 def test_beam_cost_with_floors_equals_the_cost_of_the_map(seed: int) -> None:
     """The headings err by degrees. So equations that stay linear would miss by many nats."""

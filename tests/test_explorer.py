@@ -196,6 +196,7 @@ def test_explorer_ends_as_contradicted_without_a_map() -> None:
     assert found.steps < 10
 
 
+@pytest.mark.slow
 def test_explorer_continues_after_a_step_limit() -> None:
     whole, parts = (
         Explorer(Streetwalker(CORRIDOR, "a", "E"), margin=0, time_limit=None) for _ in range(2)

@@ -296,6 +296,7 @@ def test_telling_features_are_the_beams_at_the_notch(run: Trace) -> None:
             assert at[1] < 0.01, (i, method, at)
 
 
+@pytest.mark.slow
 def test_tell_apart_prints_and_plots_telling_beams(
     run: Trace, learnt: BootstrapLearner, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

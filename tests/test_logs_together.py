@@ -120,6 +120,7 @@ def test_join_logs_keeps_a_single_log(
     assert join_logs(halves[:1], [part]) == (halves[0], part)
 
 
+@pytest.mark.slow
 def test_map_together_joins_two_drives(folder: Path) -> None:
     run = json.loads((folder / "run.json").read_text())
     assert [drive["name"] for drive in run["drives"]] == ["monday", "tuesday"]

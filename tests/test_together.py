@@ -348,6 +348,7 @@ def test_shell_accepts_step_names_with_drives(
 MAZES = [*of_mazes(3, 20, range(3), truth.Noise(Odometry(**truth.NOISE)))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", MAZES[1:], ids=[known.name for known in MAZES[1:]])
 def test_narrow_beam_finds_a_joint_map_as_cheap_as_the_true_one(known: truth.Known) -> None:
     """Three drives start anywhere in a maze, with any heading."""

@@ -67,6 +67,7 @@ def test_aces3_displacements_fit_its_layout() -> None:
     ] == [23.5, 0.0]
 
 
+@pytest.mark.slow
 def test_map_is_true_if_its_dstates_and_places_are() -> None:
     (known,) = truth.mazes(2, 20, [1], truth.Noise(NOISE))
     ssh_map = next(
