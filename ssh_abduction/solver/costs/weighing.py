@@ -62,12 +62,17 @@ from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.solver.solution.weighed import CHANCE, EQUAL, Rival, Weighed
+from ssh_abduction.solver.solution.weighed import (
+    CHANCE,
+    EQUAL,
+    Rival,
+    Weighed,
+    groups_of_drives,
+)
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
-from ssh_abduction.theory.overlap import groups_of
 from ssh_abduction.theory.settle import Problem, displacement_of
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
@@ -294,10 +299,7 @@ class Weighing:
 
         Drives in a group share dstates.
         """
-        drives = drives_of(self._parts.task.trace)
-        of_step = [i for i, drive in enumerate(drives) for _ in range(drive.first, drive.stop)]
-        rival = rival_of(candidate.map, candidate.nats)
-        groups = groups_of(rival.dstates, of_step, range(len(drives)))
+        groups = groups_of_drives(candidate.map.dstate_at, drives_of(self._parts.task.trace))
         if groups not in self._of_groups or candidate.nats < self._of_groups[groups].nats:
             self._of_groups[groups] = candidate
 

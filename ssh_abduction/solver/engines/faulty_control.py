@@ -105,7 +105,7 @@ class FaultyControl:
             self.given |= set(range(max(step - AROUND, 0), min(step + AROUND + 1, size)))
 
     def learn_from(self, answer: FaultyAnswer) -> None:
-        """Add names for each view of which an answer uses the rest; let misread steps have any."""
+        """Add names for views whose rest an answer uses. Its misread steps may have any name."""
         if answer.rests:
             used = Counter(
                 view

@@ -8,7 +8,7 @@ one that costs 3 nats more is exp(3) = 20 times less probable.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -99,10 +99,7 @@ class Weighed:
         Drives that share places form groups. If the groups of a rival differ from those of the best
         map, the difference of the two costs is divided by CHANCE.
         """
-        drive = [i for i, d in enumerate(self.drives) for _ in range(d.first, d.stop)]
-        ways = [
-            groups_of(r.places or r.dstates, drive, range(len(self.drives))) for r in self.rivals
-        ]
+        ways = [groups_of_drives(r.places or r.dstates, self.drives) for r in self.rivals]
         likely = [
             math.exp((self.nats - rival.nats) / self.excess / (1.0 if way == ways[0] else CHANCE))
             for rival, way in zip(self.rivals, ways, strict=True)
@@ -294,6 +291,12 @@ def probability_in_words(probability: float) -> str:
     if probability < 0.005:
         return "below 0.01"
     return "above 0.99" if probability >= 0.995 else f"{probability:.2f}"
+
+
+def groups_of_drives(at: Sequence[int], drives: Sequence[Drive]) -> int:
+    """Count the groups of drives that share no dstate or place; `at` has that of each step."""
+    drive = [i for i, d in enumerate(drives) for _ in range(d.first, d.stop)]
+    return groups_of(at, drive, range(len(drives)))
 
 
 def _rival(read: FieldReader, value: Any, name: str, steps: int) -> Rival:
