@@ -203,6 +203,61 @@ def test_any_step_at_a_place_renames_it(folder: Path, capsys: pytest.CaptureFixt
     assert [n.name for n in load_corrections(building).names] == ["lobby"]
 
 
+@pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
+def test_corrections_take_names_and_stay_with_their_steps(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The places get other numbers when a drive comes first that sees them in another order."""
+    building, maps = folder / "building", str(folder / "building" / "maps.json")
+    assert main(solving(folder, "round")) == 0
+    for place, name in (("p0", "north hall"), ("p1", "kitchen")):
+        assert main(["name", maps, place, name]) == 0
+    said = ["--open", "north hall north", "--elsewhere", "kitchen, north hall"]
+    assert main(["correct", maps, *said]) == 0
+    by_name = load_corrections(building)
+    (building / "corrections.yaml").unlink()
+    assert main(["correct", maps, "--open", "p0 north", "--elsewhere", "p1,round:0"]) == 0
+    by_number = load_corrections(building)
+    assert by_name.gateways == by_number.gateways
+    assert by_name.pairs == by_number.pairs
+    save_corrections(by_name, building)
+    replace(ROUND[1:], name="first").save(folder / "first.jsonl")
+    assert main(solving(folder, "first", "round")) == 0
+    solution = Solution.load(maps)
+    assert solution.theory.elsewhere == ((6, 7),)
+    hall = solution[0].place_of(6)
+    assert hall != 0
+    assert solution[0].name_of("place", hall) == "north hall"
+    assert main(["correct", maps, "--name", "kitchen", "pantry"]) == 0
+    assert [n.step for n in load_corrections(building).names] == ["round:0", "round:1"]
+    capsys.readouterr()
+    for verb in (["route", maps, "--to", "panty"], ["correct", maps, "--open", "panty west"]):
+        assert main(verb) == 1
+        assert "did you mean pantry?" in capsys.readouterr().err
+    for wrong, told in (
+        ("north hal", "did you mean north hall?"),
+        ("path0", "got the path 'path0'"),
+    ):
+        assert main(["correct", maps, "--elsewhere", f"{wrong},pantry"]) == 1
+        assert told in capsys.readouterr().err
+    assert main(["explain", maps, "pantry", "path0"]) == 0
+    assert capsys.readouterr().out.startswith("place 1 ")
+    assert main(["explain", maps, "pantri"]) == 1
+    assert "did you mean pantry?" in capsys.readouterr().err
+
+
+def test_two_names_of_one_place_can_both_be_changed(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = Corrections(MARKS).with_name("start", "place", "monday:0")
+    save_corrections(said.with_name("end", "place", "monday:3"), folder / "building")
+    assert main(["name", str(folder / "building"), "end", "exit"]) == 0
+    assert main(["correct", str(folder / "building"), "--elsewhere", "start,exit"]) == 0
+    found = load_corrections(folder / "building")
+    assert [n.name for n in found.names] == ["start", "exit"]
+    assert found.pairs[0].steps == ("monday:0", "monday:3")
+
+
 @pytest.mark.parametrize("name", ["5", "p4", "place 4", "path2", "region 0"])
 def test_name_that_looks_like_a_number_is_refused(
     name: str, folder: Path, capsys: pytest.CaptureFixture[str]

@@ -16,11 +16,11 @@ from ssh_abduction.data.words import counted
 HELPS = {
     "same": "steps I and J, such as monday:12,tuesday:3, are one dstate",
     "different": "steps I and J are different dstates",
-    "elsewhere": "steps I and J are at different places",
-    "same_place": "steps I and J are at one place",
+    "elsewhere": "I and J, steps or places such as p4 or kitchen, are different places",
+    "same_place": "I and J, named as with --elsewhere, are one place",
     "open": (
-        "a gateway is open: a place and a direction on the drawn map, such as 'p4 north', or a "
-        "step and a direction from the robot, such as 'monday:12 left'"
+        "a gateway is open: a place and a direction on the drawn map, such as 'kitchen north', or "
+        "a step and a direction from the robot, such as 'monday:12 left'"
     ),
     "closed": "a gateway, named as with --open, is closed",
 }
@@ -42,7 +42,7 @@ def add_parser(verbs: Verbs) -> None:
         parser.add(f"--{name.replace('_', '-')}", words, action="append", metavar=metavar)
     parser.add(
         "--name",
-        "name a place, path or region (p4, path2, region3), or the place of a step (monday:12)",
+        "name or rename a place, path or region (p4, path2, kitchen), or the place of a step",
         action="append",
         nargs=2,
         metavar=("WHAT", "NAME"),
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
         for gateway in gateways or ():
             said = said.with_gateway(is_open, saved.gateway(gateway))
     for what, name in options.name or ():
-        said = said.with_name(name, *saved.thing(what))
+        said = said.with_name(name, *saved.thing_to_name(what))
     if said == saved.corrections:
         print("\n".join(map(printable, sentences_of(said))) or "nothing was said")
         return 0
@@ -79,8 +79,12 @@ def _how_to_obey(maps: Path) -> str:
 
 
 def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
-    """Read a pair of steps, such as "monday:12,tuesday:3", or raise MapError."""
-    steps = at_comma(pair, saved.step)
+    """Read a pair of steps, such as "monday:12,tuesday:3", or raise MapError.
+
+    Sentences about places also take places, such as "kitchen,p7".
+    """
+    about_places = kind in ("elsewhere", "same_place")
+    steps = at_comma(pair, saved.step_at_place if about_places else saved.step)
     if len(steps) != 2 or steps[0] == steps[1]:
         raise MapError(
             f"--{kind.replace('_', '-')}: expected two steps such as monday:12,tuesday:3, got "

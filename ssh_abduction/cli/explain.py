@@ -7,7 +7,7 @@ side of the path the place lies. With a place alone, it does so for all paths.
 from __future__ import annotations
 
 import argparse
-import re
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -30,7 +30,9 @@ from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.map_parts import thing_named
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import meant
 from ssh_abduction.explain.mend import TraceExplanation, TraceQuestion
 from ssh_abduction.explain.pairs import PairQuestion
 from ssh_abduction.explain.sides import PlaceExplanation, PlaceQuestion
@@ -44,8 +46,6 @@ if TYPE_CHECKING:
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
 SECONDS = 60.0  # the default time limit: joint maps with changes may need hours for a proof
-# A place, and perhaps a path, in the words of the command line: "p7 path2".
-_PLACE = re.compile(r"p(\d+)(?: path(\d+))?")
 
 Answer: TypeAlias = PairExplanation | TraceExplanation | PlaceExplanation
 
@@ -74,7 +74,8 @@ def add_parser(verbs: Verbs) -> None:
         "steps",
         "the numbers of two steps, from 0, or DRIVE:STEP in a joint trace. Leave them out to "
         "learn why there is no map. Or a place and a path of the first minimal map, such as p7 "
-        "path2, or a place alone, to learn on which side of each path and in which regions it is",
+        "path2, or a place alone, to learn on which side of each path and in which regions it is. "
+        "With a file of maps, also by their names",
         nargs="*",
         default=(),
         metavar="step",
@@ -97,12 +98,6 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    of_place = _PLACE.fullmatch(" ".join(options.steps))
-    if not of_place and len(options.steps) not in (0, 2):
-        raise AbductionError(
-            f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are "
-            "to be explained, or a place and a path, as in p7 path2"
-        )
     kept = trace_of_maps(options.trace)
     if kept is not None or Path(options.trace).is_dir():
         options.theory = options.theory or maps_path(options.trace)
@@ -114,12 +109,11 @@ def run(options: argparse.Namespace) -> int:
     listing = _listing_of(maps, data, len(trace)) if found and options.steps else None
     if listing is not None:
         limits["known"] = listing.maps
+    of_place = _place_asked(options.steps, listing)
     question: PairQuestion | TraceQuestion | PlaceQuestion
     pair: PairInMap | None = None
     if of_place:
-        place, path = (None if n is None else int(n) for n in of_place.groups())
-        assert place is not None
-        question = PlaceQuestion(trace, place, path, theory, **limits)
+        question = PlaceQuestion(trace, *of_place, theory, **limits)
     elif options.steps:
         first, second = (step_named(trace, step) for step in options.steps)
         if listing is not None:
@@ -148,6 +142,26 @@ def run(options: argparse.Namespace) -> int:
     return _exit_code(answer)
 
 
+def _place_asked(words: Sequence[str], listing: Listing | None) -> tuple[int, int | None] | None:
+    """Return the numbers of the place and of the path that the user asks about; None for steps.
+
+    Names are those of the first listed map. Raises AbductionError if the words are neither.
+    """
+    names = listing.maps[0].names if listing is not None else ()
+    found = [thing_named(word, names) or ("", 0) for word in words]
+    kinds = [kind for kind, _ in found]
+    if kinds in (["place"], ["place", "path"]):
+        return found[0][1], found[1][1] if found[1:] else None
+    if len(words) not in (0, 2):
+        texts = [name.text for name in names]
+        raise AbductionError(
+            f"steps: expected two, or none, got {len(words)}; name the two steps that are "
+            "to be explained, or a place and a path, as in p7 path2"
+            + "".join(meant(word, texts, 3) for word in words[:1])
+        )
+    return None
+
+
 def _maps_of(options: argparse.Namespace) -> tuple[str | None, Theory | None, Any]:
     """Return the file that --theory names, the theory of its maps, and its data.
 
@@ -170,7 +184,7 @@ def _listing_of(file: str | None, data: Any, steps: int) -> Listing | None:
     from ssh_abduction.rivals.listing import Listing  # loads numpy
 
     listing = Listing.from_dict(data, named(file))
-    return listing if listing.steps == steps else None
+    return listing.named_beside(file) if listing.steps == steps else None
 
 
 def _as_text(in_map: PairInMap | None, seconds: float, explanation: Answer) -> str:

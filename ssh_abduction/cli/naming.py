@@ -22,8 +22,8 @@ def add_parser(verbs: Verbs) -> None:
     add_maps(parser)
     parser.add(
         "what",
-        "a place such as p4, a path such as path2, a region such as region3, or a step such "
-        "as monday:12, for its place",
+        "a place such as p4, a path such as path2, a region such as region3, or its name so far; "
+        "or a step such as monday:12, for its place",
     )
     parser.add("name", 'the name, such as "kitchen"')
     add_map(parser)
@@ -31,8 +31,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     saved = SavedMap.load(options.maps, options.map)
-    kind, step = saved.thing(options.what)
-    step = saved.step_of_name(kind, step)
+    kind, step = saved.thing_to_name(options.what)
     file = saved.save(saved.corrections.with_name(options.name, kind, step))
     print(printable(f"the {kind} of {step} is {options.name.strip()!r}, in {named(file)}"))
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import os
 import re
 import sys
@@ -20,6 +19,7 @@ from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, bri
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import meant
 from ssh_abduction.theory.fields import ASSERTIONS, CHOICES
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
@@ -383,11 +383,10 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
         return Theory.from_toml(named_theory).replace(**chosen)
     named_theory = maps_path(named_theory)
     if not (named_theory.endswith(".json") or Path(named_theory).is_file()):
-        near = difflib.get_close_matches(named_theory, PRESETS, n=1)
-        hint = f"did you mean {near[0]}?" if near else "name one of them"
+        hint = meant(named_theory, PRESETS)
         raise TheoryError(
             f"--theory: expected {', '.join(PRESETS)}, a .toml file, or a file of maps, "
-            f"got {brief(named_theory)}; {hint}"
+            f"got {brief(named_theory)}; name one of them{hint}"
         )
     return theory_of_maps(read_json(named_theory), named_theory).replace(**chosen)
 

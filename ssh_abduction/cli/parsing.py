@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from ssh_abduction.data.errors import printable
+from ssh_abduction.data.words import meant
 
 # Options of version 0.1.0 that have another name now. They still work, with a warning.
 REPLACED = {"as": "format", "theory-of": "theory", "localize": "run"}
@@ -61,7 +61,7 @@ class Setting:
         """Convert text to a value. Raise argparse.ArgumentTypeError if it is wrong."""
         if self.choices and text not in self.choices:
             expected = " or ".join(filter(None, (", ".join(self.choices[:-1]), self.choices[-1])))
-            hint = _meant(text, self.choices)
+            hint = meant(text, self.choices)
             raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}{hint}")
         try:
             return self.type(text)
@@ -94,7 +94,7 @@ class _Set(argparse.Action):
         setting = parser.settings.get(name.strip().replace("-", "_"))
         if setting is None or not equals:
             known = ", ".join(parser.settings)
-            hint = f"; write {name}=VALUE" if setting else _meant(name, parser.settings)
+            hint = f"; write {name}=VALUE" if setting else meant(name, parser.settings)
             raise argparse.ArgumentError(
                 self, f"expected NAME=VALUE with a name out of {known}, got {values!r}{hint}"
             )
@@ -215,7 +215,7 @@ class Parser(argparse.ArgumentParser):
         try:
             super()._check_value(action, value)
         except argparse.ArgumentError as error:
-            hint = _meant(value, map(str, action.choices or ()))
+            hint = meant(value, map(str, action.choices or ()))
             raise argparse.ArgumentError(action, f"{error.message}{hint}") from None
 
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
@@ -231,7 +231,7 @@ class Parser(argparse.ArgumentParser):
         if unknown:
             verb = self.verbs[options.verb] if getattr(options, "verb", None) else self
             wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
-            hint = _meant(wrong.partition("=")[0], verb.names)
+            hint = meant(wrong.partition("=")[0], verb.names)
             if not wrong.startswith("-") and verb.takes_many:
                 hint = "; write them before the options"
             verb.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
@@ -358,9 +358,3 @@ def _exported(words: list[str], at: int, notes: list[str]) -> list[str]:
 
 def _note(old: str, new: str) -> str:
     return f"{printable(old)} is deprecated; write {printable(new)}"
-
-
-def _meant(word: object, names: Iterable[str]) -> str:
-    """Make a hint such as "; did you mean star?" if a name is similar to a word; else ""."""
-    near = difflib.get_close_matches(str(word), list(names), n=1)
-    return f"; did you mean {near[0]}?" if near else ""

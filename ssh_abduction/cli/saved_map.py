@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ssh_abduction.cli.options import maps_path, read_maps, trace_of_maps
-from ssh_abduction.data.corrections import Corrections
+from ssh_abduction.data.corrections import Corrections, Naming
 from ssh_abduction.data.corrections_file import FILE, direction, load_corrections, save_corrections
 from ssh_abduction.data.drives import Drive, step_name, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
+from ssh_abduction.data.map_parts import NAMED, thing_named
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import region_of
+from ssh_abduction.data.words import meant
 from ssh_abduction.rivals.listing import Listing
 
 # Directions on the map as it is drawn, in degrees counterclockwise from east.
 COMPASS = {"east": 0.0, "north": 90.0, "west": 180.0, "south": 270.0}
-_THING = re.compile(r"(?P<kind>p|place|path|region) ?(?P<number>\d{1,9})")
-_KINDS = {"p": "place"}
 
 
 @dataclass(frozen=True)
@@ -64,6 +63,8 @@ class SavedMap:
         said.check_drives(known)
         drives = {**said.drives, **{name: str(mark) for name, mark in known.items()}}
         ssh_map = listing.maps[listing.number(str(number))]
+        if beside.is_file():
+            ssh_map = said.named(ssh_map, listing.drives)
         is_framed = isinstance(theory, dict) and theory.get("star") == "frame"
         return cls(ssh_map, listing.drives, file, replace(said, drives=drives), is_framed)
 
@@ -80,15 +81,34 @@ class SavedMap:
         return file
 
     def thing(self, text: str) -> tuple[str, str]:
-        """Find what a person names: return its kind, and the first step there. Raises MapError.
+        """Find what a person names: return its kind, and a step there. Raises MapError.
 
-        The text is a place, path or region by its number, such as "p4" or "path 2"; or a
-        step such as "monday:12", for the place where the robot was.
+        The text is a place, path or region by its number, such as "p4" or "path 2", or by its name,
+        such as "kitchen"; or a step such as "monday:12", for the place where the robot was.
         """
-        found = _THING.fullmatch(text)
-        if found is None:
+        if found := self._numbered_or_named(text):
+            return found
+        try:
             return "place", self.step(text)
-        kind, number = _KINDS.get(found["kind"], found["kind"]), int(found["number"])
+        except MapError as error:
+            names = {name.text for name in self.map.names} | {n.name for n in self._names}
+            hint = meant(text, names, 3) or "; or a place such as p4"
+            raise MapError(f"{error}{hint}") from None
+
+    @property
+    def _names(self) -> tuple[Naming, ...]:
+        """The names that a person gave in the drives of this map."""
+        return self.corrections.known_in(self.drives).names
+
+    def _numbered_or_named(self, text: str) -> tuple[str, str] | None:
+        """Find a place, path or region by its number or name, as `thing`; None for a step."""
+        # If two places with names became one place of this map, the map has only the first name.
+        for naming in self._names:
+            if naming.name == text:
+                return naming.kind, naming.step
+        kind, number = thing_named(text, self.map.names) or ("", -1)
+        if kind not in NAMED:
+            return None
         here = (t for t, s in enumerate(self.map.dstate_at) if self._of(kind, s) == number)
         first = next(here, None)
         if first is None:
@@ -99,32 +119,36 @@ class SavedMap:
             )
         return kind, step_name(self.drives, first)
 
-    def step_of_name(self, kind: str, step: str) -> str:
-        """Return the step to which the name of a place, path or region belongs.
-
-        `kind` says whether this is the place, path or region of `step`. If it has no name yet,
-        return `step`.
-        """
+    def thing_to_name(self, text: str) -> tuple[str, str]:
+        """Find what a person names, as `thing`. If it has a name, return the step of this name."""
+        kind, step = self.thing(text)
         number = self._at(kind, step)
-        names = self.corrections.known_in(self.drives).names
-        return next(
-            (n.step for n in names if (n.kind, self._at(kind, n.step)) == (kind, number)), step
-        )
+        there = [n.step for n in self._names if (n.kind, self._at(kind, n.step)) == (kind, number)]
+        return kind, step if step in there or not there else there[0]
 
     def step(self, text: str) -> str:
         """Return the name of a step, such as "monday:12". Raise MapError if there is none."""
         try:
             return step_name(self.drives, step_of(self.drives, text))
         except TraceError as error:
-            raise MapError(f"{error}; or a place such as p4") from None
+            raise MapError(str(error)) from None
+
+    def step_at_place(self, text: str) -> str:
+        """Return a step at a place, named as for `thing`. Raise MapError for anything else."""
+        kind, step = self.thing(text)
+        if kind != "place":
+            raise MapError(
+                f"expected a place or a step, got the {kind} {brief(text)}; name a place"
+            )
+        return step
 
     def gateway(self, text: str) -> tuple[tuple[str, float], ...]:
         """Return the steps at the place of a gateway, each with the gateway's direction.
 
         Directions are degrees clockwise from ahead. The text is a place and a direction on the
-        drawn map, such as "p4 north"; or a step and a direction from the robot, such as "monday:12
-        left" or "monday:12 135". Raises MapError if the map has no such place or step, or no
-        headings there.
+        drawn map, such as "p4 north" or "kitchen north"; or a step and a direction from the robot,
+        such as "monday:12 left" or "monday:12 135". Raises MapError if the map has no such place or
+        step, or no headings there.
         """
         where, _, way = text.strip().rpartition(" ")
         kind, step = self.thing(where.strip()) if where else ("", "")
@@ -133,7 +157,7 @@ class SavedMap:
                 "gateway: expected a place and a direction such as 'p4 north' or 'monday:12 left', "
                 f"got {brief(text)}; write both"
             )
-        if way not in COMPASS and _THING.fullmatch(where.strip()):
+        if way not in COMPASS and self._numbered_or_named(where.strip()):
             raise MapError(
                 f"gateway: expected {', '.join(COMPASS)} after a place, got {brief(way)}; take one "
                 f"of them, or name a step, such as '{step} left'"

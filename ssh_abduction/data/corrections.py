@@ -13,7 +13,6 @@ meaning when the map is solved again, and when drives are added.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -29,7 +28,7 @@ from ssh_abduction.data.checks import (
 )
 from ssh_abduction.data.drives import SEEN, Drive, drives_of, fingerprints_of, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, is_writable
-from ssh_abduction.data.map_parts import NAMED, Name
+from ssh_abduction.data.map_parts import NAMED, Name, thing_named
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.regions import region_of
 from ssh_abduction.data.star import star_to_json, with_gateway
@@ -45,8 +44,6 @@ _AGAINST = {
     "elsewhere": ("same", "same_place"),
     "same_place": ("elsewhere",),
 }
-# How the command line writes the number of a dstate, place, path or region. No name may look so.
-_NUMBER = re.compile(r"((p|place|path|region) ?)?[0-9]+")
 # The directions of gateways by name, in degrees clockwise from ahead.
 DIRECTIONS = {"ahead": 0.0, "right": 90.0, "back": 180.0, "left": 270.0}
 
@@ -351,7 +348,7 @@ class Corrections:
         where = self.source or "corrections"
         first: dict[tuple[str, ...], int] = {}
         for i, naming in enumerate(self.names):
-            if _NUMBER.fullmatch(naming.name):
+            if thing_named(naming.name):
                 raise MapError(
                     f"{where}: names[{i}]: expected a name such as kitchen, got "
                     f"{brief(naming.name)}, which is how to write a dstate, place, path or region "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -9,6 +11,7 @@ from ssh_abduction.data.observation import View
 
 # What a person can name.
 NAMED = ("place", "path", "region")
+_NUMBERED = re.compile(r"(?:(p|place|path|region) ?)?([0-9]{1,9})")
 FAULTS = ("misread", "misseen", "slipped", "jumped", "changed")
 # The slots of the frame of a place, in words: the first dstate there faces slot 0.
 SLOTS = ("ahead", "right", "behind", "left")
@@ -76,6 +79,21 @@ class Name:
     kind: str
     id: int
     text: str
+
+
+def thing_named(text: str, names: Iterable[Name] = ()) -> tuple[str, int] | None:
+    """Return the kind and the number of what a text names; None if it names nothing.
+
+    The text is the number of a dstate, such as "7"; a place, path or region by its number, such as
+    "p4", "place 4" or "region2"; or one of the names that a person gave.
+
+    >>> thing_named("p4"), thing_named("kitchen", [Name("place", 4, "kitchen")])
+    (('place', 4), ('place', 4))
+    """
+    if found := _NUMBERED.fullmatch(text):
+        kind = found[1] or "dstate"
+        return "place" if kind == "p" else kind, int(found[2])
+    return next(((n.kind, n.id) for n in names if n.text == text), None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import difflib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, fields
 from importlib import import_module
 from typing import Any
@@ -17,6 +18,15 @@ from ssh_abduction.data.errors import brief
 def counted(number: float, things: str) -> str:
     """Return a number with its noun: "8 dstates", "1 dstate"."""
     return f"{number} {things.removesuffix('s') if number == 1 else things}"
+
+
+def meant(word: object, names: Iterable[str], most: int = 1) -> str:
+    """Make a hint such as "; did you mean star?" if names are similar to a word; else "".
+
+    `most` is the largest number of names in the hint.
+    """
+    near = difflib.get_close_matches(str(word), list(names), n=most)
+    return f"; did you mean {' or '.join(near)}?" if near else ""
 
 
 def that_differ(value: Any) -> dict[str, str]:

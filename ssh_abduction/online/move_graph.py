@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import networkx as nx
 
-from ssh_abduction.data.errors import MapError, brief, is_whole
+from ssh_abduction.data.errors import MapError, brief
+from ssh_abduction.data.map_parts import thing_named
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import Region
+from ssh_abduction.data.words import meant
 from ssh_abduction.output.layout import drawable_poses
 
 if TYPE_CHECKING:
@@ -69,38 +70,27 @@ class MoveGraph:
     def nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
         """Return the dstates that a user names, and words for them, such as "place 3".
 
-        `name` is the number of a dstate; or "p3", "region2", or the name of a place or region, for
-        all dstates there. `field` is the name of the user's parameter, for messages. Raises
-        MapError, which lists what exists.
+        `name` is a dstate, place or region by its number, such as 3, "p3" or "region2", or a name
+        that a person gave. A place or region stands for all dstates there. `field` is the name of
+        the user's parameter, for messages. Raises MapError, which lists what exists.
         """
-        count, text = len(self.map.dstates), str(name)
-        own = next((n.id for n in self.map.names if (n.kind, n.text) == ("place", name)), None)
-        if own is not None:
-            return self._dstates_at(own, field), self.map.called("place", own)
-        if isinstance(name, str) and text[:1] == "p" and _is_number(text[1:]):
-            place = int(text[1:])
-            return self._dstates_at(place, field), self.map.called("place", place)
-        region = self._region(text)
-        if region is not None:
-            return self._dstates_in(region.places), self.map.called("region", region.id)
-        is_number = is_whole(name) or (isinstance(name, str) and _is_number(text))
-        if is_number and 0 <= int(text) < count:
-            return {int(text)}, f"dstate {int(text)}"
+        kind, number = thing_named(str(name), self.map.names) or (None, -1)
+        if kind == "place":
+            return self._dstates_at(number, field), self.map.called(kind, number)
+        region = next((r for r in self.map.regions or () if r.id == number), None)
+        if kind == "region" and region is not None:
+            return self._dstates_in(region.places), self.map.called(kind, number)
+        count = len(self.map.dstates)
+        if kind == "dstate" and number < count:
+            return {number}, f"dstate {number}"
         places = f", or a place as p{self.map.places[0]}" if self.map.places else ""
         places += ", or a region as region0" if self.map.regions else ""
         names = [n.text for n in self.map.names if n.kind in ("place", "region")]
         places += f", or {', '.join(names)}" if names else ""
         raise MapError(
-            f"{field}: expected a dstate, 0 to {count - 1}{places}, got {brief(name)}; "
-            "ssh-abduction show lists them"
+            f"{field}: expected a dstate, 0 to {count - 1}{places}, got {brief(name)}"
+            f"{meant(name, names, 3) or ';'} ssh-abduction show lists them"
         )
-
-    def _region(self, name: str) -> Region | None:
-        """Find a region by its name, or by its number as in "region2"; None if there is none."""
-        own = {n.id for n in self.map.names if (n.kind, n.text) == ("region", name)}
-        number = name.removeprefix("region").strip() if name.startswith("region") else ""
-        own |= {int(number)} if _is_number(number) else set()
-        return next((region for region in self.map.regions or () if region.id in own), None)
 
     def nodes_in(self, places: AbstractSet[int]) -> set[Node]:
         """Find all nodes that are at these places."""
@@ -292,8 +282,3 @@ class MoveGraph:
         if isinstance(node, int):
             return poses[node]
         return poses[next(s.id for s in self.map.dstates if s.place == node[0])]
-
-
-def _is_number(text: str) -> bool:
-    """Whether a text is a whole number, 0 or more, of fewer than ten digits."""
-    return text.isascii() and text.isdecimal() and len(text) < 10
