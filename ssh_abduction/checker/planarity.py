@@ -13,23 +13,23 @@ gateway.
 
 If places have frames (numbered directions), this module lists all headings that turns and stars
 allow, and tries them place by place. Headings make a drawing if each gateway is joined to one
-other, and V - E + F = 2 for each connected part (vertices, edges, faces; Heffter, Edmonds; see
-Mohar & Thomassen, Graphs on Surfaces, 2001).
+other, and the clockwise order of gateways around each place is planar.
 
 Without frames the module lists the clockwise orders of gateways that turns allow.
-`theory/planarity.py` searches for a drawing with these orders. The evidence uses the same search,
-so the tests compare it with networkx and with a brute force.
+
+`theory/planarity.py` decides whether orders are planar, and searches for a drawing. The evidence
+uses it, too, so the tests compare it with networkx and with a brute force.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import TypeAlias
 
 from ssh_abduction.data.star import Openings
-from ssh_abduction.runtime.clock import each_looking, look_at_clock
-from ssh_abduction.theory.planarity import can_be_drawn
+from ssh_abduction.theory.planarity import can_be_drawn, clockwise_orders, has_way, is_planar
 
 # A dstate, and 1 (ahead) or -1 (behind).
 Arm: TypeAlias = tuple[int, int]
@@ -154,8 +154,9 @@ class Edges:
         }
         ends = [choose(edge, key=repr) for edge in edges for choose in (min, max)]
         orders = {
-            p: _orders(
-                sorted({arm for arms in sequences[p] for arm in arms}, key=repr), sequences[p]
+            p: clockwise_orders(
+                sorted({arm for arms in sequences[p] for arm in arms}, key=repr),
+                partial(_agrees, sequences[p]),
             )
             for p in self._at
         }
@@ -208,85 +209,49 @@ class Edges:
 
         Options are chosen place by place. A partial choice that makes no drawing is not extended.
         """
-        settled = {arm: k for some in options if len(some) == 1 for arm, k in some[0].items()}
+        settled: Option = {
+            arm: k for some in options if len(some) == 1 for arm, k in some[0].items()
+        }
         others = sorted((some for some in options if len(some) != 1), key=len)
-        if not self._is_drawing(settled):
-            return False
-        choices = [(0, settled)]
-        while choices:
-            look_at_clock()
-            level, chosen = choices.pop()
-            if level == len(others):
-                return True
-            choices += [
-                (level + 1, more)
-                for option in others[level]
-                if self._is_drawing(more := {**chosen, **option})
-            ]
-        return False
+
+        def extended(chosen: Option, some: list[Option]) -> Iterator[Option]:
+            return (more for option in some if self._is_drawing(more := {**chosen, **option}))
+
+        return self._is_drawing(settled) and has_way(settled, others, extended)
 
     def _is_drawing(self, position: Option) -> bool:
         """Tell whether a drawing exists for the travels whose arms both have a position.
 
-        Each gateway has to be joined to one other, and V - E + F = 2 for each connected part.
+        Each gateway has to be joined to one other, and the clockwise orders have to be planar.
         """
         joined = {
             frozenset(((self.place_of[s], position[s, 1]), (self.place_of[t], position[t, -1])))
             for s, t in self.travels
             if (s, 1) in position and (t, -1) in position
         }
-        beyond: dict[tuple[int, int], tuple[int, int]] = {}
-        for edge in joined:
-            first, *_, last = *edge, *edge
-            for here, there in ((first, last), (last, first)):
-                if beyond.setdefault(here, there) != there:
+        ends: dict[tuple[int, int], int] = {}
+        around: dict[object, tuple[int, ...]] = {}
+        for edge, gateways in enumerate(joined):
+            for end, gateway in enumerate(gateways, 2 * edge):
+                if ends.setdefault(gateway, end) != end:
                     return False
-        around: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        for gateway in sorted(beyond):
-            around[gateway[0]].append(gateway)
-        # the next gateway counterclockwise
-        after = {
-            gateway: gateways[i - 1]
-            for gateways in around.values()
-            for i, gateway in enumerate(gateways)
-        }
-        # an edge that leads back to its own gateway gets an extra place at its other end
-        places = len(around) + sum(len(edge) == 1 for edge in joined)
-        faces = _cycles({gateway: after[other] for gateway, other in beyond.items()})
-        return places - len(joined) + faces == 2 * _parts(around, beyond)
-
-
-def _cycles(following: Mapping[tuple[int, int], tuple[int, int]]) -> int:
-    """Count the cycles of a permutation."""
-    left, cycles = set(following), 0
-    while left:
-        cycles += 1
-        here = left.pop()
-        while (here := following[here]) in left:
-            left.remove(here)
-    return cycles
-
-
-def _parts(
-    around: Mapping[int, Sequence[tuple[int, int]]],
-    beyond: Mapping[tuple[int, int], tuple[int, int]],
-) -> int:
-    """Count the connected parts of a drawing."""
-    left, parts = set(around), 0
-    while left:
-        parts += 1
-        queue = [left.pop()]
-        while queue:
-            new = {beyond[gateway][0] for gateway in around[queue.pop()]} & left
-            left -= new
-            queue.extend(new)
-    return parts
+            # an edge that leads back to its own gateway gets an extra place at its other end
+            if len(gateways) == 1:
+                around["beyond", edge] = (2 * edge + 1,)
+        for place, position_there in sorted(ends):
+            around[place] = (*around.get(place, ()), ends[place, position_there])
+        return is_planar(around)
 
 
 def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
     """Tell whether headings fit a turn. They do if one of its two headings is not chosen yet."""
     s, quarters, t = turn
     return s not in faced or t not in faced or (faced[s] + quarters - faced[t]) % 4 == 0
+
+
+def _agrees(sequences: Sequence[Sequence[Arm]], order: Sequence[Arm]) -> bool:
+    """Whether a clockwise order agrees with sequences that are known to be clockwise."""
+    return all(_goes_round(order, some) for some in sequences)
 
 
 def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
@@ -299,23 +264,3 @@ def _goes_round(order: Sequence[Arm], sequence: Sequence[Arm]) -> bool:
         len(set(sequence)) == len(sequence)
         and sum(j < i for i, j in zip(there, [*there[1:], *there[:1]], strict=True)) <= 1
     )
-
-
-def _orders(gateways: Sequence[Arm], sequences: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
-    """List all clockwise orders of gateways that agree with sequences known to be clockwise.
-
-    Orders that differ by a rotation are listed once: each starts with the first gateway.
-    """
-    orders: list[tuple[Arm, ...]] = [()]
-    for gateway in gateways:
-        longer = (
-            (*order[:gap], gateway, *order[gap:])
-            for order in orders
-            for gap in range(min(1, len(order)), len(order) + 1)
-        )
-        orders = [
-            order
-            for order in each_looking(longer)
-            if all(_goes_round(order, some) for some in sequences)
-        ]
-    return orders
