@@ -9,7 +9,7 @@ module of Python. `__main__` moves that folder to the end of the search path.
 TYPE_CHECKING = False  # as in typing, which takes longer to load than this whole module
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
     from typing import Any
 
     from ssh_abduction.checker import check
@@ -20,28 +20,12 @@ if TYPE_CHECKING:
     from ssh_abduction.online import Explorer, Localiser, OnlineMapper, route
     from ssh_abduction.output import export_map
     from ssh_abduction.page import view_page
-    from ssh_abduction.rivals import comparison as compare
-    from ssh_abduction.rivals import next_experiment
+    from ssh_abduction.rivals import compare, next_experiment
     from ssh_abduction.robot_logs import map_log
     from ssh_abduction.solver import Solution, solve
     from ssh_abduction.theory import Theory
 
     __version__: str
-
-_HOMES = {  # package: the names that are exported from it
-    "checker": ("check",),
-    "data": ("AbductionError", "SSHMap", "Trace"),
-    "evaluation": ("evaluate",),
-    "explain": ("explain_pair", "explain_trace"),
-    "learning": ("BootstrapLearner",),
-    "online": ("Explorer", "Localiser", "OnlineMapper", "route"),
-    "output": ("export_map",),
-    "page": ("view_page",),
-    "rivals": ("compare", "next_experiment"),
-    "robot_logs": ("map_log",),
-    "solver": ("Solution", "solve"),
-    "theory": ("Theory",),
-}
 
 # Names of version 0.1.0. Each still works in this version, with a warning that gives its new home.
 _MOVED = {"Path": "data.MapPath", "SSHError": "data.AbductionError"} | {
@@ -85,12 +69,11 @@ __all__ = [
 
 
 def lazy_names(
-    package: str, homes: "Mapping[str, Sequence[str]]", exported: "Sequence[str]"
+    package: str, exported: "Sequence[str]"
 ) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
     """Make the `__getattr__` and `__dir__` of a package that loads each name when it is first used.
 
-    Args:
-        homes: For each module of the package, the names to take from it.
+    The imports below `if TYPE_CHECKING` in the source of the package say where each name is.
 
     Returns:
         The function `__getattr__`, which loads and returns the value of a name, and the function
@@ -98,17 +81,19 @@ def lazy_names(
     """
     import sys
 
-    where = {name: module for module, names in homes.items() for name in names}
+    where: dict[str, tuple[str, str]] = {}  # the module of each name, and its name there
 
     def load(name: str) -> "Any":
         from importlib import import_module
 
-        if name not in where:
+        if name not in exported:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module = f"{package}.{where[name]}"
+        if not where:
+            where.update(_imports_of(package))
+        module, there = where[name]
         loaded = import_module(module)
         value = (
-            getattr(loaded, name) if hasattr(loaded, name) else import_module(f"{module}.{name}")
+            getattr(loaded, there) if hasattr(loaded, there) else import_module(f"{module}.{there}")
         )
         setattr(sys.modules[package], name, value)
         return value
@@ -119,7 +104,21 @@ def lazy_names(
     return load, names
 
 
-_load, __dir__ = lazy_names(__name__, _HOMES, [*__all__, "__version__"])
+def _imports_of(package: str) -> "dict[str, tuple[str, str]]":
+    """Read the names that a package imports, each with its module and its name there."""
+    import ast
+    import sys
+
+    spec: Any = sys.modules[package].__spec__
+    return {
+        alias.asname or alias.name: (node.module, alias.name)
+        for node in ast.walk(ast.parse(spec.loader.get_source(package)))
+        if isinstance(node, ast.ImportFrom) and node.module is not None
+        for alias in node.names
+    }
+
+
+_load, __dir__ = lazy_names(__name__, __all__)
 
 
 def __getattr__(name: str) -> "Any":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,15 @@ def test_old_names_give_the_new_objects_with_a_warning(name: str) -> None:
 
 def test_package_exports_15_to_20_names() -> None:
     assert 15 <= len(ssh_abduction.__all__) <= 20
+
+
+@pytest.mark.parametrize("package", ["", "data", "evaluation", "explain", "online", "rivals"])
+def test_packages_load_each_name_that_they_export(package: str) -> None:
+    module = import_module(f"ssh_abduction.{package}".rstrip("."))
+    for name in module.__all__:
+        assert getattr(module, name).__name__ == name
+    with pytest.raises(AttributeError, match="has no attribute 'Sequence'"):
+        module.Sequence  # noqa: B018 - an import for type checkers only
 
 
 def test_old_parameters_work_with_a_warning() -> None:

@@ -28,26 +28,6 @@ if TYPE_CHECKING:
     from ssh_abduction.data.star import Star
     from ssh_abduction.data.trace import Action, Step, Trace
 
-_HOMES = {  # module: the names that this package exports from it
-    "closure": ("Closure",),
-    "corrections": ("Corrections", "Naming", "Passage", "Said"),
-    "corrections_file": ("load_corrections", "save_corrections"),
-    "drives": ("Drive", "drives_of", "together"),
-    "errors": (
-        "AbductionError",
-        "LocaliserError",
-        "MapError",
-        "RangeError",
-        "SolverError",
-        "TheoryError",
-        "TraceError",
-    ),
-    "maps": ("DState", "Fault", "Fit", "MapPath", "Name", "Pose", "SSHMap"),
-    "odometry": ("Odometry",),
-    "regions": ("Region",),
-    "star": ("Star",),
-    "trace": ("Action", "Step", "Trace"),
-}
 __all__ = [
     "AbductionError",
     "Action",
@@ -81,4 +61,4 @@ __all__ = [
     "together",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, __all__)

@@ -22,19 +22,6 @@ if TYPE_CHECKING:
     from ssh_abduction.evaluation.relations import Relation, Relations
     from ssh_abduction.evaluation.trajectory import Trajectory, TrajectoryWarning
 
-_HOMES = {
-    "named_truth": ("Evaluation", "MapEvaluation", "evaluate", "tells_names"),
-    "relations": ("Relation", "Relations"),
-    "trajectory": ("Trajectory", "TrajectoryWarning"),
-    "pose_truth": (
-        "MapPairs",
-        "MapVisits",
-        "JudgedPairs",
-        "VisitsEvaluation",
-        "evaluate_visits",
-        "told_poses",
-    ),
-}
 __all__ = [
     "Evaluation",
     "JudgedPairs",
@@ -52,4 +39,4 @@ __all__ = [
     "told_poses",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, __all__)

@@ -10,12 +10,6 @@ if TYPE_CHECKING:
     from ssh_abduction.explain.pairs import explain_pair
     from ssh_abduction.explain.sides import PlaceExplanation, explain_place
 
-_HOMES = {
-    "mend": ("explain_trace",),
-    "no_map": ("Explanation", "explain", "why_apart"),
-    "pairs": ("explain_pair",),
-    "sides": ("PlaceExplanation", "explain_place"),
-}
 __all__ = [
     "Explanation",
     "PlaceExplanation",
@@ -26,4 +20,4 @@ __all__ = [
     "why_apart",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, __all__)

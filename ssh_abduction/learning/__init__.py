@@ -7,7 +7,6 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ssh_abduction.learning.learner import BootstrapLearner
 
-_HOMES = {"learner": ("BootstrapLearner",)}
 __all__ = ["BootstrapLearner"]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, __all__)

@@ -12,14 +12,6 @@ if TYPE_CHECKING:
     from ssh_abduction.online.mapper import OnlineMapper
     from ssh_abduction.online.routes import Move, Route, route
 
-_HOMES = {
-    "belief": ("Belief",),
-    "chances": ("Chances",),
-    "explorer": ("Exploration", "Explorer"),
-    "localiser": ("Localiser",),
-    "mapper": ("OnlineMapper",),
-    "routes": ("Move", "Route", "route"),
-}
 __all__ = [
     "Belief",
     "Chances",
@@ -32,4 +24,4 @@ __all__ = [
     "route",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, __all__)

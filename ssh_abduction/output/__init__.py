@@ -15,14 +15,6 @@ if TYPE_CHECKING:
     from ssh_abduction.output.picture import to_svg
     from ssh_abduction.output.plotting import plot
 
-_HOMES = {  # module: the names that this package exports from it
-    "cards": ("map_card", "trace_card"),
-    "dot": ("to_dot",),
-    "export": ("export_map",),
-    "graphs": ("to_graphml", "to_networkx", "to_pandas"),
-    "picture": ("to_svg",),
-    "plotting": ("plot",),
-}
 __all__ = [
     "export_map",
     "map_card",
@@ -35,4 +27,4 @@ __all__ = [
     "trace_card",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, __all__)

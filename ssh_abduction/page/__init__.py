@@ -7,7 +7,6 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ssh_abduction.page.html import Page, view_page
 
-_HOMES = {"html": ("Page", "view_page")}
 __all__ = ["Page", "view_page"]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, __all__)

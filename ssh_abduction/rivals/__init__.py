@@ -13,15 +13,6 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.rivals.sides import SharedSides, shared_sides
 
-_HOMES = {
-    "comparison": ("Comparison", "compare"),
-    "differences": ("Difference", "difference"),
-    "drive_joins": ("DrivePair", "joins_of_drives"),
-    "experiment": ("Experiment",),
-    "explore": ("next_experiment",),
-    "listing": ("Listing",),
-    "sides": ("SharedSides", "shared_sides"),
-}
 __all__ = [
     "Comparison",
     "Difference",
@@ -36,4 +27,4 @@ __all__ = [
     "shared_sides",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, __all__)

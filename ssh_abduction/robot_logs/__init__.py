@@ -7,7 +7,6 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ssh_abduction.robot_logs.log_maps import LogMap, map_log
 
-_HOMES = {"log_maps": ("LogMap", "map_log")}
 __all__ = ["LogMap", "map_log"]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, __all__)

@@ -66,43 +66,6 @@ if TYPE_CHECKING:
         cost_as_counted,
     )
 
-_HOMES = {  # module: the names that this package exports from it
-    "asp": ("facts", "workers"),
-    "asp.control": ("Control",),
-    "asp.limits": ("POLL", "LimitError", "Stop", "Watch", "check_limit", "resident_memory"),
-    "asp.workers": ("end_all", "in_process"),
-    "asp.rules": ("check_rules",),
-    "entry": ("find_backbone", "solve"),
-    "costs.estimating": ("maps_apart",),
-    "front": ("Front", "Point", "fault_front"),
-    "guesses.gated": ("sketch_beyond", "sketches_of"),
-    "guesses.tree": ("Sketch",),
-    "judging": ("InternalError", "Judging"),
-    "costs.misfit": ("Misfit",),
-    "obeying": ("obeyed", "with_kept_apart", "with_names"),
-    "geometry.fit": ("fit",),
-    "geometry.ranking": ("Ranking",),
-    "solution.recorded": ("drives_in", "joins_in", "theory_in", "trace_in", "warnings_in"),
-    "regions": ("find_regions", "with_regions"),
-    "solution.result": ("Solution",),
-    "search": ("Search",),
-    "start": ("Limits", "Start"),
-    "solution.sharing": ("SORTS", "Backbone", "Shared", "Sharing", "Sort", "stretches"),
-    "steps.certificate": ("RESTS_ON", "Certificate"),
-    "steps.log": ("Outcome", "observation"),
-    "solution.weighed": ("EQUAL", "Weighed", "probability_in_words"),
-    "values": (
-        "Bound",
-        "Cost",
-        "Effort",
-        "Level",
-        "Progress",
-        "Seconds",
-        "Status",
-        "cost_as_counted",
-    ),
-    "solution.writing": ("ending", "opening", "summary_of", "written_map"),
-}
 __all__ = [
     "EQUAL",
     "POLL",
@@ -171,4 +134,4 @@ __all__ = [
     "written_map",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, __all__)
