@@ -15,7 +15,7 @@ from strategies import traces
 from ssh_abduction import SSHMap, Theory, Trace
 from ssh_abduction.checker import geometry
 from ssh_abduction.checker.geometry import refused_returns
-from ssh_abduction.data import DState, Odometry
+from ssh_abduction.data import DState, Odometry, together
 from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares
 from ssh_abduction.theory.evidence.returns import Returns
@@ -202,3 +202,22 @@ def test_bounds_change_no_verdict_of_the_checker(noise: str) -> None:
                 assert list(refused_returns(walk.trace, ssh_map, theory)) == bounded
             said += [len(refused.returns) for refused in bounded]
     assert said.count(2) > 4
+
+
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_checker_skips_returns_of_drives_that_were_accepted(wrong: int) -> None:
+    """In one of two drives the map has too few dstates. The first drive was accepted."""
+    walks = [maze(3, 3, steps=30, seed=seed, odometry=Odometry(along=0.02)) for seed in (6, 7)]
+    trace = together([replace(walk.trace, name=f"{i}") for i, walk in enumerate(walks)])
+    drives = [
+        seen(walk.trace, walk.truth, 9 if i == wrong else 1000) for i, walk in enumerate(walks)
+    ]
+    shift = len(drives[0].dstates)
+    labels = (*drives[0].labels, *(label + shift for label in drives[1].labels))
+    dstates = [*drives[0].dstates, *(replace(s, id=s.id + shift) for s in drives[1].dstates)]
+    both = SSHMap(labels, tuple(replace(s, place=None) for s in dstates), ())
+    theory = Theory(displacement="use", returns=64, reject=0.3, star="none")
+    found = list(refused_returns(trace, both, theory))
+    assert found
+    since = len(walks[0].trace)
+    assert list(refused_returns(trace, both, theory, since)) == (found if wrong else [])

@@ -97,12 +97,15 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
     return tuple(violations(trace, ssh_map, theory))
 
 
-def violations(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Violation]:
+def violations(
+    trace: Trace, ssh_map: SSHMap, theory: Theory, since: int = 0
+) -> Iterator[Violation]:
     """Find violations one by one, so that a caller can stop at the first one.
 
-    The map may be malformed. In the theory no field is "auto".
+    The map may be malformed. In the theory no field is "auto". An earlier check found that the map
+    agrees with the displacements of the first `since` steps.
     """
-    reading = Reading(trace, ssh_map, theory)
+    reading = Reading(trace, ssh_map, theory, since)
     checks = [(COHERENCE, test) for test in coherence.CHECKS] + [
         (name, AXIOMS[name]) for name in theory.axioms if name in AXIOMS
     ]

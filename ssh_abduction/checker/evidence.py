@@ -145,7 +145,7 @@ def one_pose(m: Reading) -> Found:
     trusted = m.trace.without_displacements_at(
         [fault.step for fault in m.map.faults if fault.kind == "jumped"]
     )
-    for refused in refused_returns(trusted, m.map, m.theory):
+    for refused in refused_returns(trusted, m.map, m.theory, m.since):
         said = " and ".join(
             f"steps {m.steps[i]} and {m.steps[j]} are at one "
             f"{'place' if freedom == 2 else 'dstate'}"

@@ -108,26 +108,31 @@ class Refused:
         yield ".1f", [closing.size for closing in self.closings]
 
 
-def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Refused]:
+def refused_returns(
+    trace: Trace, ssh_map: SSHMap, theory: Theory, since: int = 0
+) -> Iterator[Refused]:
     """Find the single returns and the pair of returns that displacements reject most clearly.
 
     A return is two steps that the map has at one place or dstate. Yields at most one return to a
     place, one return to a dstate, and then one pair of returns. In the theory no field is "auto",
-    and `returns` is the number of tests.
+    and `returns` is the number of tests. Skips returns before step `since` that no displacement
+    relates to that step, such as those of earlier drives.
     """
     if not trace.has_displacements:
         return
-    for returns, square, most in _refused(trace, ssh_map, theory, Drifts(trace)):
+    for returns, square, most in _refused(trace, ssh_map, theory, Drifts(trace), since):
         yield Refused(returns, tuple(_closing(trace, i, j) for i, j, _ in returns), square, most)
 
 
-def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts) -> Iterator[_Found]:
+def _refused(
+    trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts, since: int
+) -> Iterator[_Found]:
     """Find rejected returns for `refused_returns`, the single ones first: they are found fast."""
-    yield from _refused_alone(list(_returns(trace, ssh_map, theory, drifts)), drifts, theory)
+    returns = _returns(trace, ssh_map, theory, drifts, since)
+    yield from _refused_alone([*returns], drifts, theory)
     if theory.joint > 1:
-        yield from _refused_together(
-            list(_returns(trace, ssh_map, theory, drifts, of_arrivals=True)), drifts, theory
-        )
+        of_arrivals = _returns(trace, ssh_map, theory, drifts, since, of_arrivals=True)
+        yield from _refused_together([*of_arrivals], drifts, theory)
 
 
 def _closing(trace: Trace, first: int, last: int) -> LoopGap:
@@ -154,19 +159,26 @@ def _closing(trace: Trace, first: int, last: int) -> LoopGap:
 
 
 def _returns(
-    trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts, of_arrivals: bool = False
+    trace: Trace,
+    ssh_map: SSHMap,
+    theory: Theory,
+    drifts: Drifts,
+    since: int,
+    of_arrivals: bool = False,
 ) -> Iterator[Return]:
     """Yield the returns with a known closing error: first step, last step, degrees of freedom.
 
     Returns to places are between the first steps of visits. So are returns to dstates with
-    `of_arrivals`; else they are between any steps.
+    `of_arrivals`; else they are between any steps. The first stretch of the trace without a missing
+    displacement that has returns here is the one of step `since`.
     """
     place = {s.id: s.place for s in ssh_map.dstates}
     size = min(len(trace), len(ssh_map.dstate_at))
     labels = ssh_map.dstate_at[:size]
-    arrived = [t for t in range(size) if t == 0 or trace.actions[t - 1].kind != "turn"]
+    begin = int(np.searchsorted(drifts.none.broken, drifts.none.broken[since]))
+    arrived = [t for t in range(begin, size) if t == 0 or trace.actions[t - 1].kind != "turn"]
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for t in arrived if of_arrivals else range(size):
+    for t in arrived if of_arrivals else range(begin, size):
         groups[3, labels[t]].append(t)
     for t in arrived if theory.level == "topological" else ():
         there = place.get(labels[t])

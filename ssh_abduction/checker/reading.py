@@ -32,6 +32,7 @@ class Reading:
         trace: The trace.
         map: The map.
         theory: The theory.
+        since: The displacements up to this step agree with the map, as an earlier check found.
         steps: The numbers of all steps. With several drives, a step prints with its drive's name.
         axioms: Names of the theory's axioms.
         records: For each id, the dstates of the map with this id. A malformed map may have several.
@@ -43,8 +44,8 @@ class Reading:
             map ignores are left out.
     """
 
-    def __init__(self, trace: Trace, ssh_map: SSHMap, theory: Theory) -> None:
-        self.trace, self.map, self.theory = trace, ssh_map, theory
+    def __init__(self, trace: Trace, ssh_map: SSHMap, theory: Theory, since: int = 0) -> None:
+        self.trace, self.map, self.theory, self.since = trace, ssh_map, theory, since
         self.steps = named_steps(drives_of(trace), len(trace))
         self.axioms = frozenset(theory.axioms)
         self.records: dict[int, list[DState]] = defaultdict(list)

@@ -89,7 +89,7 @@ class Judging:
         """Accept a map as `accepts` does. The evidence accepted its first `since` steps already."""
         return (
             self.can_accept
-            and next(violations(self._trace, ssh_map, self._theory), None) is None
+            and next(violations(self._trace, ssh_map, self._theory, since), None) is None
             and self.allows_grown(self._trace, ssh_map, since)
             and keeps_own_rules(self._problem, ssh_map)
         )

@@ -38,19 +38,20 @@ def can_lay(theory: Theory) -> bool:
 
 
 def laid(
-    old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem, watch: Watch
+    old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem, watch: Watch, since: int
 ) -> Solution | None:
     """Find a joint map of little cost that keeps the map of the old drives.
 
     `trace` has the new drives, and the problem all drives, under a theory that `can_lay`. The
     solution has the cheaper of two maps: one joins the new drives to the old ones, and in the other
-    they are pieces of their own. None if neither satisfies the axioms.
+    they are pieces of their own. None if neither satisfies the axioms. The displacements of the
+    first `since` steps are known to agree with the map.
     """
     joint, theory = problem.trace, problem.theory
     ranking, judging = Ranking(joint), Judging(problem)
     fitted = map(ranking.fitted, _joint_maps(old, ssh_map, trace, problem))
     found = sorted(fitted, key=lambda m: _nats(m, problem))
-    while found and not judging.accepts_grown(found[0], len(old)):
+    while found and not judging.accepts_grown(found[0], since):
         del found[0]
     if not found:
         return None

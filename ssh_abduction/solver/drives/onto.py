@@ -55,6 +55,8 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 # over. That is enough for a drive of some hundred steps. Without it, a busy machine would leave the
 # drive apart, and all later ones, too.
 LAYING = 5.0
+# The fields of a theory that say which returns displacements reject.
+_JUDGES = ("level", "displacement", "reject", "joint", "without")
 _LIMITS = ("time limit", "memory limit", "interrupted")  # what ends a search early
 
 
@@ -91,9 +93,11 @@ def solve_onto(
     in_use = problem.theory
     if solving.speedups.greedy and len(joint) > READABLE and can_lay(in_use):
         on_map = None
+        judged = all(getattr(in_use, f) == getattr(existing.theory, f) for f in _JUDGES)
+        since = len(old) if judged else 0
         try:
             with suppress(LimitError), heeding(solving.watch.later(LAYING)):
-                on_map = laid(old, ssh_map, trace, problem, solving.watch)
+                on_map = laid(old, ssh_map, trace, problem, solving.watch, since)
         except KeyboardInterrupt:
             if (grown := _grown(ssh_map, old, problem)) is None:
                 raise
