@@ -81,6 +81,10 @@ class Overlap:
         """
         return self.price * sum(share for *_, share in self.crowded(labels, places, at))
 
+    def share(self, here: Sequence[float], there: Sequence[float]) -> float:
+        """Return the share of the price that two places at these positions, in metres, cost."""
+        return max(0.0, 1 - math.dist(here, there) / self.near) if self.near else 0.0
+
     def crowded_in(self, ssh_map: SSHMap) -> Iterator[tuple[int, int, float]]:
         """Yield the same as `crowded` for a map of the whole trace that has a fit."""
         poses = ssh_map.fit.poses if ssh_map.fit else ()
@@ -115,9 +119,9 @@ class Overlap:
                     break
                 one, two = (seen[places[labels[step]]] for step in (t, u))
                 is_known = {frame[group] for group in one} & {frame[group] for group in two}
-                away = math.dist(here, there) / self.near
-                if away < 1 and is_known and not one & two:
-                    yield min(t, u), max(t, u), 1 - away
+                share = self.share(here, there)
+                if share and is_known and not one & two:
+                    yield min(t, u), max(t, u), share
 
     def _frames(self, seen: Iterable[set[int]], facing: Iterable[set[int]]) -> list[int]:
         """Merge groups of drives with a dstate or two places in common, which fix how they lie."""

@@ -48,8 +48,7 @@ def rivals_of(problem: Problem, misfit: Misfit, best: SSHMap, seconds: float) ->
     free = [drive for i, drive in enumerate(drives) if not problem.overlap.is_tied(i)]
 
     def cost_of(dstates: Sequence[int], places: Sequence[int]) -> float:
-        nats: float = kept + misfit.of_course(dstates, places or dstates, jumped(best)) / 2
-        nats += misfit.crowding(dstates, places or dstates)
+        nats: float = kept + misfit.nats_of_course(dstates, places or dstates, jumped(best))
         return nats + dstate * len(set(dstates)) + place * len(set(places))
 
     rival = rival_of(best, misfit.nats_of(best))

@@ -23,7 +23,7 @@ from typing import TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.engines.refusing import minimal_part
-from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.geometry.fit import Array, Poses
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.theory.evidence import Equality
@@ -50,7 +50,7 @@ class Misfit:
         self.visit = [0]
         for t, action in enumerate(self.trace.actions, 1):
             self.visit.append(self.visit[-1] if stays and action.kind == "turn" else t)
-        self._known: dict[_Groups, float] = {}
+        self._known: dict[_Groups, tuple[float, Array]] = {}
 
     def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
         """Return the misfit (a chi-square) of returns, ignoring displacements to `wrong` steps."""
@@ -59,17 +59,13 @@ class Misfit:
             if found.of == "dstate":
                 _join(headings, found.first, found.second)
             _join(positions, found.first, found.second)
-        return self._of_groups((_roots(headings), _roots(positions), tuple(sorted(wrong))))
+        return self._of_groups((_roots(headings), _roots(positions), tuple(sorted(wrong))))[0]
 
     def of_course(
         self, dstates: Sequence[int], places: Sequence[int], wrong: Collection[int] = ()
     ) -> float:
         """Return the misfit if steps are at these dstates and places, without `wrong` moves."""
-        first_at: dict[int, int] = {}
-        first_in: dict[int, int] = {}
-        headings = [first_at.setdefault(name, t) for t, name in enumerate(dstates)]
-        positions = [first_in.setdefault(name, t) for t, name in enumerate(places)]
-        return self._of_groups((tuple(headings), tuple(positions), tuple(sorted(wrong))))
+        return self._of_groups(_groups_of(dstates, places, wrong))[0]
 
     def of_map(self, ssh_map: SSHMap) -> float:
         """Compute the misfit (a chi-square) of a map of the whole trace."""
@@ -78,17 +74,24 @@ class Misfit:
     def nats_of(self, ssh_map: SSHMap) -> float:
         """Compute the cost of a map of the whole trace in nats: its prices and half its misfit."""
         places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
-        nats = nats_of(Cost.of(ssh_map), self._theory) + self.of_map(ssh_map) / 2
-        return nats + self.crowding(ssh_map.dstate_at, places)
+        names = places if None not in places else ssh_map.dstate_at
+        nats = nats_of(Cost.of(ssh_map), self._theory)
+        return nats + self.nats_of_course(ssh_map.dstate_at, names, jumped(ssh_map))
 
-    def crowding(self, dstates: Sequence[int], places: Sequence[Hashable]) -> float:
-        """Return the price of places at one position, for the dstate and place of each step."""
-        if not self._overlap.near or not self._overlap.nats(places):
-            return 0.0
-        labels = numbered(dstates)
-        of_dstate = [*dict(zip(labels, places, strict=True)).values()]
-        at = Poses(self.trace, labels, of_dstate).positions().tolist()
-        return self._overlap.crowding(dict(enumerate(labels)), of_dstate, at)
+    def nats_of_course(
+        self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
+    ) -> float:
+        """Return half the misfit of a whole course, as `of_course`, and the price of crowding.
+
+        This is the price of places at one position.
+        """
+        headings, positions, _ = groups = _groups_of(dstates, places, wrong)
+        square, at = self._of_groups(groups)
+        if not self._overlap.near or not self._overlap.nats(positions):
+            return square / 2
+        labels = numbered(headings)
+        of_dstate = [*dict(zip(labels, positions, strict=True)).values()]
+        return square / 2 + self._overlap.crowding(dict(enumerate(labels)), of_dstate, at.tolist())
 
     def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
         """List the returns of a map: each step with the last step at its dstate or place."""
@@ -122,8 +125,11 @@ class Misfit:
 
         return [] if suffices([]) else minimal_part(suffices, list(returns))
 
-    def _of_groups(self, groups: _Groups) -> float:
-        """Return the misfit if steps share headings and positions. Compute it only once."""
+    def _of_groups(self, groups: _Groups) -> tuple[float, Array]:
+        """Return the misfit if steps share headings and positions, and where the headings are.
+
+        Compute it only once.
+        """
         if groups not in self._known:
             headings, positions, wrong = groups
             trace = self.trace.without_displacements_at(wrong)
@@ -132,8 +138,20 @@ class Misfit:
             poses = Poses(
                 trace, [number[heading] for heading in headings], [position[h] for h in number]
             )
-            self._known[groups] = poses.misfit() + 2 * self._overlap.nats(positions)
+            square, at = poses.placed()
+            self._known[groups] = square + 2 * self._overlap.nats(positions), at
         return self._known[groups]
+
+
+def _groups_of(
+    dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int]
+) -> _Groups:
+    """Number the dstate and the place of each step by the first step there."""
+    first_at: dict[int, int] = {}
+    first_in: dict[Hashable, int] = {}
+    headings = (first_at.setdefault(name, t) for t, name in enumerate(dstates))
+    positions = (first_in.setdefault(name, t) for t, name in enumerate(places))
+    return tuple(headings), tuple(positions), tuple(sorted(wrong))
 
 
 def _join(groups: list[int], first: int, second: int) -> None:

@@ -113,12 +113,16 @@ class Poses:
 
     def misfit(self) -> float:
         """Compute the least chi-square of the displacements."""
-        return float((self._residuals(self._best()) ** 2).sum())
+        return self.placed()[0]
 
-    def positions(self) -> Array:
-        """Find the best position of each heading (mostly of each dstate), in metres, (n, 2)."""
-        at: Array = self._best()[: 2 * self._positions].reshape(-1, 2)[self._place[: self._dstates]]
-        return at
+    def placed(self) -> tuple[float, Array]:
+        """Compute the least chi-square, and the best position of each heading, in metres, (n, 2).
+
+        Headings are mostly those of dstates.
+        """
+        unknown = self._best()
+        at: Array = unknown[: 2 * self._positions].reshape(-1, 2)[self._place[: self._dstates]]
+        return float((self._residuals(unknown) ** 2).sum()), at
 
     def settled(
         self, start: Array | None, fixed: Sequence[int], wanted: Sequence[int]

@@ -339,9 +339,8 @@ class Overlay:
         """Compute what two places at one position pay that one place does not pay."""
         if not places or {*before.sights[places[0]]} & {*before.sights[places[1]]}:
             return 0.0
-        x, y = (before.mean[k : k + 2] for k in self._both.position[list(places)])
-        away = math.dist(x, y) / self._overlap.near if self._overlap.near else 1.0
-        return self._overlap.price * max(0.0, 1 - away)
+        here, there = (before.mean[k : k + 2].tolist() for k in self._both.position[[*places]])
+        return self._overlap.price * self._overlap.share(here, there)
 
     def _merge_coinciding(self, places: set[int]) -> None:
         """Merge the coinciding dstates at some places, unless some of them cannot be one."""
