@@ -183,7 +183,7 @@ class Belief:
     def to_dict(self) -> dict[str, Any]:
         """Return the belief as a dict for JSON, as `localise --json` prints it.
 
-        docs/reference/formats.md describes the keys.
+        The keys are names of attributes; docs/reference/formats.md has the exceptions.
         """
         return {
             "verdict": self.verdict.value,

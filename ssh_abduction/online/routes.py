@@ -167,7 +167,7 @@ class Route:
     def to_dict(self) -> dict[str, Any]:
         """Return the route as a dict for JSON, as `route --json` prints it.
 
-        docs/reference/formats.md describes the keys.
+        The keys are names of attributes; docs/reference/formats.md has the exceptions.
         """
         length = self.metres
         return {
