@@ -56,7 +56,8 @@ def block(name: str, results: dict[str, Any], path: Path) -> str:
 
 
 def _narrow(table: str) -> str:
-    """Remove the spaces that align the columns of a table, which are a third of its length."""
+    """Remove the spaces that align columns, and the memory of other programs."""
+    table = re.sub(r"( m?s|memory¹), [\d,]+ MB", r"\1", table)
     return re.sub(" {2,}", " ", re.sub("-{3,}", "--", table))
 
 
