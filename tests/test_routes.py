@@ -14,7 +14,7 @@ from worlds import rectangle, written
 from ssh_abduction import SSHMap, Theory, Trace, check, route, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
-from ssh_abduction.data.map_parts import Name
+from ssh_abduction.data.map_parts import Fault, Name
 from ssh_abduction.data.maps import DState, Fit, MapPath, Pose
 from ssh_abduction.solver import with_regions
 
@@ -124,6 +124,31 @@ def test_route_goes_around_avoided_dstates() -> None:
         ssh_map.labels, dstates, (*links, (2, "d", 3)), (0, 1, 2, 3), (MapPath(0, (0, 1)),)
     )
     assert route(detour, 0, 3, avoid=["p1"]).actions == ("b", "d")
+
+
+@pytest.mark.parametrize(
+    ("slot", "bearing", "headings"), [(0, None, (0, 2, 0, 2)), (None, 35, (30, 210, 50, 230))]
+)
+@pytest.mark.parametrize("by", ["actions", "places"])
+def test_route_passes_no_gateway_that_was_last_seen_closed(
+    slot: int | None, bearing: int | None, headings: tuple[int, ...], by: str
+) -> None:
+    """Two places, and a dstate in each direction at both."""
+    courses = zip((0, 0, 1, 1), (1, -1, 1, -1), headings, strict=True)
+    dstates = tuple(
+        DState(i, f"v{i}", place, 0, way, heading)
+        for i, (place, way, heading) in enumerate(courses)
+    )
+    links = ((0, "on", 2), (0, "turn", 1), (1, "turn", 0), (2, "turn", 3), (3, "on", 1))
+    ssh_map = SSHMap((0, 2, 3, 1), dstates, links, (0, 1), (MapPath(0, (0, 1)),))
+    shut = Fault(2, "changed", "closed on tuesday", "open on monday", 1.0, 0, slot, bearing=bearing)
+    again = replace(shut, step=3, seen="open on wednesday", expected="closed on tuesday")
+    for start, goal, actions in ((0, "p1", ("on",)), (2, "p0", ("turn", "on"))):
+        assert route(ssh_map, start, goal, by=by).actions == actions
+        opened = replace(ssh_map, faults=(shut, again))
+        assert route(opened, start, goal, by=by).actions == actions
+        with pytest.raises(MapError, match="passes a gateway that was last seen closed"):
+            route(replace(ssh_map, faults=(shut,)), start, goal, by=by)
 
 
 def test_route_counts_rivals_that_agree() -> None:

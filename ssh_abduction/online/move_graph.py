@@ -27,6 +27,8 @@ Node: TypeAlias = "int | tuple[int, int, int]"
 KNOWN_MOVE, UNTRIED_MOVE, OPEN_TURN = 1.0, 1.5, 2.5
 # Cost of an action in a route by metres, so that fewer actions win among routes of equal length.
 MICROMETRE = 1e-6
+# A dstate faces a gateway if its heading is at most this many degrees off the gateway's bearing.
+FACING = 20
 
 
 class MoveGraph:
@@ -44,6 +46,8 @@ class MoveGraph:
     Attributes:
         map: The map.
         by: What the shortest route minimises.
+        closed: The gateways that were closed when a drive last saw them: the place and the slot or
+            bearing of each. No edge passes them.
     """
 
     def __init__(self, ssh_map: SSHMap, by: str) -> None:
@@ -66,6 +70,9 @@ class MoveGraph:
         self._graph = self._of_links()
         if by == "places":
             self._add_implied()
+        self.closed = _closed_gateways(ssh_map)
+        shut = [edge for edge in self._graph.edges if self._passes_closed(*edge)]
+        self._graph.remove_edges_from(shut)
 
     def nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
         """Return the dstates that a user names, and words for them, such as "place 3".
@@ -217,6 +224,28 @@ class MoveGraph:
                     tuple(p for p, i in zip(path.order, pieces, strict=True) if i == piece),
                 )
 
+    def _passes_closed(self, source: Node, target: Node) -> bool:
+        """Whether a move leaves or enters a place by a gateway that was last seen closed."""
+        if self._place(source) == self._place(target) or self._floor(source) != self._floor(target):
+            return False
+        return self._faces_closed(source, 0) or self._faces_closed(target, 180)
+
+    def _faces_closed(self, node: Node, turned: int) -> bool:
+        """Whether a robot at a node, turned by some degrees, faces a gateway last seen closed."""
+        place, path, way = self.course(node)
+        here = [s for s in self.map.dstates if s.place == place and s.heading is not None]
+        facing = [(s.heading, turned) for s in here if s.id == node]
+        if isinstance(node, tuple):  # no dstate faces this way, but one may face the other way
+            facing = [
+                (s.heading, turned + 180 * (s.direction != way)) for s in here if s.path == path
+            ]
+        for at, slot, bearing in self.closed:
+            unit, gateway = (90, slot) if bearing is None else (1, bearing)
+            off = [unit * ((heading or 0) - (gateway or 0)) + more for heading, more in facing]
+            if at == place and any(abs((degrees + 180) % 360 - 180) <= FACING for degrees in off):
+                return True
+        return False
+
     def _imply(self, source: Node, target: Node, action: str | None) -> None:
         """Add an implied move, unless the map has a link for it or it leads to another floor."""
         is_known = self._graph.has_edge(source, target)
@@ -282,3 +311,10 @@ class MoveGraph:
         if isinstance(node, int):
             return poses[node]
         return poses[next(s.id for s in self.map.dstates if s.place == node[0])]
+
+
+def _closed_gateways(ssh_map: SSHMap) -> list[tuple[int | None, int | None, int | None]]:
+    """List the place, slot and bearing of each gateway that was last seen closed."""
+    changes = (fault for fault in ssh_map.faults if fault.kind == "changed")
+    last = {(fault.place, fault.gateway, fault.bearing): fault for fault in changes}
+    return [at for at, fault in last.items() if str(fault.seen).startswith("closed")]

@@ -310,7 +310,9 @@ def _raise_no_route(
             f"avoid: expected a way around what is avoided, got none to {named}; avoid less"
         )
     mend = "drive on (ssh-abduction next says what to try)"
-    if graph.by != "places" and graph.map.paths:
+    if graph.closed:
+        mend = "no route passes a gateway that was last seen closed; drive on if it is open again"
+    elif graph.by != "places" and graph.map.paths:
         mend = "take --by places, which may lead where the robot has not driven, or drive on"
     reached = counted(graph.dstates_from(here), "dstates")
     raise MapError(
