@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from itertools import combinations, pairwise, product
@@ -20,6 +21,7 @@ from strategies import TOYS, theories, traces
 from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.misfit import false_costs, misfit
+from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, Odometry, SolverError, TheoryError, together
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.fields import FieldReader
@@ -309,6 +311,30 @@ def test_check_finds_false_costs(weighed_route: Solution, name: str, said: str) 
         data["weighed"]["rivals"][0]["nats"] -= 1.0
     found = list(false_costs(weighed_route.trace, data, maps, theory))
     assert any(said in claim for claim in found)
+
+
+@pytest.mark.parametrize(
+    ("claims", "said"),
+    [
+        ({"confidence": 0.5}, "weighed.confidence: expected"),
+        ({"status": "feasible", "complete": False}, "weighed.within: expected 0"),
+    ],
+)
+def test_check_finds_a_false_probability(
+    claims: dict[str, object],
+    said: str,
+    weighed_route: Solution,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    data = weighed_route.to_dict()
+    (data["weighed"] if "confidence" in claims else data).update(claims)
+    assert weighed_route.trace is not None
+    files = tmp_path / "maps.json", tmp_path / "trace.jsonl"
+    files[0].write_text(json.dumps(data))
+    weighed_route.trace.save(files[1])
+    assert main(["check", *map(str, files)]) == 20
+    assert said in capsys.readouterr().out
 
 
 def test_stopped_search_is_not_sure(route: truth.Known) -> None:

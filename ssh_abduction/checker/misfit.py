@@ -97,6 +97,12 @@ def false_costs(
     if not isinstance(bound, int | float) or not isinstance(nats, int | float) or bound > nats:
         yield f"weighed.bound: expected a number up to {brief(nats)}, got {brief(bound)}"
         return
+    within = weighed.get("within")
+    if answer.get("status") != "optimal" and within:
+        yield (
+            f"weighed.within: expected 0, as it is not proven which map is the best, got "
+            f"{brief(within)}"
+        )
     if len(trace) > LONGEST:
         return
     places = [maps[0].dstates[label].place for label in maps[0].dstate_at]

@@ -33,6 +33,7 @@ from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 EXIT_VIOLATED = 20
+ROUNDED = 1e-4  # a claimed probability may be wrong by this much, as costs in files are rounded
 SHOWN = 20  # violations that are printed for each map
 
 
@@ -182,8 +183,14 @@ def _costs_hold(
     """Recompute the costs of maps in nats. Append the result to `said`; return if all hold."""
     from ssh_abduction.checker.misfit import LONGEST, false_costs  # loads numpy
 
-    Solution.from_dict(data, where, trace)  # the fields that claim costs have the right form
+    weighed = Solution.from_dict(data, where, trace).weighed  # the fields have the right form
     false = list(false_costs(trace, data, maps, theory))
+    claimed = data["weighed"].get("confidence") if weighed else None
+    if weighed and not (is_finite(claimed) and abs(claimed - weighed.confidence) <= ROUNDED):
+        false.append(
+            f"weighed.confidence: expected {weighed.confidence:.6f}, by the costs of the rivals, "
+            f"got {brief(claimed)}"
+        )
     said += false
     if len(trace) > LONGEST:
         said.append(f"costs in nats are not checked, as the trace has more than {LONGEST} steps")
