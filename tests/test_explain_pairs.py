@@ -20,10 +20,10 @@ from ssh_abduction.explain.derivation import Derivation
 from ssh_abduction.explain.mend import explain_trace
 from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.explain.piece import Piece
-from ssh_abduction.explain.verdict import PairExplanation, Verdict
+from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.rivals import Listing
 from ssh_abduction.rivals.listing import PairInMap
-from ssh_abduction.solver import Search, Start, Status
+from ssh_abduction.solver import Cost, Search, Start, Status
 from ssh_abduction.solver.asp.facts import derivation_lp, further_rules
 from ssh_abduction.theory.encodings import axioms
 from ssh_abduction.theory.settle import settle
@@ -470,4 +470,17 @@ def test_interrupted_explanation_says_so(
     assert main(["explain", str(tmp_path / "rectangle.jsonl"), "0", "4"]) == 130
     assert capsys.readouterr().out.endswith(
         "different dstates in every map\nno argument was found (interrupted)\n"
+    )
+
+
+def test_prices_of_faults_are_no_misfit() -> None:
+    """A map with a misread view costs 8 nats for it, and fits as well as one without."""
+    one = Side(True, Cost(8, 4, 4, faults=1.0), proven=True, nats=105.0)
+    two = Side(True, Cost(10, 4, 5), proven=True, nats=114.0)
+    explanation = PairExplanation(
+        0, 8, Verdict.SAME_IN_MINIMAL, one, two, True, None, None, None, Theory(misread=1.0)
+    )
+    assert explanation.sentences[1] == (
+        "making steps 0 and 8 different dstates costs 8.0 nats for its parts (2 dstates more, "
+        "faults for 1 dstate less) and costs 1.0 nats of misfit"
     )

@@ -168,15 +168,16 @@ class PairExplanation:
         assert won.cost is not None
         joining = self.verdict is Verdict.DIFFERENT_IN_MINIMAL
         pair = f"steps {self.first} and {self.second}"
-        names = ("dstates", "places", "paths")
+        names = ("dstates", "places", "paths", "faults")  # a fault costs dstates
+        prices = (*self.theory.prices, self.theory.prices[0])
         more = {name: getattr(lost.cost, name) - getattr(won.cost, name) for name in names}
-        price = sum(self.theory.prices[i] * more[name] for i, name in enumerate(names))
+        price = sum(prices[i] * more[name] for i, name in enumerate(names))
         misfit = lost.nats - won.nats - price
         what = f"joining {pair}" if joining else f"making {pair} different dstates"
         changed = [
-            (number, f"{abs(number)} {_noun(name, abs(number))}")
+            (number, _counted(abs(number), name))
             for i, (name, number) in enumerate(more.items())
-            if number and self.theory.prices[i]
+            if number and prices[i]
         ]
         if len({number > 0 for number, _ in changed}) == 1:  # all counts rise, or all fall
             effect = "costs" if price > 0 else "saves"
@@ -259,6 +260,13 @@ def _noun(name: str, number: float) -> str:
     """Return the word for a count, in the singular or plural."""
     noun = "dstates with its faults" if name == "tenths" else name
     return noun.removesuffix("s") if number == 1 and name != "tenths" else noun
+
+
+def _counted(number: float, name: str) -> str:
+    """Put a count into words. Faults are counted by what they cost in dstates."""
+    if name == "faults":
+        return f"faults for {number:g} {_noun('dstates', number)}"
+    return f"{number:g} {_noun(name, number)}"
 
 
 def _effect(nats: float) -> str:
