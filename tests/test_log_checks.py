@@ -162,6 +162,18 @@ def test_reader_refuses_ranges_in_other_units(
         tracked(RobotLog(tuple(longer), source="drive"))
 
 
+def test_reader_refuses_ranges_beyond_the_reach_that_the_log_gives(
+    scans: tuple[Scan, ...],
+) -> None:
+    """The ranges are in centimetres, and the reach is in metres."""
+    beyond = [
+        replace(s, ranges=np.where(100 * s.ranges < s.laser.reach, 100 * s.ranges, np.inf))
+        for s in scans
+    ]
+    with pytest.raises(LogError, match=r"within the reach of the laser, .* m, got hardly any"):
+        tracked(RobotLog(tuple(beyond), source="drive"))
+
+
 @pytest.mark.parametrize(("count", "unit"), [(100.0, "centimetres"), (1000.0, "millimetres")])
 def test_odometry_of_scans_a_metre_apart_is_converted(
     scans: Scans, count: float, unit: str

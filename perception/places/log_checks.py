@@ -50,15 +50,25 @@ DARK = 5
 # Beams that meet walls are at most this many metres long, in the median of a log. Good logs have up
 # to 3 m.
 FAR_WALLS = 50.0
+# In more than half of the scans of good logs, more than this share of the beams meets a wall.
+MEETING = 0.02
 
 
 def refuse_lengths(log: RobotLog) -> None:
     """Raise a LogError if the ranges of a log are too long to be metres."""
-    met = (
-        scan.ranges[(scan.ranges > 0) & (scan.ranges < scan.laser.reach)]
-        for scan in in_turn(log.scans)
-    )
-    usual = float(np.median([float(np.median(some)) for some in met if len(some)] or [0.0]))
+    lengths, shares = [], []
+    for scan in in_turn(log.scans):
+        met = scan.ranges[(scan.ranges > 0) & (scan.ranges < scan.laser.reach)]
+        lengths += [float(np.median(met))] if len(met) else []
+        shares.append(len(met) / len(scan.ranges))
+    reach = log.scans[0].laser.reach
+    if np.median(shares) < MEETING and math.isfinite(reach):
+        raise LogError(
+            f"{named(log.source)}: expected beams that meet walls within the reach of the laser, "
+            f"{reach:g} m, got hardly any in most scans; if the ranges are in centimetres or "
+            "millimetres, divide them, or say how far the laser reaches (--set no_return=METRES)"
+        )
+    usual = float(np.median(lengths or [0.0]))
     if usual > FAR_WALLS:
         unit, count = ("millimetres", 1000) if usual > 10 * FAR_WALLS else ("centimetres", 100)
         raise LogError(
