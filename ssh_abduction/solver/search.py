@@ -67,8 +67,8 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.costs.weighing import Weighing
 
 COUNTED = (
-    "weigh: maps are counted instead of weighed, as the trace has no displacements whose misfit "
-    "could be weighed"
+    "weigh: maps are counted instead of weighed, as no displacements are used whose misfit could "
+    "be weighed"
 )
 # Before maps are weighed, a map with the fewest dstates is sought for at most this share of the
 # time. It is a first map, and seldom the best one.
