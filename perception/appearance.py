@@ -21,7 +21,8 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from perception.errors import PerceptionError, equal_length
 from perception.reciprocal import ReciprocalTransformer
-from ssh_abduction.data.errors import brief, is_finite, is_whole
+from ssh_abduction.data.checks import a_number
+from ssh_abduction.data.errors import brief, is_whole
 from ssh_abduction.data.trace import Trace
 
 Shape = tuple[int, int, int]
@@ -72,10 +73,7 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
             (1, images.shape[1], 1) if self.shape is None else _numbers("shape", self.shape, 3)
         )
         _numbers("patch", self.patch, 2)
-        if not is_finite(self.floor) or self.floor < 0:
-            raise PerceptionError(
-                f"floor: expected a number of 0 or more, got {brief(self.floor)}; change it"
-            )
+        a_number("floor", self.floor, PerceptionError, 0)
         # The shape comes from the user, the images from a file: they may not fit.
         if np.prod(self.shape_) != images.shape[1]:
             rows, columns, colours = self.shape_

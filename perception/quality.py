@@ -42,6 +42,7 @@ from sklearn.metrics import homogeneity_score
 from sklearn.utils import check_array
 
 from perception.errors import PerceptionError, equal_length
+from ssh_abduction.data.checks import a_number
 from ssh_abduction.runtime.threads import one_thread
 
 Floats = NDArray[np.float64]
@@ -151,14 +152,8 @@ def trimmed_quality(
     Raises:
         PerceptionError: The labels have another length, or trim is out of range.
     """
-    if not (
-        isinstance(trim, int | float | np.number)
-        and not isinstance(trim, bool)
-        and 0 <= trim <= 0.5
-    ):
-        raise PerceptionError(
-            f"trim: expected a share from 0 to 0.5, got {trim!r}; give a number such as 0.05"
-        )
+    mend = "give a number such as 0.05"
+    a_number("trim", trim, PerceptionError, 0, 0.5, what="a share", mend=mend)
     images = check_array(equal_length(X), dtype=np.float64)
     clusters = _numbered(labels, len(images))
     if clusters.max() == 0:

@@ -15,7 +15,7 @@ from sklearn.base import BaseEstimator, OneToOneFeatureMixin, TransformerMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from perception.errors import ImageWarning, PerceptionError, equal_length
-from ssh_abduction.data.errors import is_finite
+from ssh_abduction.data.checks import a_number
 
 
 class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]
@@ -45,11 +45,8 @@ class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimato
             PerceptionError: The floor is not a positive number.
             ValueError: The images are not a table.
         """
-        if not is_finite(self.floor) or self.floor <= 0:
-            raise PerceptionError(
-                f"floor: expected a positive number of metres, got {self.floor!r}; give one such "
-                "as 0.1"
-            )
+        mend = "give a number such as 0.1"
+        a_number("floor", self.floor, PerceptionError, above=0, what="metres", mend=mend)
         validate_data(self, equal_length(X), dtype=np.float64, ensure_all_finite=False)
         return self
 

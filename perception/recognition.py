@@ -26,6 +26,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.reciprocal import ReciprocalTransformer
+from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import brief
 
 
@@ -55,16 +56,10 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             ValueError: The images are not a finite table, or the labels are not classes.
         """
         images, labels = validate_data(self, equal_length(X), y, dtype=np.float64)
-        number = self.n_neighbors
-        if (
-            not isinstance(number, int | np.integer)
-            or isinstance(number, bool)
-            or not 1 <= number <= len(images)
-        ):
-            raise PerceptionError(
-                f"n_neighbors: expected a whole number from 1 to the {len(images)} images, "
-                f"got {number!r}; give a smaller number, or more images"
-            )
+        mend = "give a smaller number, or more images"
+        number = a_whole_number(
+            "n_neighbors", self.n_neighbors, PerceptionError, 1, len(images), mend=mend
+        )
         # If many labels are rare, scikit-learn warns that labels might be numbers.
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "The number of unique classes")

@@ -37,8 +37,8 @@ from perception.clusterings import (
 from perception.confidence import NOISE, confidence
 from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.quality import cluster_quality, sample_indices, spanning_tree, trimmed_quality
-from ssh_abduction.data.checks import a_whole_number
-from ssh_abduction.data.errors import brief, is_finite
+from ssh_abduction.data.checks import a_number, a_whole_number, one_of
+from ssh_abduction.data.errors import brief
 from ssh_abduction.runtime.threads import one_thread
 
 # Up to this many images, k-means makes all of its starts on all images. Of more images, it makes
@@ -311,11 +311,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             value, least = getattr(self, name), 2 if name == "k_min" else 1
             if value is None and name in ("k", "k_max"):
                 continue
-            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-                raise PerceptionError(
-                    f"{name}: expected a whole number of at least {least}, got {value!r}"
-                    "; take a larger one"
-                )
+            a_whole_number(name, value, PerceptionError, least, mend="take a larger one")
         if self.n_init > MOST_STARTS:
             raise PerceptionError(
                 f"n_init: expected at most {MOST_STARTS} starts, got {brief(self.n_init)}; a "
@@ -334,15 +330,10 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 what="a seed",
                 mend="give a seed, a RandomState or None",
             )
-        if not isinstance(self.by, str) or self.by not in ("M", "trimmed"):
-            raise PerceptionError(
-                f'by: expected "M" or "trimmed", got {self.by!r}; write one of them'
-            )
-        if self.isolated is not None and not (is_finite(self.isolated) and self.isolated > 1):
-            raise PerceptionError(
-                f"isolated: expected a number of more than 1, or None, got {self.isolated!r}; give "
-                "one such as 3, or None"
-            )
+        one_of("by", self.by, ("M", "trimmed"), PerceptionError)
+        if self.isolated is not None:
+            mend = "give one such as 3, or None"
+            a_number("isolated", self.isolated, PerceptionError, above=1, mend=mend)
         if self.k is None and self.k_max is not None and self.k_max < self.k_min:
             raise PerceptionError(
                 f"k_max: expected at least k_min = {self.k_min}, got {self.k_max}; raise it"

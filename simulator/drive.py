@@ -18,7 +18,7 @@ from simulator.errors import SimulatorError
 from simulator.laser import Laser
 from simulator.odometer import Odometer
 from simulator.world import World
-from ssh_abduction.data.errors import brief, is_finite
+from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
 Array = NDArray[np.float64]
@@ -116,11 +116,8 @@ class Recorder:
     _turned: float = 0.0
 
     def __post_init__(self) -> None:
-        if not is_finite(self.every) or self.every < CLOSEST:
-            raise SimulatorError(
-                f"every: expected metres, {CLOSEST} or more, got {brief(self.every)}; a scan "
-                f"each {EVERY} m is usual"
-            )
+        mend = f"a scan each {EVERY} m is usual"
+        a_number("every", self.every, SimulatorError, CLOSEST, what="metres", mend=mend)
 
     @property
     def taken(self) -> int:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.robot import OPTIONS
-from ssh_abduction.data.errors import brief, is_finite
+from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.odometry import Displacement, Odometry
 
 Array = NDArray[np.float64]
@@ -58,16 +58,11 @@ class Odometer:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
+            name, value = f"odometer.{field.name}", getattr(self, field.name)
             least = -WORST if field.name in ("scale", "bend") else 0.0
-            if not is_finite(value) or not least <= value <= WORST:
-                raise SimulatorError(
-                    (
-                        f"odometer.{field.name}: expected a number from {least:g} to {WORST:g}, "
-                        f"got {brief(value)}; choose a smaller error"
-                    )
-                    + (f" (--{OPTIONS[field.name]})" if field.name in OPTIONS else "")
-                )
+            option = f" (--{OPTIONS[field.name]})" if field.name in OPTIONS else ""
+            mend = f"choose a smaller error{option}"
+            a_number(name, value, SimulatorError, least, WORST, mend=mend)
 
     def as_noisy_as(self, along: float) -> Odometer:
         """Copy the odometer, with noise of the default proportions, scaled to a value of `along`.
@@ -75,11 +70,8 @@ class Odometer:
         That is the standard deviation along the motion after one metre, in metres. Raises
         SimulatorError if it is not from 0 to 1.
         """
-        if not is_finite(along) or not 0 <= along <= WORST:
-            raise SimulatorError(
-                f"odometry_noise: expected a number from 0 to {WORST:g}, got "
-                f"{brief(along)}; with 1 the robot is a metre off after one metre"
-            )
+        mend = "with 1 the robot is a metre off after one metre"
+        a_number("odometry_noise", along, SimulatorError, 0, WORST, mend=mend)
         usual = Odometer()
         share = along / usual.along
         scaled = {kind: getattr(usual, kind) * share for kind in ("across", "heading", "turning")}

@@ -24,7 +24,7 @@ from simulator.errors import SimulatorError
 from simulator.laser import meetings
 from simulator.world import World, checked_segments, pose_of
 from ssh_abduction.data.checks import a_flag, a_list, a_number, a_whole_number, an_instance
-from ssh_abduction.data.errors import brief, is_finite, is_whole
+from ssh_abduction.data.errors import brief
 from ssh_abduction.data.odometry import Pose
 
 Array = NDArray[np.float64]
@@ -189,11 +189,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("rows", "columns"):
-            if not is_whole(getattr(self, name)) or not 1 <= getattr(self, name) <= 1000:
-                raise SimulatorError(
-                    f"camera.{name}: expected a whole number from 1 to 1000, got "
-                    f"{brief(getattr(self, name))}; change it"
-                )
+            a_whole_number(f"camera.{name}", getattr(self, name), SimulatorError, 1, 1000)
         an_instance("camera.paint", self.paint, Paint, SimulatorError, mend="make one with Paint()")
         what = "the hours at which a run begins and ends"
         hours = tuple(a_list("camera.hours", self.hours, SimulatorError, what=what))
@@ -210,11 +206,7 @@ class Camera:
             ("noise", self.noise, 255.0),
             ("exposure", self.exposure, 1.0),
         ):
-            if not is_finite(value) or not 0 <= value <= most:
-                raise SimulatorError(
-                    f"camera.{name}: expected a number from 0 to {most:g}, got "
-                    f"{brief(value)}; change it"
-                )
+            a_number(f"camera.{name}", value, SimulatorError, 0, most)
 
     @property
     def shape(self) -> tuple[int, int, int]:

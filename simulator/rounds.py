@@ -28,7 +28,7 @@ from simulator.laser import Laser
 from simulator.odometer import Odometer
 from simulator.plans import Plan
 from simulator.robot import Body, SimulatedRobot
-from ssh_abduction.data.errors import brief, is_finite
+from ssh_abduction.data.checks import a_number, a_whole_number
 from ssh_abduction.data.words import counted
 
 Array = NDArray[np.float64]
@@ -262,12 +262,8 @@ def record_plan(
     Raises:
         SimulatorError: No two rooms are connected, or a number is out of range.
     """
-    if tours < 1:
-        raise SimulatorError(f"tours: expected 1 or more, got {tours}; take 1 or more")
-    if not is_finite(metres) or metres <= 0:
-        raise SimulatorError(
-            f"metres: expected a length above 0, got {brief(metres)}; 200 is usual"
-        )
+    a_whole_number("tours", tours, SimulatorError, 1)
+    a_number("metres", metres, SimulatorError, above=0, what="a length", mend="200 is usual")
     body = body or Body()
     rooms = Rooms(Building.of(plan), body.radius)
     chance, motion = (np.random.default_rng([seed, k]) for k in (0, 1))

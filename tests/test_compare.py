@@ -596,7 +596,7 @@ def test_compare_refuses_maps_of_other_traces(
     maps, others = aces.solution().maps, solve(rectangle(9)).maps
     for wrong, said in (
         ([maps[0], others[0]], "maps[1]: expected 23 steps, as maps[0] has, got 10"),
-        ([maps[0], 5], "maps[1]: expected a map, got 5"),
+        ([maps[0], 5], "maps[1]: expected an SSHMap, got 5"),
         (
             "maps.json",
             "maps: expected a solution or maps, got 'maps.json'; read a file with Listing.load",

@@ -113,7 +113,7 @@ def test_trace_decides_between_star_frame_and_gateways() -> None:
             [{"bearing": 0, "width": 2}],
             r"star\[0\]: expected fields out of bearing, spread, opposite, open, got 'width'",
         ),
-        ([{"bearing": 0, "spread": 50}], r"star\[0\]\.spread: expected 0 to 45 degrees"),
+        ([{"bearing": 0, "spread": 50}], r"star\[0\]\.spread: expected degrees from 0 to 45"),
         ([{"bearing": 0, "spread": -1}], r"star\[0\]\.spread: expected"),
         ([{"bearing": 0, "open": False}], r"star\[0\]\.open: expected true, or null"),
         (

@@ -170,7 +170,7 @@ def test_last_patches_of_a_panorama_may_be_smaller() -> None:
         ({"shape": (2, 5, 3)}, "images: expected 2 x 5 x 3 values each, got 12"),
         ({"shape": (2, 6)}, r"shape: expected 3 whole numbers of at least 1, got \(2, 6\)"),
         ({"patch": (0, 1)}, "patch: expected 2 whole numbers of at least 1"),
-        ({"floor": -1.0}, "floor: expected a number of 0 or more, got -1.0"),
+        ({"floor": -1.0}, "floor: expected a number, 0 or more, got -1.0"),
     ],
 )
 def test_wrong_transformer_settings_are_refused(settings: dict[str, Any], message: str) -> None:
@@ -194,7 +194,7 @@ def test_wrong_images_and_headers_are_refused(run: Trace) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"rows": 0}, "camera.rows: expected a whole number from 1 to 1000, got 0"),
+        ({"rows": 0}, "camera.rows: expected a whole number from 1 to 1,000, got 0"),
         ({"hours": (7.0, 25.0)}, "camera.hours: expected a number from 0 to 24, got 25.0"),
         ({"exposure": math.nan}, "camera.exposure: expected a number from 0 to 1"),
         ({"noise": -1.0}, "camera.noise: expected a number from 0 to 255, got -1.0"),

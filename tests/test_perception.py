@@ -104,7 +104,7 @@ def test_invalid_ranges_are_replaced_with_one_warning() -> None:
 
 @pytest.mark.parametrize("floor", [0, -1, np.inf, np.nan, "near"])
 def test_a_floor_is_a_positive_number(floor: Any) -> None:
-    with pytest.raises(PerceptionError, match="floor: expected a positive number"):
+    with pytest.raises(PerceptionError, match="floor: expected metres above 0"):
         ReciprocalTransformer(floor).fit([[1.0]])
 
 
@@ -358,7 +358,7 @@ def test_runner_up_has_nearly_the_best_trimmed_quality() -> None:
         ViewClusterer(k=3).fit(images).runner_up_,
         ViewClusterer(clusterer=DBSCAN(eps=1.0)).fit(images).runner_up_,
     ) == (None, None)
-    with pytest.raises(PerceptionError, match='by: expected "M" or "trimmed", got \'U\''):
+    with pytest.raises(PerceptionError, match="by: expected M or trimmed, got 'U'"):
         ViewClusterer(by="U").fit(images)
 
 
@@ -540,10 +540,10 @@ def test_k_is_at_most_the_number_of_different_images() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"k": 0}, "k: expected a whole number of at least 1, got 0"),
+        ({"k": 0}, "k: expected a whole number, 1 or more, got 0"),
         ({"k": 2.5}, "k: expected a whole number"),
         ({"k": 4}, "k: expected at most 3, as there are 3 different images among 6, got 4"),
-        ({"k_min": 1}, "k_min: expected a whole number of at least 2"),
+        ({"k_min": 1}, "k_min: expected a whole number, 2 or more"),
         ({"k_min": 5}, "k: expected at most 3"),
         ({"k_min": 5, "k_max": 4}, "k_max: expected at least k_min = 5, got 4"),
         ({"n_init": 0}, "n_init: expected"),
@@ -587,7 +587,7 @@ def test_recogniser_returns_the_place_of_the_nearest_image() -> None:
     assert (model.predict_proba(images).sum(axis=1) == 1).all()
     with pytest.raises(
         PerceptionError,
-        match="n_neighbors: expected a whole number from 1 to the 40 images, got 41",
+        match="n_neighbors: expected a whole number from 1 to 40, got 41",
     ):
         PlaceRecogniser(41).fit(images, places)
 

@@ -32,8 +32,7 @@ from dataclasses import dataclass
 
 from ssh_abduction.checker import clashes, coherence, evidence, regions, sides, stars, topological
 from ssh_abduction.checker.reading import Check, Reading
-from ssh_abduction.data.errors import MapError, brief
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.settle import settle
@@ -90,11 +89,7 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
         docs/explanation/theory.md.
     """
     theory = settle(trace, theory).theory
-    if not isinstance(ssh_map, SSHMap):
-        raise MapError(
-            f"map: expected an SSHMap, got {brief(ssh_map)}; take one of a solution, or SSHMap.load"
-        )
-    return tuple(violations(trace, ssh_map, theory))
+    return tuple(violations(trace, checked_map(ssh_map), theory))
 
 
 def violations(

@@ -18,7 +18,8 @@ from ssh_abduction.cli.options import (
     trace_path,
 )
 from ssh_abduction.cli.parsing import Verbs
-from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole, named
+from ssh_abduction.data.checks import a_whole_number
+from ssh_abduction.data.errors import AbductionError, MapError, brief, named
 
 if TYPE_CHECKING:
     from ssh_abduction.data.trace import Trace
@@ -181,11 +182,8 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
             "them with localise --json"
         )
     maps, number = maps_of(data, "maps"), record.get("map", 1)
-    if not is_whole(number) or not 1 <= number <= len(maps):
-        raise MapError(
-            f"{named(file)}: map: expected 1 to {len(maps)}, got {brief(number)}; run localise "
-            "with these maps"
-        )
+    mend = "run localise with these maps"
+    a_whole_number(f"{named(file)}: map", number, MapError, 1, len(maps), what="a map", mend=mend)
     if record.get("dstates", count := len(maps[number - 1].dstates)) != count:
         raise MapError(
             f"{named(file)}: dstates: expected {count}, as map {number} has, got "

@@ -131,8 +131,10 @@ def an_instance(name: str, value: object, kind: type[T], error: Kind, *, mend: s
     """Return a value if it is an instance of the class `kind`, or raise `error`."""
     if isinstance(value, kind):
         return value
-    article = "an" if kind.__name__.startswith(("A", "E", "I", "O", "SSH")) else "a"
-    raise error(f"{name}: expected {article} {kind.__name__}, got {brief(value)}; {mend}")
+    thing = kind.__name__
+    if not thing.endswith("s"):
+        thing = f"{'an' if thing.startswith(('A', 'E', 'I', 'O', 'SSH')) else 'a'} {thing}"
+    raise error(f"{name}: expected {thing}, got {brief(value)}; {mend}")
 
 
 def all_instances(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
+from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole, is_writable
 
 View: TypeAlias = str | int
@@ -44,12 +45,14 @@ def view_or_unknown(value: Any, where: str) -> View | None:
 
 def checked_probability(value: Any, where: str) -> float:
     """Return a value as a float if it is a probability from 0 to 1, or raise TraceError."""
-    if not is_finite(value) or not 0 <= value <= 1:
-        raise TraceError(
-            f"{where}: expected a probability from 0 to 1, got {brief(value)}; leave it out if "
-            "the probability is unknown"
-        )
-    return float(value)
+    mend = "leave it out if the probability is unknown"
+    return a_number(where, value, TraceError, 0, 1, what="a probability", mend=mend)
+
+
+def finite(value: Any, where: str) -> float:
+    """Return a value as a float if it is a finite number, or raise TraceError."""
+    mend = "replace it, or leave the field out"
+    return a_number(where, value, TraceError, what="a finite number", mend=mend)
 
 
 def checked_image(value: Any, where: str) -> tuple[float, ...] | int:
@@ -67,10 +70,7 @@ def checked_image(value: Any, where: str) -> tuple[float, ...] | int:
         )
     for i, x in enumerate(value):
         if not is_finite(x):
-            raise TraceError(
-                f"{where}[{i}]: expected a finite number, got {brief(x)}; "
-                f"replace it, or leave the field out"
-            )
+            finite(x, f"{where}[{i}]")  # raises
     return tuple(plain_number(x) for x in value)
 
 

@@ -16,8 +16,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, TypeAlias
 
-from ssh_abduction.data.checks import an_object
-from ssh_abduction.data.errors import TraceError, brief, is_finite
+from ssh_abduction.data.checks import a_number, an_object
+from ssh_abduction.data.errors import TraceError, brief
+from ssh_abduction.data.observation import finite
 
 Pose: TypeAlias = tuple[float, float, float]
 Displacement: TypeAlias = tuple[float, float, float]
@@ -68,13 +69,9 @@ class Odometry:
 
     def __post_init__(self) -> None:
         for name in NUMBERS:
-            value = getattr(self, name)
-            if not is_finite(value) or not 0 <= value <= FARTHEST:
-                raise TraceError(
-                    f"odometry.{name}: expected a number from 0 to {FARTHEST:.0f}, "
-                    f"got {brief(value)}; give a standard deviation"
-                )
-            object.__setattr__(self, name, float(value))
+            value, mend = getattr(self, name), "give a standard deviation"
+            value = a_number(f"odometry.{name}", value, TraceError, 0, FARTHEST, mend=mend)
+            object.__setattr__(self, name, value)
         an_object("odometry.extra", self.extra, TraceError)
 
     @classmethod
@@ -135,13 +132,7 @@ def checked_displacement(value: Any, where: str) -> Displacement:
         raise TraceError(
             f"{where}: expected [dx, dy, dtheta], got {brief(value)}; give metres, metres, radians"
         )
-    for i, x in enumerate(value):
-        if not is_finite(x):
-            raise TraceError(
-                f"{where}[{i}]: expected a finite number, got {brief(x)}; "
-                f"replace it, or leave the field out"
-            )
-    dx, dy, turned = map(float, value)
+    dx, dy, turned = (finite(x, f"{where}[{i}]") for i, x in enumerate(value))
     if max(abs(dx), abs(dy)) > FARTHEST:
         raise TraceError(
             f"{where}: expected metres, at most {FARTHEST:,.0f} in a step, "
@@ -164,14 +155,9 @@ def checked_covariance(value: Any, where: str) -> Covariance:
             f"{where}: expected three rows of three numbers, got {brief(value)}; "
             f"give the covariance of [dx, dy, dtheta]"
         )
-    for i, row in enumerate(value):
-        for j, x in enumerate(row):
-            if not is_finite(x):
-                raise TraceError(
-                    f"{where}[{i}][{j}]: expected a finite number, got {brief(x)}; "
-                    f"replace it, or leave the field out"
-                )
-    (a, b, c), (d, e, f), (g, h, k) = (tuple(map(float, row)) for row in value)
+    (a, b, c), (d, e, f), (g, h, k) = (
+        [finite(x, f"{where}[{i}][{j}]") for j, x in enumerate(row)] for i, row in enumerate(value)
+    )
     largest = max(abs(x) for x in (a, b, c, d, e, f, g, h, k))
     if max(abs(b - d), abs(c - g), abs(f - h)) > SYMMETRIC * largest:
         raise TraceError(

@@ -22,8 +22,9 @@ from functools import lru_cache
 from itertools import combinations, combinations_with_replacement
 from typing import Any, TypeAlias
 
-from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole
-from ssh_abduction.data.observation import plain_number
+from ssh_abduction.data.checks import a_number
+from ssh_abduction.data.errors import TraceError, brief, is_whole
+from ssh_abduction.data.observation import finite, plain_number
 
 Openings: TypeAlias = tuple[bool, bool, bool, bool]
 Entry: TypeAlias = "float | Gateway | None"
@@ -355,11 +356,7 @@ def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
         return _gateway(value, count, where)
     if value is None and four:
         return None
-    if not is_finite(value):
-        raise TraceError(
-            f"{where}: expected a finite number, got {brief(value)}; "
-            f"replace it, or leave the field out"
-        )
+    finite(value, where)
     return plain_number(value)
 
 
@@ -374,11 +371,8 @@ def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway | floa
         value.get(name, default)
         for name, default in zip(_FIELDS, (None, SPREAD, None, True), strict=True)
     )
-    if not is_finite(bearing):
-        raise TraceError(
-            f"{where}.bearing: expected a number of degrees, got {brief(bearing)}; "
-            f"say in which direction the gateway is"
-        )
+    mend = "say in which direction the gateway is"
+    a_number(f"{where}.bearing", bearing, TraceError, what="a number of degrees", mend=mend)
     if is_open is not None and is_open is not True:
         raise TraceError(
             f"{where}.open: expected true, or null where it was not observed, "
@@ -386,11 +380,8 @@ def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway | floa
         )
     # The bearing of an observed gateway is known better.
     widest = WIDEST if is_open is None else WIDEST / 2
-    if not is_finite(spread) or not 0 <= spread <= widest:
-        raise TraceError(
-            f"{where}.spread: expected 0 to {widest:g} degrees, got {brief(spread)}; "
-            f"say how far the bearing may be off"
-        )
+    mend = "say how far the bearing may be off"
+    a_number(f"{where}.spread", spread, TraceError, 0, widest, what="degrees", mend=mend)
     if opposite is not None and not (is_whole(opposite) and 0 <= opposite < count):
         raise TraceError(
             f"{where}.opposite: expected the index of a gateway, 0 to {count - 1}, "

@@ -35,7 +35,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
-from ssh_abduction.data.maps import SSHMap, checked_maps
+from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
 from ssh_abduction.data.trace import Trace, View, checked_trace
 from ssh_abduction.data.words import counted
 
@@ -262,11 +262,7 @@ def map_of_trace(ssh_map: object, where: str, trace: Trace) -> SSHMap:
 
     Raises MapError, which names the map `where`.
     """
-    if not isinstance(ssh_map, SSHMap):
-        raise MapError(
-            f"{where}: expected an SSHMap, got {brief(ssh_map)}; "
-            "take the maps of a solution, or SSHMap.load"
-        )
+    ssh_map = checked_map(ssh_map, where)
     if len(ssh_map.dstate_at) != len(trace):
         raise MapError(
             f"{where}: labels: expected {len(trace)}, one for each step of the trace, "

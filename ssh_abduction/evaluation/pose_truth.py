@@ -34,8 +34,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.data.checks import an_instance
-from ssh_abduction.data.errors import TraceError, brief, is_finite, named
+from ssh_abduction.data.checks import a_number, an_instance
+from ssh_abduction.data.errors import TraceError, named
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.trace import Trace, checked_trace
@@ -203,12 +203,8 @@ def evaluate_visits(
     """
     checked_trace(trace)
     for name, value in (("near", near), ("turned", turned)):
-        if not is_finite(value) or value <= 0:
-            thing = "place" if name == "near" else "dstate"
-            raise TraceError(
-                f"{name}: expected a number above 0, got {brief(value)}; "
-                f"say what counts as one {thing}"
-            )
+        mend = f"say what counts as one {'place' if name == 'near' else 'dstate'}"
+        a_number(name, value, TraceError, above=0, mend=mend)
     maps = checked_maps(maps)
     if relations is not None:
         an_instance(

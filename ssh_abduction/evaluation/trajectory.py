@@ -22,7 +22,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ssh_abduction.data.errors import TraceError, brief, is_finite, named
+from ssh_abduction.data.checks import a_number, numbers
+from ssh_abduction.data.errors import TraceError, brief, named
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.trace import Step, Trace
@@ -214,11 +215,12 @@ def is_trajectory(lines: Iterable[Sequence[str]]) -> bool:
 
 def checked_time(value: Any, where: str) -> float | None:
     """Return the time of a step in seconds, or None. Raise TraceError for anything else."""
-    if value is not None and not is_finite(value):
-        raise TraceError(
-            f"{where}: time: expected seconds, got {brief(value)}; mend it, or leave it out"
-        )
-    return None if value is None else float(value)
+    mend = "mend it, or leave it out"
+    return (
+        None
+        if value is None
+        else a_number(f"{where}: time", value, TraceError, what="seconds", mend=mend)
+    )
 
 
 def checked_pose(value: Any, where: str) -> Pose:
@@ -231,16 +233,9 @@ def checked_pose(value: Any, where: str) -> Pose:
 
 def three_numbers(value: Any, where: str) -> Pose:
     """Read a pose from JSON. Raise TraceError if it is malformed."""
-    if (
-        isinstance(value, Sequence)
-        and not isinstance(value, str)
-        and len(value) == 3
-        and all(is_finite(number) for number in value)
-    ):
-        return float(value[0]), float(value[1]), float(value[2])
-    raise TraceError(
-        f"{where}: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it"
-    )
+    what = "[x, y, heading] in metres and radians"
+    x, y, heading = numbers(where, value, TraceError, 3, what, "mend it")
+    return x, y, heading
 
 
 def _truth(step: Step, pose: Pose | None) -> Any:

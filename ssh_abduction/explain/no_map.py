@@ -17,7 +17,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_whole
+from ssh_abduction.data.checks import a_whole_number
+from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.axioms import Axioms
@@ -168,11 +169,8 @@ def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = Non
 def check_two_steps(trace: Trace, first: object, second: object) -> None:
     """Raise TraceError if these are not two different steps of a trace."""
     for step in (first, second):
-        if not is_whole(step) or not 0 <= step < len(trace):
-            raise TraceError(
-                f"step: expected a step from 0 to {len(trace) - 1}, got {brief(step)}; "
-                "steps are counted from 0"
-            )
+        mend = "steps are counted from 0"
+        a_whole_number("step", step, TraceError, 0, len(trace) - 1, what="a step", mend=mend)
     if first == second:
         raise TraceError(f"step: expected two steps, got {first} twice; take another one")
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from sklearn.neighbors import NearestNeighbors
 
 from perception.confidence import NOISE
+from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.drives import Drive, drives_of, joined_drives, pieces_in_words
-from ssh_abduction.data.errors import AbductionError, brief, is_whole
+from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.traces import Traces
@@ -61,11 +62,9 @@ def labels_of(
         raise LearnerError(
             "maps: expected at least one to take labels from, got none; see the solution's status"
         )
-    if choose is not None and (not is_whole(choose) or not 0 <= choose < len(maps)):
-        raise LearnerError(
-            f"map: expected an index from 0 to {len(maps) - 1}, got {brief(choose)}; give the "
-            "index of a map of the solution"
-        )
+    if choose is not None:
+        mend = "give the index of a map of the solution"
+        a_whole_number("map", choose, LearnerError, 0, len(maps) - 1, what="an index", mend=mend)
     labels = np.array(maps[choose or 0].dstate_at, np.intp)
     if choose is not None:
         return labels

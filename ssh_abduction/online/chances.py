@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from ssh_abduction.data.errors import LocaliserError, brief, is_finite
+from ssh_abduction.data.checks import a_number
+from ssh_abduction.data.errors import LocaliserError
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +34,8 @@ class Chances:
 
     def __post_init__(self) -> None:
         for chance in fields(self):
-            value = getattr(self, chance.name)
-            if not is_finite(value) or not 0 <= value <= 1:
-                raise LocaliserError(
-                    f"{chance.name}: expected a probability from 0 to 1, got {brief(value)}; "
-                    "take 0 for what never happens"
-                )
+            value, mend = getattr(self, chance.name), "take 0 for what never happens"
+            a_number(chance.name, value, LocaliserError, 0, 1, what="a probability", mend=mend)
 
     @classmethod
     def none(cls) -> Chances:

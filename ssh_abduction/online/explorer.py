@@ -44,8 +44,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeAlias
 
-from ssh_abduction.data.checks import a_function
-from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_whole
+from ssh_abduction.data.checks import a_function, a_whole_number
+from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.data.words import counted
@@ -190,11 +190,8 @@ class Explorer:
         time_limit: float | None = 2.0,
         max_maps: int | None = 100,
     ) -> None:
-        if not is_whole(margin) or margin < 0:
-            raise TraceError(
-                f"margin: expected a number of dstates, 0 or more, got {brief(margin)}; give a "
-                "whole number such as 2"
-            )
+        what, mend = "a number of dstates", "give a whole number such as 2"
+        a_whole_number("margin", margin, TraceError, what=what, mend=mend)
         check_limit("time_limit", "seconds", time_limit)
         for name in ("look", "can", "do"):
             a_function(
@@ -257,11 +254,8 @@ class Explorer:
         Raises:
             TraceError: `steps` is negative or no whole number, or what the robot sees does not fit.
         """
-        if not is_whole(steps) or steps < 0:
-            raise TraceError(
-                f"steps: expected a number of actions, 0 or more, got {brief(steps)}; give a "
-                "whole number such as 50"
-            )
+        what, mend = "a number of actions", "give a whole number such as 50"
+        a_whole_number("steps", steps, TraceError, what=what, mend=mend)
         while steps > 0 and self.step():
             steps -= 1
         if steps == 0 and not self._is_stuck:

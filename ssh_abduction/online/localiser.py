@@ -63,8 +63,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.errors import LocaliserError, MapError, TraceError, brief, named
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Action, Step, Trace, View, checked_trace
 from ssh_abduction.online.belief import AKIN, NOVEL, TINY, Belief, Observation
 from ssh_abduction.online.chances import Chances
@@ -105,12 +106,8 @@ class Localiser:
         chances: Chances | None = None,
     ) -> None:
         self.ssh_map = _checked(ssh_map)
-        self.chances = Chances() if chances is None else chances
-        if not isinstance(self.chances, Chances):
-            raise LocaliserError(
-                f"chances: expected Chances, got {brief(chances)}; "
-                "make them with Chances(misread=…)"
-            )
+        chances, mend = Chances() if chances is None else chances, "make Chances(misread=…)"
+        self.chances = an_instance("chances", chances, Chances, LocaliserError, mend=mend)
         self._number = len(ssh_map.dstates)
         if trace is not None and len(checked_trace(trace)) != len(ssh_map.dstate_at):
             raise MapError(
@@ -355,11 +352,7 @@ class Localiser:
 
 def _checked(ssh_map: object) -> SSHMap:
     """Return the map if its dstates have the ids 0, 1, 2, …; raise MapError otherwise."""
-    if not isinstance(ssh_map, SSHMap):
-        raise MapError(
-            f"map: expected an SSHMap, got {brief(ssh_map)}; "
-            "take one of solution.maps, or SSHMap.load"
-        )
+    ssh_map = checked_map(ssh_map)
     ids = [s.id for s in ssh_map.dstates]
     if not ids or ids != list(range(len(ids))):
         raise MapError(

@@ -36,8 +36,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal, NoReturn
 
-from ssh_abduction.data.checks import a_list
-from ssh_abduction.data.errors import MapError, brief, printable
+from ssh_abduction.data.checks import a_list, one_of
+from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import Region, course_named, named_by_number, right_of
 from ssh_abduction.data.trace import View
@@ -205,11 +205,7 @@ def route(
         MapError: There is no such dstate, place, region or map; no route exists; the map has no
             poses for "metres", or no paths for "places".
     """
-    if not isinstance(by, str) or by not in BY:
-        raise MapError(
-            f"by: expected {', '.join(BY[:-1])} or {BY[-1]}, got {brief(by)}; "
-            "say what the route minimises"
-        )
+    one_of("by", by, BY, MapError, mend="say what the route minimises")
     listing = Listing.of(maps)
     number = listing.number(str(map))
     ssh_map = listing.maps[number]

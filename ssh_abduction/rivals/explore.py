@@ -52,7 +52,7 @@ import numpy as np
 
 from ssh_abduction.data.checks import a_flag, a_function, a_list, an_instance
 from ssh_abduction.data.errors import MapError, brief
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Action, Trace, checked_trace
 from ssh_abduction.rivals.consequences import Consequence, Consequences, is_possible
 from ssh_abduction.rivals.experiment import (
@@ -389,10 +389,7 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
             "see the status that solve gave"
         )
     for i, ssh_map in enumerate(maps):
-        if not isinstance(ssh_map, SSHMap):
-            raise MapError(
-                f"maps[{i}]: expected an SSHMap, got {brief(ssh_map)}; take a Solution, or its maps"
-            )
+        checked_map(ssh_map, f"maps[{i}]")
         labels = ssh_map.dstate_at
         if len(labels) != len(maps[0].dstate_at):
             raise MapError(

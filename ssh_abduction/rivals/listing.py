@@ -17,14 +17,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 from ssh_abduction.checker.joins import Join, joins_in_words
-from ssh_abduction.data.checks import a_path, a_text, an_instance
+from ssh_abduction.data.checks import a_flag, a_path, a_text, a_whole_number, an_instance, one_of
 from ssh_abduction.data.corrections_file import named_beside
 from ssh_abduction.data.drives import Drive, pieces_in_words, with_named_faults
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.map_parts import Fault
-from ssh_abduction.data.maps import ID_LENGTH, SSHMap, maps_of
+from ssh_abduction.data.maps import ID_LENGTH, SSHMap, checked_maps, maps_of
 from ssh_abduction.data.trace import View
 from ssh_abduction.solver import (
     Backbone,
@@ -138,13 +138,7 @@ class Listing:
                 f"maps: expected a solution or maps, got {brief(source)}; read a file with "
                 "Listing.load"
             )
-        maps = tuple(source)
-        for i, ssh_map in enumerate(maps):
-            if not isinstance(ssh_map, SSHMap):
-                raise MapError(
-                    f"maps[{i}]: expected a map, got {brief(ssh_map)}; give the maps of a solution"
-                )
-        return cls(maps).checked()
+        return cls(checked_maps(source)).checked()
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Listing:
@@ -209,16 +203,11 @@ class Listing:
                 )
         theory = theory_in(answer["theory"], where) if "theory" in answer else None
         status, count = answer.get("status"), answer.get("count", len(maps))
-        if status is not None and status not in [known.value for known in Status]:
-            raise MapError(
-                f"{where}: status: expected one of {', '.join(known.value for known in Status)}, "
-                f"got {brief(status)}; solve again"
-            )
-        if not is_whole(count) or count < 0:
-            raise MapError(
-                f"{where}: count: expected the number of minimal maps, got {brief(count)}; "
-                "solve again"
-            )
+        if status is not None:
+            every = [status.value for status in Status]
+            one_of(f"{where}: status", status, every, MapError, mend="solve again")
+        what = "the number of minimal maps"
+        a_whole_number(f"{where}: count", count, MapError, what=what, mend="solve again")
         # with levels, only maps of the first level are minimal
         levels = answer.get("levels")
         minimal: Any = len(maps)
@@ -231,10 +220,8 @@ class Listing:
                     f"got {brief(levels)}; solve again"
                 )
         complete = answer.get("complete")
-        if complete is not None and not isinstance(complete, bool):
-            raise MapError(
-                f"{where}: complete: expected true or false, got {brief(complete)}; solve again"
-            )
+        if complete is not None:
+            a_flag(f"{where}: complete", complete, MapError)
         backbone = None
         if maps and "backbone" in answer:
             backbone = Backbone.from_dict(

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from ssh_abduction.data.errors import TheoryError, brief, is_finite, is_whole
+from ssh_abduction.data.checks import a_whole_number
+from ssh_abduction.data.errors import TheoryError, brief, is_finite
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.rules import Rules
 
@@ -222,13 +223,9 @@ def _check_numbers(theory: Theory) -> None:
             "take 0.001, or another small one"
         )
     for name, least, most in (("joint", 1, MOST_JOINT), ("returns", 0, MOST_STEPS)):
-        value = getattr(theory, name)
-        if not is_whole(value) or not least <= value <= most:
-            raise TheoryError(
-                f"{name}: expected a whole number from {least} to {most}, got {brief(value)}"
-                "; take one in this range"
-            )
-        object.__setattr__(theory, name, int(value))
+        value, mend = getattr(theory, name), "take one in this range"
+        value = a_whole_number(name, value, TheoryError, least, most, mend=mend)
+        object.__setattr__(theory, name, value)
     object.__setattr__(theory, "reject", float(theory.reject))
 
 

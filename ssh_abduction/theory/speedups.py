@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Final
 
+from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.errors import SolverError, brief
 from ssh_abduction.data.words import shortly
 from ssh_abduction.theory import encodings
@@ -93,12 +94,8 @@ class Speedups:
 
 def checked_speedups(value: object) -> Speedups:
     """Return a value if it is Speedups, or raise SolverError."""
-    if not isinstance(value, Speedups):
-        raise SolverError(
-            f"speedups: expected Speedups, got {brief(value)}; take Speedups() or "
-            "Speedups.without(…)"
-        )
-    return value
+    mend = "take Speedups() or Speedups.without(…)"
+    return an_instance("speedups", value, Speedups, SolverError, mend=mend)
 
 
 SPEEDUPS = tuple(f.name for f in fields(Speedups))
