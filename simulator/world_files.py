@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -16,7 +17,9 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.occupancy import FARTHEST, read_occupancy
-from ssh_abduction.data.errors import brief, is_finite, printable
+from ssh_abduction.data.checks import a_text
+from ssh_abduction.data.errors import is_finite, printable
+from ssh_abduction.data.fields import FieldReader
 
 Array = NDArray[np.float64]
 Angles: TypeAlias = Literal["right", "any"]
@@ -94,7 +97,7 @@ def are_square(walls: Array) -> bool:
     return bool(lengths[off > SQUARE].sum() <= OBLIQUE * lengths.sum())
 
 
-class WorldReader:
+class WorldReader(FieldReader):
     """Reads and checks the fields of a world file.
 
     All methods but `wrong` return the checked value, or raise SimulatorError if it is invalid.
@@ -104,8 +107,7 @@ class WorldReader:
         where: Name of the file, for errors.
     """
 
-    def __init__(self, where: str) -> None:
-        self.where = where
+    error, mend = SimulatorError, "mend it (docs/reference/worlds.md)"
 
     def fields(self, data: Any) -> dict[str, Any]:
         """Read the arguments of `World`, by name, from a JSON object."""
@@ -117,12 +119,12 @@ class WorldReader:
             raise self.wrong(
                 "format", f'an object with "format": "{FORMAT}", "version": {VERSION}', data
             )
-        walls = [self.loop(p, f"polygons[{i}]") for i, p in enumerate(self.list(data, "polygons"))]
-        walls += [
-            self.numbers(s, 4, f"segments[{i}]").reshape(1, 4)
-            for i, s in enumerate(self.list(data, "segments"))
+        each = partial(self.each, data, optional=True)
+        walls = [
+            *each("polygons", self.loop),
+            *each("segments", self.segment),
+            *each("arcs", self.arc),
         ]
-        walls += [self.arc(a, f"arcs[{i}]") for i, a in enumerate(self.list(data, "arcs"))]
         if "occupancy" in data:
             walls.append(self.occupancy(data["occupancy"]))
         if not walls:
@@ -131,24 +133,21 @@ class WorldReader:
             )
         # Places are those of dstates and those listed; routes may also lead through other points.
         segments = np.vstack(walls)
-        dstates = tuple(
-            self.dstate(s, f"dstates[{i}]") for i, s in enumerate(self.list(data, "dstates"))
-        )
+        dstates = each("dstates", self.dstate)
         places = {state.place: state.pose[:2] for state in dstates} | self.points(
             data.get("places", {}), "places"
         )
         via = self.points(data.get("via", {}), "via")
         stops = {**via, **places}
-        lifts = tuple(self.lift(v, f"lifts[{i}]") for i, v in enumerate(self.list(data, "lifts")))
-        route = self.route(self.list(data, "route"), stops, lifts)
+        lifts = each("lifts", self.lift)
+        route = self.route(self.list(data, "route", optional=True), stops, lifts)
         start = [*stops[route[0]], 0.0] if set(route) & set(stops) else [0, 0, 0]
+        name = data.get("name", printable(Path(self.where).stem))
         return {
-            "name": self.name(data.get("name", printable(Path(self.where).stem))),
+            "name": a_text(f"{self.where}: name", name, SimulatorError),
             "segments": self.ragged(segments, data.get("ragged", 0.0)),
             "angles": self.angles(data.get("angles"), segments),
-            "clutter": tuple(
-                self.clutter(c, f"clutter[{i}]") for i, c in enumerate(self.list(data, "clutter"))
-            ),
+            "clutter": each("clutter", self.clutter),
             "start": self.pose(data.get("start", start), "start"),
             "route": route,
             "reach": self.reach(data.get("reach", 1.0)),
@@ -158,38 +157,22 @@ class WorldReader:
             "lifts": lifts,
         }
 
-    def name(self, value: Any) -> str:
-        """Check the name of a world."""
-        if not isinstance(value, str):
-            raise self.wrong("name", "a text", value)
-        return value
-
-    def wrong(self, name: str, expected: str, value: Any) -> SimulatorError:
-        """Make the error that a field is wrong."""
-        return SimulatorError(
-            f"{self.where}: {name}: expected {expected}, got {brief(value)}; mend it "
-            "(docs/reference/worlds.md)"
-        )
-
-    def list(self, data: Mapping[str, Any], name: str) -> list[Any]:
-        """Read a field that is a list. The list is empty if the field is missing."""
-        value = data.get(name, [])
-        if not isinstance(value, list):
-            raise self.wrong(name, "a list", value)
-        return value
-
-    def numbers(self, value: Any, count: int, name: str) -> Array:
+    def row(self, value: Any, count: int, name: str) -> Array:
         """Read a list of `count` finite numbers: (count,)."""
         good = isinstance(value, list) and len(value) == count
         if not good or not all(is_finite(x) and abs(x) <= FARTHEST for x in value):
             raise self.wrong(name, f"{count} finite numbers, of at most {FARTHEST:,.0f}", value)
         return np.array(value, dtype=float)
 
+    def segment(self, value: Any, name: str) -> Array:
+        """Read a wall: (1, 4), metres."""
+        return self.row(value, 4, name).reshape(1, 4)
+
     def loop(self, value: Any, name: str) -> Array:
         """Read a list of points, and make the sides of the closed polygon: (n, 4), metres."""
         if not isinstance(value, list) or len(value) < 3:
             raise self.wrong(name, "at least three points [x, y]", value)
-        points = np.array([self.numbers(p, 2, f"{name}[{i}]") for i, p in enumerate(value)])
+        points = np.array([self.row(p, 2, f"{name}[{i}]") for i, p in enumerate(value)])
         return np.hstack([points, np.roll(points, -1, axis=0)])
 
     def arc(self, value: Any, name: str) -> Array:
@@ -198,7 +181,7 @@ class WorldReader:
         It lists x and y of the centre, radius, and first and last direction in degrees
         counterclockwise.
         """
-        x, y, radius, first, last = self.numbers(value, 5, name)
+        x, y, radius, first, last = self.row(value, 5, name)
         if not radius > 0 or not 0 < last - first <= 360:
             raise self.wrong(
                 name,
@@ -253,7 +236,7 @@ class WorldReader:
         if clash := next((text for text in value if text in ACTIONS or "," in text), None):
             raise self.wrong(name, "names without commas that are no actions", clash)
         found = {
-            text: self.numbers(point, 2, f"{name}.{text}").tolist() for text, point in value.items()
+            text: self.row(point, 2, f"{name}.{text}").tolist() for text, point in value.items()
         }
         return {text: (x, y) for text, (x, y) in found.items()}
 
@@ -264,7 +247,7 @@ class WorldReader:
         action = value["name"]
         if not action or action in ACTIONS or "," in action:
             raise self.wrong(f"{name}.name", "a name without commas that is no action", action)
-        start, end = (self.numbers(value.get(k), 2, f"{name}.{k}") for k in ("from", "to"))
+        start, end = (self.row(value.get(k), 2, f"{name}.{k}") for k in ("from", "to"))
         return Lift(action, (float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
 
     def route(
@@ -308,14 +291,14 @@ class WorldReader:
 
     def pose(self, value: Any, name: str) -> tuple[float, float, float]:
         """Read a pose. Its heading is in degrees in the file, and in radians in the result."""
-        x, y, degrees = self.numbers(value, 3, name)
+        x, y, degrees = self.row(value, 3, name)
         return float(x), float(y), math.radians(degrees)
 
     def clutter(self, value: Any, name: str) -> Clutter:
         """Read a polygon that may move."""
         if not isinstance(value, Mapping):
             raise self.wrong(name, "an object with a polygon", value)
-        moves = self.numbers(value.get("moves", [0, 0]), 2, f"{name}.moves")
+        moves = self.row(value.get("moves", [0, 0]), 2, f"{name}.moves")
         present = value.get("present", 1.0)
         if not is_finite(present) or not 0 <= present <= 1:
             raise self.wrong(f"{name}.present", "a probability", present)

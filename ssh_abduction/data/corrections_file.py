@@ -6,8 +6,9 @@ import json
 import math
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +27,7 @@ from ssh_abduction.data.corrections import (
 )
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, named
+from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line, read_at_most, save_file
 from ssh_abduction.data.map_parts import NAMED
 from ssh_abduction.data.maps import SSHMap
@@ -156,7 +158,7 @@ def from_yaml(text: str, source: str = "corrections") -> Corrections:
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise MapError(f"{source}: expected YAML, got {reason}; mend it there") from None
-    return _CorrectionsReader(source).corrections(data)
+    return _CorrectionsReader(named(source)).corrections(data, source)
 
 
 def _check_keys(node: Any) -> None:
@@ -174,39 +176,39 @@ def _check_keys(node: Any) -> None:
                 )
 
 
-class _CorrectionsReader:
+class _CorrectionsReader(FieldReader):
     """Checks the fields of a file of corrections. Errors name the file and the field."""
 
-    def __init__(self, source: str) -> None:
-        self._source = source
+    mend = "mend it there"
 
-    def corrections(self, data: object) -> Corrections:
+    def corrections(self, data: object, source: str) -> Corrections:
         """Convert the data of a file."""
         fields = ("format", "version", "drives", "names", *PAIRS, "gateways")
         record = self._object(data, "file", fields)
         if record.get("format") != FORMAT:
-            raise self._wrong("format", f'"{FORMAT}"', record.get("format"))
+            raise self.wrong("format", f'"{FORMAT}"', record.get("format"))
         if record.get("version") != str(VERSION):
             expected = f"{VERSION} (another one is of another ssh-abduction)"
-            raise self._wrong("version", expected, record.get("version"))
-        drives = self._object(record.get("drives") or {}, "drives")
+            raise self.wrong("version", expected, record.get("version"))
+        record = {name: value for name, value in record.items() if value}  # others say nothing
+        drives = self._object(record.get("drives", {}), "drives")
         return Corrections(
             {name: self._text(mark, f"drives.{name}") for name, mark in drives.items()},
-            self._each(record, "names", self._naming),
+            self.each(record, "names", self._naming, optional=True),
             tuple(
-                self._said(kind, value, where)
+                said
                 for kind in PAIRS
-                for value, where in self._each(record, kind, lambda value, where: (value, where))
+                for said in self.each(record, kind, partial(self._said, kind), optional=True)
             ),
-            self._each(record, "gateways", self._passage),
-            self._source,
+            self.each(record, "gateways", self._passage, optional=True),
+            source,
         )
 
     def _naming(self, value: object, where: str) -> Naming:
         record = self._object(value, where, ("name", *NAMED, "note"))
         kinds = [kind for kind in NAMED if kind in record]
         if len(kinds) != 1:
-            raise self._wrong(where, f"one of {', '.join(NAMED)}", value)
+            raise self.wrong(where, f"one of {', '.join(NAMED)}", value)
         name = self._text(record.get("name"), f"{where}.name").strip()
         step = self._step(record[kinds[0]], f"{where}.{kinds[0]}")
         return Naming(name, kinds[0], step, self._note(record, where))
@@ -217,16 +219,16 @@ class _CorrectionsReader:
             record = self._object(value, where, ("steps", "note"))
             note, steps = self._note(record, where), record.get("steps")
         if not isinstance(steps, list) or len(steps) != 2:
-            raise self._wrong(where, "two steps, such as [monday:12, tuesday:3]", value)
+            raise self.wrong(where, "two steps, such as [monday:12, tuesday:3]", value)
         first, second = (self._step(step, f"{where}[{i}]") for i, step in enumerate(steps))
         if first == second:
-            raise self._wrong(where, "two different steps", value)
+            raise self.wrong(where, "two different steps", value)
         return Said(kind, (first, second), note)
 
     def _passage(self, value: object, where: str) -> Passage:
         record = self._object(value, where, ("open", "closed", "note"))
         if ("open" in record) == ("closed" in record):
-            raise self._wrong(where, "one of open, closed", value)
+            raise self.wrong(where, "one of open, closed", value)
         is_open = "open" in record
         field = f"{where}.{'open' if is_open else 'closed'}"
         seen = self._object(record["open" if is_open else "closed"], field)
@@ -241,12 +243,12 @@ class _CorrectionsReader:
         try:
             return direction(text)
         except MapError:
-            raise self._wrong(where, f"{', '.join(DIRECTIONS)}, or degrees", value) from None
+            raise self.wrong(where, f"{', '.join(DIRECTIONS)}, or degrees", value) from None
 
     def _step(self, value: object, where: str) -> str:
         drive, colon, number = self._text(value, where).rpartition(":")
         if not (drive and colon and number.isascii() and number.isdecimal()):
-            raise self._wrong(where, "a drive, a colon and a step, such as monday:12", value)
+            raise self.wrong(where, "a drive, a colon and a step, such as monday:12", value)
         return f"{drive}:{int(number)}"
 
     def _note(self, record: Mapping[str, object], where: str) -> str | None:
@@ -254,7 +256,7 @@ class _CorrectionsReader:
 
     def _text(self, value: object, where: str) -> str:
         if not isinstance(value, str) or not value.strip() or not value.isprintable():
-            raise self._wrong(where, "a text on one line", value)
+            raise self.wrong(where, "a text on one line", value)
         return value
 
     def _object(
@@ -262,24 +264,10 @@ class _CorrectionsReader:
     ) -> Mapping[str, Any]:
         if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
             expected = "fields such as name: kitchen" if fields is None else ", ".join(fields)
-            raise self._wrong(where, expected, value)
+            raise self.wrong(where, expected, value)
         if fields is not None and (unknown := set(value) - set(fields)):
-            raise self._wrong(where, f"only {', '.join(fields)}", min(unknown))
+            raise self.wrong(where, f"only {', '.join(fields)}", min(unknown))
         return value
-
-    def _each(
-        self, record: Mapping[str, Any], name: str, read: Callable[[object, str], T]
-    ) -> tuple[T, ...]:
-        listed = record.get(name) or []
-        if not isinstance(listed, list):
-            raise self._wrong(name, "a list, each entry after a dash", listed)
-        return tuple(read(value, f"{name}[{i}]") for i, value in enumerate(listed))
-
-    def _wrong(self, where: str, expected: str, value: object) -> MapError:
-        return MapError(
-            f"{named(self._source)}: {where}: expected {expected}, got {brief(value)}; mend it "
-            "there"
-        )
 
 
 def direction(text: str) -> float:

@@ -1,12 +1,12 @@
-"""Read the fields of JSON objects in files of maps. Errors name the field."""
+"""Read the fields of JSON objects in files. Errors name the field."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from ssh_abduction.data.checks import a_text
-from ssh_abduction.data.errors import MapError, brief, is_finite, is_writable
+from ssh_abduction.data.errors import AbductionError, MapError, brief, is_finite, is_writable
 from ssh_abduction.data.observation import View
 
 T = TypeVar("T")
@@ -15,22 +15,27 @@ T = TypeVar("T")
 class FieldReader:
     """Reads and checks fields of a JSON object from a file of maps.
 
-    Most methods return the checked value or raise MapError. Their argument `name` is the name of
-    the field in error messages.
+    Most methods return the checked value or raise an error. Their argument `name` is the name of
+    the field in error messages. Readers of other files are subclasses.
 
     Args:
         where: The name of the file in error messages.
+
+    Attributes:
+        error: The class of the errors that are raised.
+        mend: What messages advise the user to do.
     """
 
-    def __init__(self, where: str) -> None:
-        self.where = a_text("where", where, MapError)
+    error: ClassVar[type[AbductionError]] = MapError
+    mend: ClassVar = "write the file with solve --json"
 
-    def wrong(self, name: str, expected: str, value: Any) -> MapError:
-        """Return the MapError for a field with a wrong value."""
-        return MapError(
-            f"{self.where}: {name or 'map'}: expected {expected}, got {brief(value)}; write the "
-            "file with solve --json"
-        )
+    def __init__(self, where: str) -> None:
+        self.where = a_text("where", where, self.error)
+
+    def wrong(self, name: str, expected: str, value: Any) -> AbductionError:
+        """Return the error for a field with a wrong value."""
+        what = f"{self.where}: {name or 'map'}: expected {expected}"
+        return self.error(f"{what}, got {brief(value)}; {self.mend}")
 
     def mapping(self, value: Any, name: str) -> Mapping[str, Any]:
         if not isinstance(value, Mapping):
