@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
@@ -10,7 +10,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from ssh_abduction.checker.moves import Course, MapLink, course_of
 from ssh_abduction.data.drives import drives_of, named_steps
-from ssh_abduction.data.groups import firsts, reached
+from ssh_abduction.data.groups import firsts, reached, way
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace, View
@@ -278,19 +278,7 @@ class Order:
 
     def _way_back(self, p: int, q: int) -> list[int]:
         """Find a shortest way along travels from q to p, as places; empty if there is none."""
-        came: dict[int, int | None] = {q: None}
-        queue = deque([q])
-        while queue and p not in came:
-            here = queue.popleft()
-            new = [r for r in self._next[1].get(here, ()) if r not in came]
-            came.update(dict.fromkeys(new, here))
-            queue.extend(new)
-        way: list[int] = []
-        place: int | None = p if p in came else None
-        while place is not None:
-            way.append(place)
-            place = came[place]
-        return way[::-1]
+        return way(q, p, lambda r: self._next[1].get(r, ()))
 
     def ring_steps(self, ring: Sequence[int]) -> list[int]:
         """List the steps of the travels that lead around a ring of places in this order."""

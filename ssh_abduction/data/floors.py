@@ -19,6 +19,7 @@ from dataclasses import replace
 from itertools import accumulate
 
 from ssh_abduction.data.drives import frames_of
+from ssh_abduction.data.groups import NodeClasses
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
@@ -48,18 +49,16 @@ def with_floors(ssh_map: SSHMap, trace: Trace) -> SSHMap:
     if not any(action.changes_floor for action in checked_trace(trace).actions):
         return ssh_map
     stretches = stretches_of(trace)
-    floor = {stretch: stretch for stretch in stretches}
+    floor = NodeClasses[int]()
     first: dict[tuple[str, int], int] = {}  # the first stretch at each dstate and place
     for label, stretch in zip(checked_map(ssh_map).dstate_at, stretches, strict=False):
         place = ssh_map.dstates[label].place
         for spot in (("dstate", label), *(() if place is None else (("place", place),))):
-            one, other = floor[first.setdefault(spot, stretch)], floor[stretch]
-            for known in stretches if one != other else ():
-                floor[known] = one if floor[known] == other else floor[known]
+            floor.merge(first.setdefault(spot, stretch), stretch)
     number: dict[int, int] = {}
     found: dict[int, int] = {}
     for label, stretch in zip(ssh_map.dstate_at, stretches, strict=False):
-        found.setdefault(label, number.setdefault(floor[stretch], len(number)))
+        found.setdefault(label, number.setdefault(floor.of(stretch), len(number)))
     return replace(
         ssh_map, dstates=tuple(replace(s, floor=found.get(s.id)) for s in ssh_map.dstates)
     )

@@ -45,6 +45,22 @@ def reached(starts: Iterable[Node], beside: Callable[[Node], Iterable[Node]]) ->
     return found
 
 
+def way(start: Node, goal: Node, beside: Callable[[Node], Iterable[Node]]) -> list[Node]:
+    """Find a shortest way along links, from `start` to `goal`; empty if there is none."""
+    came: dict[Node, Node | None] = {start: None}
+    waiting = [start]
+    for node in waiting:  # the list grows
+        new = [other for other in beside(node) if other not in came]
+        came |= dict.fromkeys(new, node)
+        waiting += dict.fromkeys(new)
+    found: list[Node] = []
+    at: Node | None = goal if goal in came else None
+    while at is not None:
+        found.append(at)
+        at = came[at]
+    return found[::-1]
+
+
 def parts(
     nodes: Iterable[Node], beside: Callable[[Node], Iterable[Node]]
 ) -> list[Collection[Node]]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import MapError, brief
-from ssh_abduction.data.groups import firsts
+from ssh_abduction.data.groups import firsts, reached
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace, View
@@ -262,15 +262,9 @@ def machine_of(
     For each dstate, `links` has the actions and where they lead, and `sights` the number of
     what is seen there.
     """
-    number, reached = {start: 0}, [start]
-    ends: list[tuple[tuple[str, int], ...]] = []
-    for s in reached:
-        for target in links[s].values():
-            if target not in number:
-                number[target] = len(reached)
-                reached.append(target)
-        ends.append(tuple((action, number[target]) for action, target in links[s].items()))
-    return Machine(tuple(sights[s] for s in reached), tuple(ends)), tuple(reached)
+    number = {s: i for i, s in enumerate(reached([start], lambda s: links[s].values()))}
+    ends = (tuple((action, number[x]) for action, x in links[s].items()) for s in number)
+    return Machine(tuple(sights[s] for s in number), tuple(ends)), tuple(number)
 
 
 class MachineTable:

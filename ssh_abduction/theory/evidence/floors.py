@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, ClassVar
 
 from ssh_abduction.data.floors import stretches_of
-from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.groups import gathered, way
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
@@ -46,8 +46,10 @@ class Floors(Evidence):
             beside.setdefault(one, {}).setdefault(other, found)
             beside.setdefault(other, {}).setdefault(one, found)
         for t in _lifted(trace):
-            if t < len(ssh_map.dstate_at) and (way := _way(stretches[t - 1], stretches[t], beside)):
-                return frozenset(way)
+            if t < len(ssh_map.dstate_at):
+                met = way(stretches[t - 1], stretches[t], lambda stretch: beside.get(stretch, ()))
+                if len(met) > 1:  # the fewest meetings that connect both
+                    return frozenset(beside[one][other] for one, other in pairwise(met))
         return None
 
 
@@ -77,18 +79,3 @@ def _meetings(ssh_map: SSHMap) -> Iterator[Equality]:
             yield Equality(first, t)
         elif place is not None and (first := places.setdefault(place, t)) != t:
             yield Equality(first, t, "place")
-
-
-def _way(one: int, other: int, beside: dict[int, dict[int, Equality]]) -> list[Equality]:
-    """Find the fewest meetings that connect two stretches; empty if none connect them."""
-    came: dict[int, int] = {one: one}
-    queue = [one]
-    for stretch in queue:
-        new = [near for near in beside.get(stretch, ()) if near not in came]
-        came.update(dict.fromkeys(new, stretch))
-        queue += new
-    way: list[Equality] = []
-    while other in came and other != one:
-        way.append(beside[came[other]][other])
-        other = came[other]
-    return way
