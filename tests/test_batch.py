@@ -26,10 +26,10 @@ from worlds import ENDLESS, TOURS, drive, rectangle
 from perception.readers.writers import write_carmen
 from ssh_abduction import Theory, Trace
 from ssh_abduction.cli import batch, cluster_jobs, main, mapping
-from ssh_abduction.cli.batch import SolveAnswer, SolveQuestion
+from ssh_abduction.cli.batch import SolveQuestion
 from ssh_abduction.cli.cluster_jobs import Absence, answers_on_cluster
-from ssh_abduction.cli.jobs import StopFlag, answers_here
-from ssh_abduction.cli.mapping import MapAnswer, MapQuestion
+from ssh_abduction.cli.jobs import FileAnswer, StopFlag, answers_here
+from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.theory import Speedups
 
@@ -42,7 +42,7 @@ QUESTION = SolveQuestion(
 class Deadly(SolveQuestion):
     """Kill the process that solves a trace of this name, as the system does if memory runs out."""
 
-    def answer(self, number: int, path: str, *rest: Any) -> SolveAnswer:
+    def answer(self, number: int, path: str, *rest: Any) -> FileAnswer:
         if "deadly" in path:
             time.sleep(0.3)  # let other traces start
             os.kill(os.getpid(), signal.SIGKILL)
@@ -55,7 +55,7 @@ class KilledOnce(MapQuestion):
     At the first log of this name, kill the worker that maps it.
     """
 
-    def answer(self, number: int, path: str, *rest: Any) -> MapAnswer:
+    def answer(self, number: int, path: str, *rest: Any) -> FileAnswer:
         assert workers.serves()  # so the process that began this one is the worker
         begun = Path(path).with_suffix(".begun")
         with begun.open("a") as file:
@@ -340,7 +340,7 @@ def test_unexpected_error_becomes_one_line(monkeypatch: pytest.MonkeyPatch) -> N
         raise MemoryError("no room for\nso many steps")
 
     monkeypatch.setattr(Trace, "load", load)
-    assert QUESTION.answer(3, "a\nb.jsonl") == SolveAnswer(
+    assert QUESTION.answer(3, "a\nb.jsonl") == FileAnswer(
         3, r"'a\nb.jsonl': error: MemoryError: no room for so many steps", 1
     )
 
@@ -420,10 +420,10 @@ def test_memory_limit_applies_to_each_trace(traces: Path) -> None:
 def test_ctrl_c_prints_finished_answers_that_waited_for_their_turn(
     traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def answers(*_: object) -> Iterator[SolveAnswer]:
-        yield SolveAnswer(0, "first", 0)
-        yield SolveAnswer(3, "fourth", 0)
-        yield SolveAnswer(2, "third", 20)
+    def answers(*_: object) -> Iterator[FileAnswer]:
+        yield FileAnswer(0, "first", 0)
+        yield FileAnswer(3, "fourth", 0)
+        yield FileAnswer(2, "third", 20)
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(10)
 

@@ -13,7 +13,8 @@ import pytest
 
 from ssh_abduction.cli import main, mapping, run_folders
 from ssh_abduction.cli.import_log import named_after
-from ssh_abduction.cli.mapping import MapAnswer, MapQuestion
+from ssh_abduction.cli.jobs import FileAnswer
+from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.run_folders import FILES, RUN, digest, folders_of, is_done, write_run
 
 QUESTION = MapQuestion(None, {}, (None, None, None), 0.5, None, 300, False)
@@ -201,7 +202,7 @@ def test_run_that_cannot_be_written_does_not_stop_other_logs(
     def here(question: object, paths: list[str], *_: object) -> object:
         for number, path in enumerate(paths):
             asked.append(path)
-            yield MapAnswer(
+            yield FileAnswer(
                 number, f"{path}: mapped", 0, ("it is odd",), (("maps.json", b"maps"), (RUN, b"{}"))
             )
 

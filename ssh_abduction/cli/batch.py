@@ -15,12 +15,19 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 from ssh_abduction.cli import EXIT_ERROR
 from ssh_abduction.cli.cluster_jobs import answers_on_cluster
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.jobs import FileQuestion, StopFlag, answers_here, final_code, in_a_line
+from ssh_abduction.cli.jobs import (
+    FileAnswer,
+    FileQuestion,
+    StopFlag,
+    answers_here,
+    final_code,
+    in_a_line,
+)
 from ssh_abduction.cli.options import check_jobs, theory_of
 from ssh_abduction.cli.outcome import (
     Given,
@@ -49,22 +56,6 @@ from ssh_abduction.theory.theory import Theory
 # This is a last resort: a process should end itself earlier, by its `Guard`. On a busy machine the
 # Guard may be several seconds late.
 GUARDED, OVERDUE = 1.2, 10.0
-
-
-class SolveAnswer(NamedTuple):
-    """The result of one trace, as plain data.
-
-    Attributes:
-        number: The index of the trace, from 0.
-        line: The line to print.
-        code: The exit code.
-        warnings: Warnings to print on stderr.
-    """
-
-    number: int
-    line: str
-    code: int
-    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +106,7 @@ class SolveQuestion(FileQuestion):
         path: str,
         trace: Trace | None = None,
         given_up: Callable[[], bool] = lambda: False,
-    ) -> SolveAnswer:
+    ) -> FileAnswer:
         """Implement `FileQuestion.answer`: solve one trace. If that fails, the answer says why."""
         try:
             return self._solved(number, path, trace or Trace.load(path), given_up)
@@ -124,7 +115,7 @@ class SolveQuestion(FileQuestion):
 
     def _solved(
         self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]
-    ) -> SolveAnswer:
+    ) -> FileAnswer:
         """Solve one trace as `answer` does, but raise errors."""
         self.theory.check_steps(trace)
         if self.memory is not None:
@@ -165,7 +156,7 @@ class SolveQuestion(FileQuestion):
     ) -> contextlib.AbstractContextManager[object]:
         """Make a guard that ends a worker process at its limits; nothing in other processes."""
 
-        def last_words(why: Stop) -> tuple[SolveAnswer, int]:
+        def last_words(why: Stop) -> tuple[FileAnswer, int]:
             # Nobody reads the exit code of this process.
             try:
                 solution = search.snapshot(why)
@@ -195,7 +186,7 @@ class SolveQuestion(FileQuestion):
         maps: Sequence[Given],
         explanation: Explanation | None,
         backbone: Backbone | None,
-    ) -> SolveAnswer:
+    ) -> FileAnswer:
         """Make the answer for a solution: its line, exit code and warnings."""
         if self.json:
             written = [written_map(*given) for given in maps]
@@ -207,14 +198,14 @@ class SolveQuestion(FileQuestion):
             warning if warning.startswith(f"{named(path)}:") else f"{named(path)}: {warning}"
             for warning in warnings_of(search, solution)
         )
-        return SolveAnswer(number, line, exit_code(solution), warnings)
+        return FileAnswer(number, line, exit_code(solution), warnings)
 
     @property
     def overdue(self) -> float | None:
         """The seconds after which a process without an answer is given up; None for no limit."""
         return None if self.limit is None else GUARDED * self.limit + OVERDUE
 
-    def failed(self, number: int, path: str, error: Exception) -> SolveAnswer:
+    def failed(self, number: int, path: str, error: Exception) -> FileAnswer:
         """Make the answer for a trace that could not be solved because of an error."""
         message = in_a_line(error)
         line = (
@@ -222,7 +213,7 @@ class SolveQuestion(FileQuestion):
             if self.json
             else f"{named(path)}: error: {message}"
         )
-        return SolveAnswer(number, line, EXIT_ERROR)
+        return FileAnswer(number, line, EXIT_ERROR)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -252,7 +243,7 @@ def run(options: argparse.Namespace) -> int:
     return final_code(codes, len(paths), stop, "traces")
 
 
-def _printed(answers: Generator[SolveAnswer], total: int, stop: StopFlag) -> list[int]:
+def _printed(answers: Generator[FileAnswer], total: int, stop: StopFlag) -> list[int]:
     """Print all lines in the order of the traces, and return the exit codes of the answers."""
     lines: dict[int, str] = {}  # the lines that wait for an earlier trace
     codes: list[int] = []

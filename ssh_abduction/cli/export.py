@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
     if options.output == "-":
         print(text.removesuffix("\n"))
     else:
-        write_map(options.output, text.removesuffix("\n"), "map", "--output")
+        write_map(options.output, text.removesuffix("\n"))
     for doubt in export_doubts(
         chosen, options.to, level=options.level, turns=turns, hide_undecided=options.hide_undecided
     ):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
 from ssh_abduction.cli import EXIT_ERROR
@@ -34,6 +35,25 @@ def in_a_line(error: Exception) -> str:
     is_ours = isinstance(error, AbductionError)
     message = str(error) if is_ours else f"{type(error).__name__}: {error}"
     return printable(" ".join(message.split()))
+
+
+@dataclass(frozen=True, slots=True)
+class FileAnswer:
+    """The answer for one file, as plain data.
+
+    Attributes:
+        number: The number of the file in the command line, from 0.
+        line: The line to print.
+        code: The exit code.
+        warnings: The warnings to print.
+        files: Names and contents of the files to write.
+    """
+
+    number: int
+    line: str
+    code: int
+    warnings: tuple[str, ...] = ()
+    files: tuple[tuple[str, bytes], ...] = ()
 
 
 class FileQuestion(Protocol):

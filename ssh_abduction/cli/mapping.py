@@ -21,7 +21,14 @@ from ssh_abduction.cli import EXIT_ERROR, unwritten
 from ssh_abduction.cli.cluster_jobs import answers_on_cluster
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.import_log import WIDTH, named_after, reading_of
-from ssh_abduction.cli.jobs import FileQuestion, StopFlag, answers_here, final_code, in_a_line
+from ssh_abduction.cli.jobs import (
+    FileAnswer,
+    FileQuestion,
+    StopFlag,
+    answers_here,
+    final_code,
+    in_a_line,
+)
 from ssh_abduction.cli.obeying import say_obeyed
 from ssh_abduction.cli.options import check_jobs, choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
@@ -47,25 +54,6 @@ from ssh_abduction.robot_logs.log_picture import paths_mean_something
 
 GIVEN_UP = "expected time to map this log, got an interruption; map it again"
 KEPT = 64  # the copy of a log for a worker keeps this many last characters of its name
-
-
-@dataclass(frozen=True, slots=True)
-class MapAnswer:
-    """The result of one log, as plain data.
-
-    Attributes:
-        number: The index of the log, from 0.
-        line: The line to print.
-        code: The exit code.
-        warnings: Warnings to print on stderr.
-        files: The names and contents of the files for its folder.
-    """
-
-    number: int
-    line: str
-    code: int
-    warnings: tuple[str, ...] = ()
-    files: tuple[tuple[str, bytes], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,9 +118,9 @@ class MapQuestion(FileQuestion):
         path: str,
         content: bytes | None = None,
         given_up: Callable[[], bool] = lambda: False,
-        answer_last: Callable[[MapAnswer], None] = workers.reply,
+        answer_last: Callable[[FileAnswer], None] = workers.reply,
         tell: Callable[[str], None] = lambda note: None,
-    ) -> MapAnswer:
+    ) -> FileAnswer:
         """Implement `FileQuestion.answer`: map one log. If that fails, the answer says why.
 
         `answer_last` takes the answer if the process has to end because clingo does not
@@ -157,9 +145,9 @@ class MapQuestion(FileQuestion):
     def answer_together(
         self,
         paths: Sequence[str],
-        answer_last: Callable[[MapAnswer], None],
+        answer_last: Callable[[FileAnswer], None],
         tell: Callable[[str], None],
-    ) -> MapAnswer:
+    ) -> FileAnswer:
         """Map the logs of several drives through one building together. Raises AbductionError."""
         return self._mapped(0, paths, paths, digest(paths), lambda: False, answer_last, tell)
 
@@ -170,9 +158,9 @@ class MapQuestion(FileQuestion):
         files: Sequence[str],
         content: str | None,
         given_up: Callable[[], bool],
-        answer_last: Callable[[MapAnswer], None],
+        answer_last: Callable[[FileAnswer], None],
         tell: Callable[[str], None],
-    ) -> MapAnswer:
+    ) -> FileAnswer:
         """Map one log, or several together, from `files`, which may be copies.
 
         `content` is the digest of the logs before they are read. If a log changes later, the next
@@ -192,7 +180,7 @@ class MapQuestion(FileQuestion):
                 raise KeyboardInterrupt
             interrupt()
 
-        def last_words(_: Stop) -> tuple[MapAnswer, int]:
+        def last_words(_: Stop) -> tuple[FileAnswer, int]:
             known = [
                 self._answer(number, paths, mapping.known(), content)
                 for mapping in begun
@@ -231,7 +219,7 @@ class MapQuestion(FileQuestion):
 
     def _answer(
         self, number: int, paths: Sequence[str], done: LogMap, content: str | None
-    ) -> MapAnswer:
+    ) -> FileAnswer:
         """Make the answer for a log that was mapped, or for several that were mapped together."""
         files, log = done.files(), done.log
         run = json.loads(files["run.json"])
@@ -268,15 +256,15 @@ class MapQuestion(FileQuestion):
         )
         code = interrupted_code() if done.interrupted else exit_code(solution)
         notes = (*log.warnings, *done.notes, *solution.warnings)
-        return MapAnswer(number, line, code, notes, tuple(files.items()))
+        return FileAnswer(number, line, code, notes, tuple(files.items()))
 
-    def _given_up(self, number: int, path: str) -> MapAnswer:
+    def _given_up(self, number: int, path: str) -> FileAnswer:
         """Make the answer for a log that was interrupted before anything was known."""
-        return MapAnswer(number, f"{named(path)}: {GIVEN_UP}", interrupted_code())
+        return FileAnswer(number, f"{named(path)}: {GIVEN_UP}", interrupted_code())
 
-    def failed(self, number: int, path: str, error: Exception) -> MapAnswer:
+    def failed(self, number: int, path: str, error: Exception) -> FileAnswer:
         message = in_a_line(error)
-        return MapAnswer(
+        return FileAnswer(
             number,
             message if message.startswith(named(path)) else f"{named(path)}: error: {message}",
             EXIT_ERROR,
@@ -382,7 +370,7 @@ def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
         printed.add(warning)
         warn([warning])
 
-    def keep(answer: MapAnswer) -> None:
+    def keep(answer: FileAnswer) -> None:
         if answer.code == EXIT_ERROR:
             raise AbductionError(answer.line)
         try:
@@ -403,7 +391,7 @@ def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
 
 
 def _kept(
-    answers: Iterator[MapAnswer], paths: list[str], folders: dict[str, Path]
+    answers: Iterator[FileAnswer], paths: list[str], folders: dict[str, Path]
 ) -> Iterator[int]:
     """Write the files of each answer and print its line, as they come. Yield the exit codes."""
     for answer in answers:
@@ -419,7 +407,7 @@ def _kept(
         yield code
 
 
-def _say(answer: MapAnswer, folder: Path) -> None:
+def _say(answer: FileAnswer, folder: Path) -> None:
     where = f" → {named(str(folder))}" if answer.files else ""
     print(f"{answer.line}{where}", flush=True)
 

@@ -13,7 +13,7 @@ from typing import Any
 from ssh_abduction.data.checks import a_path
 from ssh_abduction.data.errors import MapError, brief, is_writable, named
 from ssh_abduction.data.fields import FieldReader
-from ssh_abduction.data.files import HalfCharacter, NotFinite, parse_json, write_file
+from ssh_abduction.data.files import HalfCharacter, NotFinite, parse_json, save_file
 from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
 from ssh_abduction.data.regions import Region
 
@@ -23,22 +23,9 @@ SOLUTION_FORMAT, MAP_FORMAT, VERSION = "ssh-solution", "ssh-map", 1
 LARGEST = 2**30
 
 
-def write_map(
-    path: str | os.PathLike[str], text: str, what: str = "map", option: str = "output"
-) -> None:
-    """Write a map, or a picture of one, into a file, with a line end. Raises MapError.
-
-    `option` is the name of the parameter or option that gave the path.
-    """
-    path = a_path("path" if option == "output" else option, path, MapError)
-    try:
-        write_file(path, f"{text}\n".encode())
-    except OSError as error:
-        raise MapError(
-            f"{named(path)}: cannot write the {what}: {error.strerror or error}; check the folder"
-        ) from None
-    except ValueError as error:
-        raise MapError(f"{option}: cannot write the {what}: {error}; name a file") from None
+def write_map(path: str | os.PathLike[str], text: str, what: str = "map") -> None:
+    """Write a map, or a picture of one, into a file, with a line end. Raises MapError."""
+    save_file(a_path("path", path, MapError), f"{text}\n".encode(), what, MapError)
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
