@@ -105,6 +105,22 @@ def test_narrow_beam_tells_dstates_at_one_place_apart() -> None:
     assert places == [0, 1, 1, 0, 0, 2, 1]
 
 
+def test_beam_keeps_hypotheses_with_other_places() -> None:
+    """Beside the cheapest hypotheses there are others, which differ in places from all these."""
+    (known,) = truth.mazes(3, 40, [700], DRIFTING)
+    problem, width, others = settle(known.trace, Theory(star="none")), 4, 0
+    beam = Beam(problem, Log(known.trace, problem.theory, problem.pairs), width)
+    kept = [beam._first()]
+    for t in range(1, len(known.trace)):
+        options = beam._options_of(kept, t, joins=True)
+        kept = list(beam._best(options, t, width))
+        assert [found.nats for found in kept[:width]] == [o.nats for o in options[:width]]
+        at = [[found.places[s] for s in found.labels] for found in kept]
+        assert all(at[k] not in at[:k] for k in range(width, len(at)))
+        others += len(at) > width
+    assert others
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "seed"), [("misread", 702), ("jumped", 701), ("slipped", 701)])
 def test_a_beam_finds_faults(kind: str, seed: int) -> None:

@@ -159,6 +159,11 @@ def test_successive_visits_with_one_middle_are_joined() -> None:
     assert math.dist(every[3].middle, points_moved(pose, every[1].middle[None])[0]) < 1e-6
     assert [(one.first, one.last) for one in closed] == [(0, 2), (1, 3)]
     assert closed[1].match.shift == pytest.approx((0.0, 0.0))
+    # A robot that turned around is not at the place before.
+    turned = [*visits[:4], replace(visits[4], support=0.0)]
+    every, _ = with_partings(track, turned, closings[:1])
+    assert [visit.scan for visit in every] == [visit.scan for visit in visits]
+    assert math.dist(every[3].middle, every[4].middle) >= 0.6
     # Across a cut nobody knows whether the robot left the place.
     cut = replace(track, cuts=(visits[4].scan,))
     assert len(with_partings(cut, visits, closings)[0]) == len(visits)

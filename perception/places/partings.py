@@ -6,7 +6,8 @@ each other, so they show where two stretches diverge. If no known place is near,
 place. Each stretch that passes it gets a visit.
 
 Closures also show visits whose middles are nearly the same. Their local maps show one junction at
-slightly different points. So they get one middle, and are visits to one place. If a visit shares
+slightly different points. So they get one middle, and are visits to one place. But a point where
+the robot turned around never gets the middle of the visit before or after it. If a visit shares
 its middle with no other one, the robot may have come nearer to a middle that others share. Then the
 visit gets that middle. Successive visits that now have one middle become one.
 
@@ -22,8 +23,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.spatial.distance import cdist, pdist
+from scipy.spatial.distance import cdist, pdist, squareform
 
 from perception.places.closures import VisitMatch
 from perception.places.stays import RIM, SAME, STAY, are_near, joined, taken, with_ways_in_order
@@ -230,11 +232,20 @@ def _agreed(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
         if len(group) < 2:
             continue
         at = np.array([point for _, point in group.values()])
-        parts = fcluster(linkage(pdist(at), "complete"), AGREED, "distance")
+        far = squareform(pdist(at))
+        far[_turned_between(drive.visits, [*group])] += AGREED
+        parts = fcluster(linkage(squareform(far), "complete"), AGREED, "distance")
         for n, part in zip(group, parts, strict=True):
             turn, point = group[n]
             moves[n] = points_turned(-turn, at[parts == part].mean(axis=0) - point)
     return moves
+
+
+def _turned_between(visits: Sequence[Visit], some: Sequence[int]) -> NDArray[np.bool_]:
+    """Whether two of some visits are successive, and the robot turned around at one: (n, n)."""
+    turns = np.array([visits[k].support == 0 for k in some])
+    successive = np.abs(np.subtract.outer(some, some)) == 1
+    return np.asarray(successive & (turns[:, None] | turns))
 
 
 def _nearer(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:

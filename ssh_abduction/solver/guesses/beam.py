@@ -15,8 +15,8 @@ the cost.
 Each step extends each hypothesis in all ways that cost little: the robot is at a known dstate, at a
 new dstate of a known place, or at a new place. If faults are allowed, the action may have slipped,
 the displacement may be wrong, and the view may be misread, each at its price. The *beam* is the
-hypotheses of least cost. The checker checks them every few steps. So a hypothesis that breaks an
-axiom does not crowd out others for long.
+hypotheses of least cost, and some with other places. The checker checks them every few steps. So a
+hypothesis that breaks an axiom does not crowd out others for long.
 
 The cost of a hypothesis is close to the cost of its map, and not equal to it (`reckoning.py`).
 
@@ -51,6 +51,9 @@ from ssh_abduction.theory.theory import Theory
 CHECKED_EVERY = 8
 # If no hypothesis is left, search again with a beam that is this many times as wide.
 WIDER = 2
+# Most hypotheses of a beam differ only in dstates at the same places. So a beam also keeps the
+# cheapest ones with other places, as many as this share of its width.
+OTHERS = 0.25
 # With several drives or floors, it is open how they are joined. So keep up to LOST * ALIKE
 # hypotheses, of which at most ALIKE join them in the same way. Check the beam at once if it has
 # more than CROWDED times its width, so that false joins do not crowd out true ones.
@@ -177,7 +180,7 @@ class Beam:
     def _best(
         self, options: Sequence[_Extension], t: int, width: int, checked: bool = False
     ) -> Iterator[Hypothesis]:
-        """Yield the `width` hypotheses to keep. The options make them, the cheapest first.
+        """Yield the hypotheses to keep: the `width` cheapest, then some with other places.
 
         With several drives or floors, keep at most ALIKE hypotheses that connect the drives or
         floors in the same way, and at most LOST * ALIKE in all. Drop those that cost at least
@@ -186,24 +189,27 @@ class Beam:
         `options` are ways to extend the beam by step t, sorted by cost. If `checked`, drop what the
         checker refuses.
         """
-        most, several = width, bool(self._frames)
+        most, several = width + int(OTHERS * width), bool(self._frames)
         if several:
             width, most = min(width, ALIKE), LOST * min(width, ALIKE)
         count: Counter[tuple[object, ...]] = Counter()
+        known: set[tuple[object, ...]] = set()  # faults, and the place of each step
         kept, dearest = [0, 0], [math.inf, math.inf]  # by whether the present piece is joined
         for option in options:
-            pieces, joined = option.of.pieces, not option.of.pieces.is_loose
+            found, joined = option.of, not option.of.pieces.is_loose
             if kept[joined] >= most or option.nats > dearest[joined]:
                 continue
-            if count[pieces.joins] >= width:
+            at = found.faults, option.place, *map(found.places.__getitem__, found.labels)
+            if count[found.pieces.joins] >= width and (several or at in known):
                 continue
             child = self._child(option, t)
-            price = self._price_of(child) - self._price_of(option.of)
-            if several and child.nats > option.of.nats + price + STRAINED:
+            price = self._price_of(child) - self._price_of(found)
+            if several and child.nats > found.nats + price + STRAINED:
                 child = self._settled([child])[0]
             if checked and self._map(child, t) is None:
                 continue
-            count[pieces.joins] += 1
+            known.add(at)
+            count[found.pieces.joins] += 1
             kept[joined] += 1
             if several and kept[joined] == 1:
                 dearest[joined] = option.nats + max(UNSURE, self._sights.dearest)
