@@ -106,6 +106,18 @@ def test_route_by_places_stays_in_one_piece() -> None:
             route(ssh_map, 0, far, by="places")
 
 
+def test_route_by_places_travels_only_where_the_robot_travelled() -> None:
+    """Place 2 is between places 0 and 1 in the order of path 0, but no travel leads there."""
+    courses = ((0, 0, 1), (1, 0, 1), (1, 1, 1), (2, 1, 1), (2, 0, 1))
+    dstates = tuple(DState(i, f"v{i}", *course) for i, course in enumerate(courses))
+    links = ((0, "on", 1), (1, "right", 2), (2, "on", 3), (3, "right", 4))
+    paths = MapPath(0, (0, 2, 1)), MapPath(1, (1, 2))
+    ssh_map = SSHMap((0, 1, 2, 3, 4), dstates, links, (0, 1, 2), paths)
+    assert route(ssh_map, 0, "p2", by="places").places == (0, 1, 1, 2)
+    back = route(ssh_map, 4, "p0", by="places")
+    assert [*dict.fromkeys(back.places)] == [2, 1, 0]
+
+
 def test_route_goes_around_avoided_dstates() -> None:
     dstates = tuple(DState(i, "v", i) for i in range(4))
     links = ((0, "a", 1), (1, "a", 3), (0, "b", 2), (2, "b", 0), (2, "c", 2), (2, "a", 1))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from collections.abc import Set as AbstractSet
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import networkx as nx
@@ -183,7 +182,9 @@ class MoveGraph:
     def _add_implied(self) -> None:
         """Add the moves that the paths of the map imply.
 
-        A path leads both ways, and at a place the robot can turn to each path through this place.
+        A path leads both ways, so the robot can go back where it travelled. At a place it can turn
+        to each path through this place. Two places next to each other in the order of a path may
+        have a wall between them if no travel joins them.
         """
         travel, around = self._only_action(onward=True), self._only_action(onward=False)
         facing: dict[Node, Node] = {}  # the first dstate of each course
@@ -193,36 +194,20 @@ class MoveGraph:
                 at.setdefault(s.place, set()).add(s.id)
                 if s.path is not None and s.direction is not None:
                     facing.setdefault((s.place, s.path, s.direction), s.id)
-        for path, order in self._stretches():
-            ahead, back = (
-                [facing.get((place, path, way), (place, path, way)) for place in order]
-                for way in (1, -1)
-            )
-            for place, *courses in zip(order, ahead, back, strict=True):
-                at.setdefault(place, set()).update(courses)
-            for (here, there), (other, before) in zip(pairwise(ahead), pairwise(back), strict=True):
-                self._imply(here, there, travel)
-                self._imply(before, other, travel)
-        for courses_here in at.values():
-            for course in courses_here:
-                for other in courses_here - {course}:
-                    self._imply(course, other, around if self._is_around(course, other) else None)
-
-    def _stretches(self) -> Iterator[tuple[int, tuple[int, ...]]]:
-        """Yield the id of each path and its places in order, separately for each piece of the map.
-
-        Pieces of a joint map may share a path, only because fewer paths are preferred.
-        """
-        piece_of = {
-            self.map.dstates[s].place: i for i, piece in enumerate(self.map.pieces) for s in piece
-        }
         for path in self.map.paths:
-            pieces = [piece_of.get(place, 0) for place in path.order]
-            for piece in dict.fromkeys(pieces):
-                yield (
-                    path.id,
-                    tuple(p for p, i in zip(path.order, pieces, strict=True) if i == piece),
-                )
+            for course in ((place, path.id, way) for place in path.order for way in (1, -1)):
+                at.setdefault(course[0], set()).add(facing.get(course, course))
+        for source, _, target in self.map.links:
+            (here, path_id, way), (there, other, _) = self.course(source), self.course(target)
+            if here != there and path_id is not None and path_id == other and way is not None:
+                assert here is not None
+                assert there is not None
+                start, end = (there, path_id, -way), (here, path_id, -way)
+                self._imply(facing.get(start, start), facing.get(end, end), travel)
+        for courses_here in at.values():
+            for node in courses_here:
+                for aside in courses_here - {node}:
+                    self._imply(node, aside, around if self._is_around(node, aside) else None)
 
     def _passes_closed(self, source: Node, target: Node) -> bool:
         """Whether a move leaves or enters a place by a gateway that was last seen closed."""
