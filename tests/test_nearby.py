@@ -29,7 +29,6 @@ from ssh_abduction.solver.engines import (
 from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.pinned import Pinned
-from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.annealing import annealed
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.steps.chart import Chart
@@ -88,7 +87,6 @@ def test_first_map_near_a_guess_equals_a_listed_map(seed: int) -> None:
     with (
         patch.object(name_search, "PATIENCE", 1),
         patch.object(small_maps, "GUESSES", 1),
-        patch.object(annealing, "STEPS", ((0.75, 100),)),
     ):
         some, every = (
             solve(

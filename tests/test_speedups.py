@@ -36,9 +36,9 @@ from ssh_abduction.solver.engines import (
     small_maps,
 )
 from ssh_abduction.solver.engines import named_labels as named
-from ssh_abduction.solver.guesses import annealing
-from ssh_abduction.solver.guesses.annealing import annealed_steps
+from ssh_abduction.solver.guesses import robust
 from ssh_abduction.solver.guesses.merging import dstates_merged, merged
+from ssh_abduction.solver.guesses.robust import machine_labels
 from ssh_abduction.solver.steps.apart import Continuations, clique
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
@@ -322,7 +322,6 @@ def test_interrupted_search_returns_the_small_map_of_a_guess(seed: int) -> None:
 
     with (
         patch.multiple(name_search, PATIENCE=1, CORES=1),
-        patch.object(annealing, "STEPS", ((0.75, 300),)),
         patch.object(name_program.NameProgram, "more_links", stop),
     ):
         solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,clique"))
@@ -351,14 +350,11 @@ def test_maps_found_before_a_limit_are_returned(off: str) -> None:
         assert check(walk.trace, ssh_map, Theory.causal()) == ()
 
 
-def test_annealing_that_needs_too_much_memory_is_skipped() -> None:
-    walk = moore(8, 2, steps=100, seed=0)
-    chart = Chart.of_steps(Log(walk.trace, Theory.causal()), 101)
-    for most in ("ENTRIES", "TABLE"):
-        with patch.object(annealing, "STEPS", ((0.75, 5),)):
-            assert next(annealed_steps(chart, [0], [[0]] * 101))
-        with patch.object(annealing, most, 100):
-            assert list(annealed_steps(chart, [0], [[0]] * 101)) == []
+def test_guess_at_a_machine_that_needs_too_much_memory_is_skipped() -> None:
+    seen, actions = [0, 1] * 50, [0] * 99
+    assert len(next(machine_labels(seen, actions))) == 100
+    with patch.object(robust, "ENTRIES", 100):
+        assert list(machine_labels(seen, actions)) == []
 
 
 def test_program_of_names_is_not_loaded_if_time_is_short() -> None:

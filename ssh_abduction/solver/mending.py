@@ -24,7 +24,6 @@ answer.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -32,26 +31,21 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.faulty import FaultyEngine
-from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.guesses.mended import mended_sketch
 from ssh_abduction.solver.guesses.outliers import wrong_displacements
 from ssh_abduction.solver.guesses.voting import Merging
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.theory.settle import Problem
-from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
 
 # Mend the trace by at most this many cheapest causal maps. If there are more, the list of minimal
 # maps may be incomplete.
 MOST_CAUSAL = 200
-ROUNDS = 5  # the most rounds of robust merging; each begins with a better map
+ROUNDS = 5  # the most rounds of finding wrong displacements; each begins with a better map
 # Solving a trace that was mended by merging takes at most MERGED seconds. Solving any mended trace
 # takes at most SHARE of the time that is left.
 MERGED, SHARE = 30.0, 0.5
-# A dstate with at most RARE steps is rare. One of the last BEFORE actions before it may have
-# slipped. At most SUSPECTED actions are tried.
-RARE, BEFORE, SUSPECTED = 1, 3, 60
 
 # Solves a mended trace. Arguments: the trace, a theory without faults, the number of maps to list
 # (0: all), and the seconds it may take. Returns the minimal maps and True, or the best map known
@@ -69,7 +63,6 @@ class Mending:
         # solved again when there is more time.
         self._solved: dict[Trace, tuple[Found | None, bool]] = {}
         self._best: Found | None = None
-        self._best_mended: Trace | None = None
         self._cheapest: list[Trace] = []  # traces mended by all cheapest causal maps
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
         self._causal_labels: tuple[int, ...] = ()  # the labels of the last causal map
@@ -90,14 +83,13 @@ class Mending:
             yield from self._by_missing_displacements(merging.labels(), merging.places())
         yield from self._by_merging(self._task.trace)
         for mended in self._by_causal_maps():
-            yield from self._improving(self._minimal(mended)[0], mended)
+            yield from self._improving(self._minimal(mended)[0])
             if self._task.theory.jumped:
                 labels = self._causal_labels
                 yield from self._by_missing_displacements(labels, [None] * len(labels))
         for mended in self._by_cheapest_causal_maps():
-            yield from self._improving(self._minimal(mended)[0], mended)
+            yield from self._improving(self._minimal(mended)[0])
         yield from self._by_sketch()
-        yield from self._by_rare_dstates()
 
     def minimal_maps(self, most: int) -> tuple[tuple[SSHMap, ...], bool] | None:
         """List the minimal maps, and say whether these are all; None if nothing is proven.
@@ -123,42 +115,23 @@ class Mending:
                 listed |= dict.fromkeys(minimal)
         return tuple(listed), is_all
 
-    def _improving(self, better: Found | None, mended: Trace) -> Iterator[Found]:
-        """Yield a map, and remember it with its mended trace, if it is the best one so far."""
+    def _improving(self, better: Found | None) -> Iterator[Found]:
+        """Yield a map, and remember it, if it is the best one so far."""
         if better is not None and (self._best is None or better.cost < self._best.cost):
-            self._best, self._best_mended = better, mended
+            self._best = better
             yield better
 
     def _by_merging(self, trace: Trace) -> Iterator[Found]:
-        """Yield better maps, found by merging visits robustly (`guesses/voting.py`).
+        """Yield a better map, found by merging visits robustly (`guesses/voting.py`).
 
-        Merging groups the visits, and the votes of the groups mend the trace. The groups are almost
-        a map. First yield a map near the groups, then solve the mended trace. If this gives a
-        better map, merge again, beginning with the places of this map. The trace is that of the
-        task, perhaps without some displacements.
+        Merging groups the visits, and the votes of the groups mend the trace. The trace is that of
+        the task, perhaps without some displacements.
         """
         theory = self._task.theory
-        if theory.star != "frame" or not (theory.misread or theory.jumped):
-            return
-        before: Found | None = None
-        pairs = self._problem(trace).pairs
-        for _ in range(ROUNDS):
-            merging = Merging(trace, theory, pairs)
-            if before is not None:
-                merging.start_from(_places(before.map))
+        if theory.star == "frame" and (theory.misread or theory.jumped):
+            merging = Merging(trace, theory, self._problem(trace).pairs)
             merging.merge()
-            mended = merging.mended()
-            problem = self._problem(mended)
-            task = Task.of(problem, self._task.watch, self._task.speedups)
-            near = (
-                FramedEngine(task).map_mended_from(merging.labels()) if _has_frames(task) else None
-            )
-            if near is not None and not Judging(problem).why_refused(near.map):
-                yield from self._improving(self._as_found(near.map, mended), mended)
-            yield from self._improving(self._minimal(mended, MERGED)[0], mended)
-            if self._best is before:
-                return
-            before = self._best
+            yield from self._improving(self._minimal(merging.mended(), MERGED)[0])
 
     def _by_missing_displacements(
         self, labels: Sequence[int], places: Sequence[int | None]
@@ -176,7 +149,7 @@ class Mending:
             tried.add(wrong)
             before, without = self._best, trace.without_displacements_at(wrong)
             yield from self._by_merging(without)
-            yield from self._improving(self._minimal(without, MERGED)[0], without)
+            yield from self._improving(self._minimal(without, MERGED)[0])
             if self._best is None or self._best is before:
                 return
             labels = self._best.map.dstate_at
@@ -209,32 +182,7 @@ class Mending:
         """
         proven = self._best is not None and self._best.cost[0] == self.bound
         if not proven and (guess := mended_sketch(self._task.trace, self._task.theory)):
-            yield from self._improving(self._minimal(guess.trace)[0], guess.trace)
-
-    def _by_rare_dstates(self) -> Iterator[Found]:
-        """Yield better maps in which an action slipped shortly before a rarely visited dstate.
-
-        The causal theory does not notice every slip, as a slip may only add a link to its map. With
-        paths, this wrong link makes the places after it new ones.
-        """
-        before: Found | None = None
-        while self._task.theory.slipped and self._best is not before:
-            before, mended = self._best, self._best_mended
-            if before is None or mended is None or before.cost[0] == self.bound:
-                return
-            visits = Counter(before.map.dstate_at)
-            rare = [t for t, label in enumerate(before.map.dstate_at) if visits[label] <= RARE]
-            suspected = dict.fromkeys(
-                k
-                for t in rare
-                for k in range(t - 1, t - 1 - BEFORE, -1)
-                if k >= 0 and not mended.actions[k].starts
-            )
-            for k in list(suspected)[:SUSPECTED]:
-                steps = list(mended.steps)
-                steps[k] = replace(steps[k], action=Action.that_slipped(k))
-                slipped = replace(mended, steps=tuple(steps))
-                yield from self._improving(self._minimal(slipped)[0], slipped)
+            yield from self._improving(self._minimal(guess.trace)[0])
 
     def _mended(self, causal: SSHMap) -> Trace:
         """Mend the trace by the faults of a causal map. A wrong action becomes unknown."""
@@ -301,17 +249,3 @@ class Mending:
         return Found.of(
             with_faults(ssh_map, self._task.trace, mended, self._task.theory), self._task.theory
         )
-
-
-def _has_frames(task: Task) -> bool:
-    """Whether `FramedEngine` finds all minimal maps for the theory of the task."""
-    return row("visits").holds_for(task.theory)
-
-
-def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
-    """For each step, return its place and the slot (direction) there that it faces, or None."""
-    at = [
-        None if s.place is None or s.heading is None else (s.place, s.heading)
-        for s in ssh_map.dstates
-    ]
-    return [at[label] for label in ssh_map.dstate_at]

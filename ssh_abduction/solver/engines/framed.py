@@ -42,8 +42,7 @@ from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, NodeL
 from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted
 from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
-from ssh_abduction.solver.guesses.merging import merged
-from ssh_abduction.solver.steps.chart import Chart, FramedChart
+from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups
@@ -138,20 +137,6 @@ class FramedEngine:
 
         first_accepted(self._visits.fewest, why_not, self._refuse)
         return fitted[0] if fitted else None
-
-    def map_mended_from(self, known: Sequence[int]) -> Found | None:
-        """Make a map of the whole trace that keeps known dstates of the first steps if possible.
-
-        All other steps get new dstates. Paths are only merged if they must be one. Returns None if
-        the steps fit no frames, or no paths fit.
-        """
-        chart = Chart.framed(self._task.trace, self._task.log)
-        if chart is None:
-            return None
-        guess = [-1] * len(chart.seen)
-        for node, label in zip(chart.node_of, known, strict=False):
-            guess[node] = label
-        return self._fitting.separate(chart, merged(chart, guess=guess, settles=False))
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         """Yield `enough` maps of the prefix with this cost, or all of them if `enough` is 0."""

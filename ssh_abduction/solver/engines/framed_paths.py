@@ -4,9 +4,6 @@ The input is a label, the number of a dstate, for each node. A node is the steps
 face one direction. paths_framed.lp finds the fewest places and paths that fit the labels. If none
 fit, it finds clashes: minimal sets of nodes whose labels no paths fit.
 
-*Separate paths.* To find out whether labels have any paths, places and segments are only merged if
-they must be. That takes a small part of the time for grounding all ways to merge them.
-
 *Pinned segments.* To find the fewest paths, pairwise distinct segments get paths of their own. Then
 other segments are assigned to these paths, or to new ones.
 
@@ -73,11 +70,6 @@ class FramedPaths:
         found = next(self.maps(naming, "ignore"), None)
         return Fitted(found, naming) if found else None
 
-    def separate(self, chart: FramedChart, labels: Sequence[int]) -> Found | None:
-        """Find a map with these dstates. Places, and segments of paths, merge only if they must."""
-        naming = NodeLabels(chart, list(labels), self.control(chart, labels, single=True))
-        return next(self.maps(naming, "ignore"), None)
-
     def better(self, naming: NodeLabels) -> Iterator[Found]:
         """Yield maps with these dstates, none more expensive than the one before.
 
@@ -122,25 +114,22 @@ class FramedPaths:
         labels: Sequence[int],
         options: Sequence[str] = (),
         nodes: Iterable[int] | None = None,
-        *,
-        single: bool = False,
     ) -> Control:
         """Make a control whose answers are the places and paths that fit the labels of some nodes.
 
         `options` are those of clasp. If `nodes` is None, the paths have to fit the labels of all
-        nodes. If `single`, places and segments are merged only if they must be one.
+        nodes.
         """
         self._asker.watch.check()
         with self._asker.grounding_timed():
             theory, nodes = self.task.theory, range(len(labels)) if nodes is None else nodes
-            facts = paths_lp.settled_facts(theory, chart, labels, nodes, single=single)
+            facts = paths_lp.settled_facts(theory, chart, labels, nodes)
             where = [labels[node] for node in chart.node_of]
             stretches = paths_lp.stretch_facts(self.task.trace, theory, where)
             control = self._control(chart, f"{facts}\n{stretches}", options)
             control.load_encodings("preference")
-            parts = ("base", *(("again",) if single else ()), "segments", "least")
-            control.ground([(part, []) for part in parts])
-            if self.task.speedups.clique and not single:
+            control.ground([("base", []), ("segments", []), ("least", [])])
+            if self.task.speedups.clique:
                 pinned = pairwise_distinct(*paths_lp.read_distinct(control))
                 control.add("pinned", [], paths_lp.pinned_facts(pinned))
             control.ground([("pinned", []), ("paths", []), ("each", [])])

@@ -169,3 +169,5 @@ class NameSearch:
             if known is None or len(set(labels)) < len(set(known)):
                 known = labels
                 yield labels
+            if self._incumbent.is_settled():
+                return

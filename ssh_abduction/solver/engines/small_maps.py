@@ -3,10 +3,10 @@
 They are for long traces. If the search has to stop, there is at least a good map. And if a map has
 as few dstates as the lower bound, the search can end.
 
-First, steps are merged by evidence (`guesses/merging.py`). Then a map is guessed by annealing
-(`guesses/annealing.py`): the places, if turns may be rotations by right angles, otherwise the
-dstates. Of a long trace, only the first steps are guessed. The guess is then followed along the
-other steps (`guesses/continuing.py`).
+First, steps are merged by evidence (`guesses/merging.py`). Then a map is guessed: by annealing
+(`guesses/annealing.py`) the places, if turns may be rotations by right angles, or otherwise by EM
+(`guesses/robust.py`) the dstates. Of a long trace, only the first steps are guessed. The guess is
+then followed along the other steps (`guesses/continuing.py`).
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from itertools import islice
 
 from ssh_abduction.solver.engines.base import AT_ONCE, Task
 from ssh_abduction.solver.engines.pinned import Pinned
-from ssh_abduction.solver.guesses.annealing import annealed, annealed_steps
+from ssh_abduction.solver.guesses.annealing import annealed
 from ssh_abduction.solver.guesses.continuing import labels_continued
 from ssh_abduction.solver.guesses.merging import dstates_merged, merged
+from ssh_abduction.solver.guesses.robust import machine_labels
 from ssh_abduction.solver.steps.chart import Chart
 
 # If turns cannot be rotations, stop after this many guesses, even if none of them is a map. Guesses
@@ -52,47 +53,47 @@ class SmallMaps:
         most = size if size <= GUESSED else 2 * AT_ONCE
         while self._task.speedups.annealed:
             beginning = Pinned.of_steps(self._task.log, steps)
-            near = self._map_of_guess(beginning)
+            near = min(self._maps_of_guesses(beginning), key=_dstates, default=None)
             tried = () if near is None else (dstates_merged(beginning.chart, near), near)
             for known in tried:
                 if labels := labels_continued(self._task.log, known):
                     yield labels[:size]
                     yield (labels := dstates_merged(chart, labels[:size]))
-                    if len(set(labels)) <= len(set(known)):
+                    if _dstates(labels) <= _dstates(known):
                         return
             if steps == most:
                 return
             steps = min(2 * steps, most)
 
     def guessed(self) -> Iterator[list[int]]:
-        """Yield the labels of a guessed map, if there is a guess and speed-up `annealed` is on."""
+        """Yield the labels of guessed maps, if speed-up `annealed` is on."""
         if self._task.speedups.annealed:
-            near = self._map_of_guess(self._pinned)
-            if near is not None:
+            for near in self._maps_of_guesses(self._pinned):
                 yield dstates_merged(self._pinned.chart, near)
 
-    def _map_of_guess(self, pinned: Pinned) -> list[int] | None:
-        """Guess dstates, and return the labels of a map near the guess; None without a guess."""
-        guess = self._guessed(pinned)
-        return None if guess is None else merged(pinned.chart, guess=guess)
+    def _maps_of_guesses(self, pinned: Pinned) -> Iterator[list[int]]:
+        """Guess dstates, and yield the labels of a map near each guess. A guess that is a map ends.
 
-    def _guessed(self, pinned: Pinned) -> list[int] | None:
-        """Guess the dstates of these steps, -1 if not sure; None if that takes too much memory."""
+        There is no guess if that takes too much memory.
+        """
         steps = pinned.chart
         chart = Chart.turned(self._task.trace, self._task.log, len(steps.seen))
         if chart is None:  # turns cannot be rotations by right angles
-            guesses: Iterable[list[int]] = islice(
-                annealed_steps(steps, pinned.clique, pinned.may_be), GUESSES
-            )
+            actions = [action for _, action, _ in steps.links]
+            guesses: Iterable[list[int]] = islice(machine_labels(steps.seen, actions), GUESSES)
         else:
             labels = annealed(chart).labels(chart)
             guesses = [[labels[node] for node in chart.node_of]]
-        guess = None
         for labels in guesses:
             guess = mended(labels, steps)
+            yield merged(steps, guess=guess)
             if steps.is_map(guess):
-                break
-        return guess
+                return
+
+
+def _dstates(labels: Sequence[int]) -> int:
+    """Count the dstates of labels."""
+    return len(set(labels))
 
 
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:

@@ -26,9 +26,6 @@ reversible. Still, each travel is counted in both directions.
 Places have names, as dstates have in `engines/named_labels.py`. Pairwise distinct visits are pinned
 to places of their own. Each kind of place has spare names. There have to be many spare names: with
 too few, different places are merged and do not separate again.
-
-A causal trace with actions other than turns and travels is annealed in the same way. Each step is
-then a visit to a place in which the robot can stand in only one way.
 """
 
 from __future__ import annotations
@@ -37,15 +34,15 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, cycle, repeat
-from typing import TypeVar
+from itertools import cycle
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.solver.guesses.sampling import Sampler, States
 from ssh_abduction.solver.steps.apart import clique
-from ssh_abduction.solver.steps.chart import Chart, FramedChart, numbered
+from ssh_abduction.solver.steps.chart import FramedChart, numbered
+from ssh_abduction.solver.steps.localising import faced
 
 # The fewest spare names of a kind of place. With four, different places of mazes were merged.
 SPARES = 6
@@ -61,16 +58,9 @@ VISITS = 40
 # A guess is good enough if at most one in this many travels contradicts the majority. The guess is
 # mended afterwards anyway.
 FEW = 200
-# The stages of a guess in which each step is a visit. The last one is repeated.
-STEPS = (0.75, 1500), (0.75, 500)
-# There is no guess at steps if their transitions have more entries than this, of 12 bytes: 720 MB.
-ENTRIES = 60_000_000
-# Nor if the table of transitions (states x actions x states) has more entries than this. It is
-# built for each sweep, with some 20 bytes per entry: 40 MB.
-TABLE = 2_000_000
 # The guess is the best attempt so far after this many seconds.
 SECONDS = 10.0
-_Kind = TypeVar("_Kind")
+_Kind = tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -92,10 +82,7 @@ class Guess:
         The label is -1 if the guess is not sure of the visit of the node.
         """
         states, sure = self.states.tolist(), self.sure.tolist()
-        return [
-            states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 if sure[visit] else -1
-            for visit, slot in chart.facing
-        ]
+        return [faced(states[visit], slot) if sure[visit] else -1 for visit, slot in chart.facing]
 
 
 def annealed(chart: FramedChart) -> Guess:
@@ -119,30 +106,10 @@ def _attempts(chart: FramedChart) -> Iterator[tuple[int, Guess]]:
     leaves = list(chart.leaves.values())
     for attempt, more in enumerate(cycle(MORE), 1):
         options = _options(chart, SPARES * more)
-        drawn = Sampler(options, leaves, 4, np.random.default_rng(attempt))
+        drawn = Sampler(options, leaves, np.random.default_rng(attempt))
         for first, sweeps in STAGES:
             drawn.anneal(first, sweeps)
             yield drawn.failed(), Guess(drawn.labels, drawn.sure())
-
-
-def annealed_steps(
-    chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]]
-) -> Iterator[list[int]]:
-    """Yield better and better guesses at the dstates of all steps; -1 if a guess is not sure.
-
-    Yield none if the transitions would take too much memory. The steps of `clique` are pairwise
-    distinct, and the step at index K is pinned to dstate K. `may_be` has, for each step, the
-    dstates of the clique that it may be at.
-    """
-    options = _step_options(chart, clique, may_be)
-    leaves = [(0, action) for _, action, _ in chart.links]
-    actions = len(set(leaves))
-    if options.size * options.shape[1] > ENTRIES or (int(options.max()) + 1) ** 2 * actions > TABLE:
-        return
-    drawn = Sampler(options, leaves, 1, np.random.default_rng(0))
-    for first, sweeps in chain(STEPS, repeat(STEPS[-1])):
-        drawn.anneal(first, sweeps)
-        yield np.where(drawn.sure(), drawn.labels, -1).tolist()
 
 
 def _options(chart: FramedChart, spares: int) -> States:
@@ -169,22 +136,6 @@ def _options(chart: FramedChart, spares: int) -> States:
             if turned[visit][r] == kinds[visit]
         ]
     return _padded(options)
-
-
-def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]]) -> States:
-    """Return the possible states of each step, if each step is a visit: rows padded with -1.
-
-    A step of the clique has only its own state. Any other step also has the spare names of its
-    view. Arguments are as for `annealed_steps`.
-    """
-    pinned = set(clique)
-    spare = _spare(chart.seen, clique, SPARES)
-    return _padded(
-        [
-            [*options, *(() if step in pinned else spare[chart.seen[step]])]
-            for step, options in enumerate(may_be)
-        ]
-    )
 
 
 def _spare(kinds: Sequence[_Kind], pinned: Sequence[int], spares: int) -> dict[_Kind, range]:

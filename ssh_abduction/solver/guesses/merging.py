@@ -61,22 +61,18 @@ DEMANDS = (
 THINNED = 10, 5, 3, 0
 
 
-def merged(
-    chart: Chart, clique: Iterable[int] = (), guess: Sequence[int] = (), *, settles: bool = True
-) -> list[int]:
+def merged(chart: Chart, clique: Iterable[int] = (), guess: Sequence[int] = ()) -> list[int]:
     """Return the dstate of each node of a chart in a small map of the causal theory.
 
     The nodes of the clique are pairwise distinct. The map is near the guess, if one is given: a
     label for each node, or -1. A label is ignored if the node cannot be one dstate with earlier
-    nodes of that label. All other nodes are merged by evidence if `settles`; else they are
-    dstates of their own, if the links allow that. Dstates are numbered in the order of their first
-    nodes.
+    nodes of that label. All other nodes are merged by evidence. Dstates are numbered in the order
+    of their first nodes.
     """
     classes = Classes(chart.apart(), chart.links)
     classes.known[list(clique)] = True
     classes.take(guess)
-    if settles:
-        classes.settle_all()
+    classes.settle_all()
     return numbered(classes.root.tolist())
 
 

@@ -1,4 +1,4 @@
-"""Finds small maps of the causal theory with faults, without a search and without a proof.
+"""Guess small maps of the causal theory, with or without faults, without a search or a proof.
 
 A hidden Markov model is trained on the trace by EM (Baum, Petrie, Soules, Weiss 1970). Each state
 shows one view, and several states show the same view (cloned hidden Markov models: George et al.
@@ -42,6 +42,10 @@ MISREAD, SLIPPED = 0.01, 0.01  # probabilities of faults in the model
 # While a map is refined, a fault that is forbidden costs this many times as much as an allowed one.
 # The last pass can replace a few of them by allowed faults.
 DEARER = 4 / 3
+# A guess without faults has SPARES states of each view, and one more for each VISITS steps with it.
+SPARES, VISITS = 6, 40
+# There is no such guess if the model has more entries of 8 bytes than this: 80 MB.
+ENTRIES = 10_000_000
 NEVER = 1_000_000  # the cost of a forbidden fault in the final Viterbi pass
 UNKNOWN = 0.5  # the cost of an unknown link, in tenths of dstates: less than any fault
 
@@ -251,6 +255,19 @@ def robust_maps(explainer: Explainer) -> Iterator[Explained | None]:
         best = min(best, guess.tenths)
         if agreed == AGREE:
             return
+
+
+def machine_labels(seen: Sequence[int], actions: Sequence[int]) -> Iterator[list[int]]:
+    """Yield guesses at the dstates of a trace without faults: one for each start of EM, no end.
+
+    Yield none if the model would take too much memory. Arguments are as for `Explainer`.
+    """
+    explainer, rng = Explainer(seen, actions, {}), np.random.default_rng(0)
+    views = max(seen) + 1
+    clones = SPARES + len(seen) // (VISITS * views)
+    states = views * clones
+    while (max(actions, default=0) + 1) * states**2 + 4 * len(seen) * states <= ENTRIES:
+        yield _Model(explainer, clones, rng).labels()
 
 
 class _Model:

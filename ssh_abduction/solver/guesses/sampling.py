@@ -1,8 +1,7 @@
 """Draw the states of visits by annealing: a blocked Gibbs sampler of a hidden Markov model.
 
-A state is a number for the placing of a visit: with right angles 4 times its place, plus the slot
-of the place that is slot 0 of the visit. `guesses/annealing.py` says which states are possible for
-each visit.
+A state is a number for the placing of a visit: 4 times its place, plus the slot of the place that
+is slot 0 of the visit. `guesses/annealing.py` says which states are possible for each visit.
 """
 
 from __future__ import annotations
@@ -46,13 +45,10 @@ class _Transitions:
         counts: The table: how often the action of the row led to the state of the column.
     """
 
-    def __init__(
-        self, leaves: Sequence[tuple[int, int]], ways: int, states: int, labels: States
-    ) -> None:
+    def __init__(self, leaves: Sequence[tuple[int, int]], states: int, labels: States) -> None:
         """Count the transitions of a draw, in which each visit has a state.
 
-        `leaves` has the slot and action at which each visit but the last ends. `ways` is the number
-        of states per place, 4 or 1. With 4, states 2 and 3 face opposite to 0 and 1.
+        `leaves` has the slot and action at which each visit but the last ends.
         """
         number: dict[int, int] = {}
         self._slot = np.array([slot for slot, _ in leaves], dtype=int)
@@ -60,7 +56,6 @@ class _Transitions:
             [number.setdefault(action, len(number)) for _, action in leaves], dtype=int
         )
         self._actions = max(1, len(number))
-        self._ways = ways
         self._states = states
         self._back = np.arange(states) ^ 2  # for each state, the one that faces the other way
         self._visits = np.arange(len(leaves))
@@ -72,10 +67,8 @@ class _Transitions:
 
     def rows(self, states: States, visits: States) -> States:
         """Return the row of the table for the action that ends each visit, given its state."""
-        turned = (states + self._slot[visits]) % self._ways
-        rows: States = (states - states % self._ways + turned) * self._actions + self._action[
-            visits
-        ]
+        turned = states - states % 4 + (states + self._slot[visits]) % 4
+        rows: States = turned * self._actions + self._action[visits]
         return rows
 
     def entries(self, states: States) -> States:
@@ -105,7 +98,7 @@ class _Transitions:
         return table.ravel()[entries]
 
     def _tallied(self, labels: States) -> tuple[States, NDArray[np.float32], NDArray[np.float32]]:
-        """Count the transitions of a draw. With 4 states per place, also count them backwards.
+        """Count the transitions of a draw, forwards and backwards.
 
         Returns each transition as an index into the flat table, the table, and the sums of its
         rows.
@@ -113,11 +106,8 @@ class _Transitions:
         here, there = labels[:-1], labels[1:]
         rows = self.rows(here, self._visits)
         entries = rows * self._states + there
-        if self._ways > 1:
-            back = self._back[there] * self._actions + self._action
-            entries = np.concatenate(
-                [entries, back * self._states + self._back[rows // self._actions]]
-            )
+        back = self._back[there] * self._actions + self._action
+        entries = np.concatenate([entries, back * self._states + self._back[rows // self._actions]])
         shape = self._states * self._actions, self._states
         counts = np.bincount(entries, minlength=shape[0] * shape[1])
         table = counts.reshape(shape).astype(np.float32)
@@ -150,21 +140,20 @@ class Sampler:
         self,
         options: States,
         leaves: Sequence[tuple[int, int]],
-        ways: int,
         random: np.random.Generator,
     ) -> None:
         """Draw a state (a number for a placing) at random for each visit.
 
-        `options` has the possible states of each visit in a row, padded with -1. `leaves` and
-        `ways` are as for `_Transitions`.
+        `options` has the possible states of each visit in a row, padded with -1. `leaves` is as for
+        `_Transitions`.
         """
         self._random = random
         self._options = options
         self._visits = np.arange(len(options))
         counts = (options >= 0).sum(axis=1)
         self.labels = options[self._visits, (random.random(len(counts)) * counts).astype(int)]
-        states = ways * (int(options.max()) // ways + 1)
-        self._transitions = _Transitions(leaves, ways, states, self.labels)
+        states = 4 * (int(options.max()) // 4 + 1)
+        self._transitions = _Transitions(leaves, states, self.labels)
 
     def anneal(self, first: float, sweeps: int) -> None:
         """Draw the states again and again, from probabilities raised to a rising power.

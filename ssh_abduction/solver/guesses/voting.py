@@ -102,21 +102,6 @@ class Merging:
         self._group_of = {number: number for number in self._groups}
         self._misfits = self._misfitting(pairs)
 
-    def start_from(self, places: Sequence[tuple[int, int] | None]) -> None:
-        """Merge the visits that a map puts at one place, given the place and direction of steps."""
-        first: dict[int, _Turned] = {}
-        for number, visit in enumerate(self.visits):
-            step, _ = visit.steps[0]
-            here = places[step]
-            if here is None:
-                continue
-            place, faced = here
-            other, turn = first.setdefault(place, (number, faced))
-            if other != number:
-                self._merge(
-                    [(self._group_of[other], 0), *self._beside(other, number, (turn - faced) % 4)]
-                )
-
     def merge(self) -> None:
         """Merge groups of visits while this lowers the total cost, the largest gain first."""
         while True:
@@ -224,20 +209,6 @@ class Merging:
             near = np.argsort(second - first, kind="stable")[:MOST_PAIRS]
             turns, first, second = turns[near], first[near], second[near]
         return list(zip(some[first].tolist(), some[second].tolist(), turns.tolist(), strict=True))
-
-    def _beside(self, visit: int, other: int, turn: int) -> list[_Turned]:
-        """Find how to turn the group of `other` before it is merged with the group of `visit`.
-
-        Slot K of `visit` shall be slot K + turn of `other`. Returns a list with the group of
-        `other` and the quarters to turn it by; empty if both visits are in one group.
-        """
-        mine, its = self._group_of[visit], self._group_of[other]
-        if mine == its:
-            return []
-        # Slot K of the visit is slot K + here of its group. It is slot K + turn of the other visit,
-        # and so slot K + turn + there of the other group.
-        here, there = self._groups[mine].members[visit], self._groups[its].members[other]
-        return [(its, (here - turn - there) % 4)]
 
     def _gain(self, first: int, second: int, turn: int) -> tuple[int, list[list[_Turned]]]:
         """Compute the gain in tenths of merging two visits' groups, and all groups that follow.

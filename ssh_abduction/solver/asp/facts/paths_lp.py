@@ -100,18 +100,10 @@ def read_contrary(model: Model) -> tuple[list[int], list[int]]:
 
 
 def settled_facts(
-    theory: Theory,
-    chart: FramedChart,
-    labels: Sequence[int],
-    nodes: Iterable[int],
-    *,
-    single: bool = False,
+    theory: Theory, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int]
 ) -> str:
     """Return the facts for paths_framed.lp that give some nodes of a chart their dstates."""
-    facts = [
-        settled_labels((node, labels[node]) for node in nodes),
-        *(["single."] if single else []),
-    ]
+    facts = [settled_labels((node, labels[node]) for node in nodes)]
     # All nodes of a dstate see the same star (openings), so take any of them.
     for label, node in {label: node for node, label in enumerate(labels)}.items():
         visit, slot = chart.facing[node]
