@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -23,7 +24,7 @@ from ssh_abduction.data import Action, MapError, TheoryError, TraceError, togeth
 from ssh_abduction.online import route
 from ssh_abduction.output import to_networkx, to_svg
 from ssh_abduction.output.export import export_map
-from ssh_abduction.output.layout import layout
+from ssh_abduction.output.layout import drawable_poses, layout
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.asp.facts.readable import program
 from ssh_abduction.theory.evidence import Equality, Floors
@@ -147,6 +148,27 @@ def test_each_floor_has_its_own_coordinates() -> None:
 def test_slipped_actions_are_refused_with_lifts() -> None:
     with pytest.raises(TheoryError, match="slipped: expected no actions that slip"):
         solve(SHAFT, Theory.causal().replace(slipped=1.0))
+
+
+@pytest.mark.parametrize("theory", [Theory.causal(), Theory.topological()])
+def test_ends_of_lifts_are_drawn_one_below_the_other(theory: Theory) -> None:
+    """The robot faces the other way on the second floor, 10 m along and 1 m aside."""
+    trace = Trace.from_steps(
+        "abcda",
+        ["travel", UP, "travel", DOWN],
+        displacements=[(10, 1, 0), None, (10.0, 1.0, 0.0), None],
+    )
+    ssh_map = solve(trace, theory).maps[0]
+    drawn = drawable_poses(ssh_map)
+    assert drawn is not None
+    a, b, c, d = (complex(drawn[s].x, drawn[s].y) for s in ssh_map.dstate_at[:4])
+    assert c - b == pytest.approx(d - a)
+    assert (c - b).imag < -1
+    assert abs(d - c) == pytest.approx(abs(complex(10, 1)))
+    turned = drawn[ssh_map.dstate_at[2]].heading - drawn[ssh_map.dstate_at[0]].heading
+    assert math.cos(turned) == pytest.approx(-1)
+    spread, was = drawn[ssh_map.dstate_at[3]].spread, ssh_map.fit.poses[ssh_map.dstate_at[3]].spread
+    assert spread == pytest.approx(was)  # half a turn
 
 
 def test_misread_view_does_not_move_a_place_to_another_floor() -> None:

@@ -26,6 +26,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.cli.options import add_theory, flags_of, theory_of
 from ssh_abduction.cli.parsing import Parser
 from ssh_abduction.data import Action, DState, MapError, Step, TraceError, together
+from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
 from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.page import html
@@ -643,6 +644,12 @@ def test_page_names_floors_beside_their_places(browser: Any, tmp_path: Path) -> 
     assert page.complaints == []
     flat = solve(trace[:2])
     assert "floors" not in content_of(flat, trace[:2])["layouts"][0]
+    tuesday = Trace.from_steps("de", ["travel"], name="tuesday")  # it took no lift
+    joint = together([replace(trace, name="monday"), tuesday])
+    Page(content_of(solve(joint), joint)).save(tmp_path / "joint.html")
+    Shown(browser, (tmp_path / "joint.html").as_uri())
+    assert len(browser.find_elements("css selector", "#drawings .trail:not(.lift)")) == 2
+    assert len(browser.find_elements("css selector", "#drawings .trail.lift")) == 1
 
 
 def test_page_draws_a_street_for_each_travel_without_paths(browser: Any, tmp_path: Path) -> None:
@@ -656,7 +663,7 @@ def test_page_draws_a_street_for_each_travel_without_paths(browser: Any, tmp_pat
         paths=(),
         regions=None,
     )
-    content = content_of(bare, trace)
+    content = content_of(replace(bare, names=(Name("place", 1, "a long name"),)), trace)
     assert content["maps"][0]["leaps"] == [3, 5]
     at = [node["steps"] for node in content["overview"]["nodes"]]
     ends = {(at[a][0], at[b][0]) for a, b, _, _ in content["overview"]["streets"]}
@@ -666,6 +673,9 @@ def test_page_draws_a_street_for_each_travel_without_paths(browser: Any, tmp_pat
     for figure in ("one", "overview"):
         page.click(figure)
         assert len(browser.find_elements("css selector", "#drawings .street:not(.lift)")) == 3
+    page.click("one")
+    own = browser.find_elements("css selector", "#drawings .name.own")
+    assert [name.text for name in own] == ["a long name"]
     assert page.complaints == []
 
 

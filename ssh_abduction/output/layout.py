@@ -14,6 +14,7 @@ straight. The robot travelled between the places of a segment.
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,6 +32,7 @@ from ssh_abduction.output.streets import LOOSE, Point, StreetProgram, Streets
 
 FARTHEST = 1e7  # metres: a robot's positions are nearer than this
 GAP = 1.5  # distance in the drawing between parts of a map that nothing connects
+SAME = 1e-6  # square metres: the ends of lifts are at one position
 STOREY = 0.25  # distance between two floors, as a share of the extent of the largest one
 
 
@@ -86,7 +88,8 @@ def drawable_poses(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
     """Return the poses of the dstates if the map can be drawn at them; None otherwise.
 
     Each floor, and each piece of a joint map, has poses relative to its own first dstate. They are
-    moved, so that each is drawn below the one before. A map cannot be drawn at its poses if other
+    moved, so that each is drawn below the one before. Floors are first turned and moved, so that
+    the ends of lifts are one below the other. A map cannot be drawn at its poses if other
     displacements between its parts are missing.
     """
     poses = ssh_map.fit.poses if ssh_map.fit else ()
@@ -102,7 +105,8 @@ def drawable_poses(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
         for s in (ssh_map.dstates[s] for s in part if s != here.id and _is_origin(poses[s])):
             if s.place is None or s.place != here.place:
                 return None
-    moves = _moves_of(parts, [(pose.x, pose.y) for pose in poses])
+    poses = _on_each_other(ssh_map, poses)
+    moves = _moves_of(parts, [(pose.x, pose.y) for pose in poses], beside=not ssh_map.floors)
     return tuple(
         replace(pose, x=pose.x + moves[s.id][0], y=pose.y + moves[s.id][1])
         for s, pose in zip(ssh_map.dstates, poses, strict=True)
@@ -126,18 +130,53 @@ def _parts(ssh_map: SSHMap, poses: Sequence[Pose]) -> tuple[tuple[int, ...], ...
     return ssh_map.floors or pieces
 
 
+def _on_each_other(ssh_map: SSHMap, poses: Sequence[Pose]) -> tuple[Pose, ...]:
+    """Turn and move floors, so that both ends of each lift have nearly one position.
+
+    A floor with one lift is not turned. Positions are complex numbers here.
+    """
+    at = [complex(pose.x, pose.y) for pose in poses]
+    found, floor = [*poses], [s.floor for s in ssh_map.dstates]
+    for i, members in enumerate(ssh_map.floors):
+        lifts = {
+            at[s]: complex(found[x].x, found[x].y)
+            for a, _, b in ssh_map.links
+            for s, x in ((a, b), (b, a))
+            if floor[s] == i and (floor[x] or 0) < i
+        }
+        here, there = (sum(ends) / max(1, len(lifts)) for ends in (lifts, lifts.values()))
+        turn = sum(((y - there) * (x - here).conjugate() for x, y in lifts.items()), 0j)
+        turn = turn / abs(turn) if abs(turn) > SAME else 1 + 0j
+        for s in members:
+            found[s] = _turned(poses[s], turn, there + turn * (at[s] - here))
+    return tuple(found)
+
+
+def _turned(pose: Pose, turn: complex, at: complex) -> Pose:
+    """Turn a pose by the direction of a number, and put it at a position."""
+    xx, xy, yy = pose.spread
+    mean, off = (xx + yy) / 2, complex((xx - yy) / 2, xy) * turn * turn
+    spread = (mean + off.real, off.imag, mean - off.real)
+    return Pose(at.real, at.imag, pose.heading + cmath.phase(turn), spread)
+
+
 def _moves_of(
-    parts: Sequence[Sequence[int]], at: Sequence[Point], least: float = 0.0
+    parts: Sequence[Sequence[int]], at: Sequence[Point], least: float = 0.0, *, beside: bool = True
 ) -> list[Point]:
-    """Find how far to move each dstate, so that each floor or piece is below the one before."""
+    """Find how far to move each dstate, so that each floor or piece is below the one before.
+
+    If `beside`, all begin at one x. Otherwise each is a little right of the one before, so that
+    lifts do not cover the ways of floors.
+    """
     moves = [(0.0, 0.0)] * len(at)
     corners = [[*zip(*(at[s] for s in part), strict=True)] for part in parts]
     boxes = [(min(xs), min(ys), max(xs), max(ys)) for xs, ys in corners]
     extent = max((max(x1 - x0, y1 - y0) for x0, y0, x1, y1 in boxes), default=0.0)
     gap = max(STOREY * extent, least)
     below = None  # the least y of the part above, where it is drawn
-    for part, (x0, y0, _, y1) in zip(parts, boxes, strict=True):
-        move = (0.0, 0.0) if below is None else (boxes[0][0] - x0, below - gap - y1)
+    for i, (part, (x0, y0, _, y1)) in enumerate(zip(parts, boxes, strict=True)):
+        aside = boxes[0][0] - x0 if beside else i * gap
+        move = (0.0, 0.0) if below is None else (aside, below - gap - y1)
         below = y0 + move[1]
         for s in part:
             moves[s] = move

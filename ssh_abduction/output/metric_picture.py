@@ -8,7 +8,7 @@ room are left out. Browsers show the same text as a title when the pointer is on
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
@@ -220,12 +220,22 @@ class _Picture:
         return marks
 
     def label(
-        self, label: str, spots: Iterable[Point], colour: str, size: float, weight: str = "normal"
+        self,
+        label: str,
+        spots: Sequence[Point],
+        colour: str,
+        size: float,
+        weight: str = "normal",
+        *,
+        always: bool = False,
     ) -> list[str]:
-        """Draw a label at the first point where it overlaps nothing, if there is one."""
+        """Draw a label at the first point where it overlaps nothing, if there is one.
+
+        Otherwise, draw it at the last point if it must be drawn `always`.
+        """
         w, h = self.half(label, size)
         for x, y in spots:
-            if all(
+            if (always and (x, y) == spots[-1]) or all(
                 x + w <= left or right <= x - w or y + h <= top or bottom <= y - h
                 for left, top, right, bottom in self.boxes
             ):
@@ -242,16 +252,21 @@ class _Picture:
         return 0.31 * self.size(size) * len(label) + 1, 0.55 * self.size(size)
 
     def place_labels(self, spots: Mapping[int, Point]) -> list[str]:
-        """Draw the numbers of places beside their dots, where there is room."""
+        """Draw the numbers of places beside their dots, where there is room, and names always."""
         marks = []
         bearings = [k * math.pi / 4 for k in (-1, 1, 3, 5, 0, 2, 4, 6)]
         ways = [(far * self.unit, bearing) for far in (17, 22, 30) for bearing in bearings]
         for place in self.map.places:
             x, y = spots[place]
-            around = [(x + far * math.cos(angle), y + far * math.sin(angle)) for far, angle in ways]
             name = self.map.name_of("place", place)
             label = str(place) if name is None else f"{place} {name}"
-            marks += self.label(label, around, "#000", 15, "bold")
+            wide = 0.0 if name is None else self.half(f" {name}", 15)[0]
+            around = [
+                (x + (far + wide) * math.cos(angle), y + far * math.sin(angle))
+                for far, angle in ways
+            ]
+            style = ("#000", 15, "bold")
+            marks += self.label(label, around, *style, always=name is not None)
         return marks
 
     def dstate_labels(self) -> list[str]:

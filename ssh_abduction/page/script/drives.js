@@ -66,10 +66,11 @@ function tellDrives() {
 // Paint the way of each drive through the places, the ways of several drives side by side.
 function paintTrails(figure, see) {
   const states = figure.map === null ? null : mapOf(figure.map).dstates;
+  const leaps = new Set(data.maps[figure.map ?? 0].leaps);
   const at = (t) => see(states ? states[figure.labels[t]].at : data.spots[t]);
   data.drives.forEach(({ name, first, stop }, k) => {
     const lane = (k - (data.drives.length - 1) / 2) * 4,
-      parts = [];
+      [ways, lifts] = [[], []];
     for (let t = first + 1; t < stop; t++) {
       const [a, b] = [at(t - 1), at(t)],
         far = Math.hypot(b[0] - a[0], b[1] - a[1]);
@@ -77,14 +78,20 @@ function paintTrails(figure, see) {
       // Both directions of an edge have the same lane.
       const side = Math.sign(b[0] - a[0] || b[1] - a[1]),
         [nx, ny] = [(-side * lane * (b[1] - a[1])) / far, (side * lane * (b[0] - a[0])) / far];
-      parts.push(`M${point([a[0] + nx, a[1] + ny])} L${point([b[0] + nx, b[1] + ny])}`);
+      (leaps.has(t) ? lifts : ways).push(`M${point([a[0] + nx, a[1] + ny])} L${point([b[0] + nx, b[1] + ny])}`);
     }
-    const trail = element(
-      "svg:path",
-      { d: parts.join(" ") || "M0,0", class: classes("trail", colourOf(k)) },
-      null,
-      figure.base,
-    );
-    element("svg:title", {}, `the way of ${name}`, trail);
+    for (const [parts, kind, title] of [
+      [ways, "", `the way of ${name}`],
+      [lifts, "lift", `${name} by a lift, or slipping`],
+    ]) {
+      if (kind && !parts.length) continue;
+      const trail = element(
+        "svg:path",
+        { d: parts.join(" ") || "M0,0", class: classes("trail", kind, colourOf(k)) },
+        null,
+        figure.base,
+      );
+      element("svg:title", {}, title, trail);
+    }
   });
 }

@@ -194,20 +194,14 @@ function keep(figure, x, y, w, h) {
 }
 
 // Put a label at a distance from a point, in the first direction where there is room for it.
-function label(figure, text, [x, y], far, directions, kind = "") {
+function label(figure, text, [x, y], far, directions, kind = "", always = false) {
   const w = text.length * 3.3 + 1,
     h = 6;
   for (const [c, s] of directions) {
     const along = far + Math.abs(c) * w + Math.abs(s) * h,
       [u, v] = [x + c * along, y + s * along];
-    if (
-      u < w ||
-      v < h ||
-      u > figure.width - w ||
-      v > figure.height - h ||
-      !clear(figure, u, v, w, h)
-    )
-      continue;
+    const outside = u < w || v < h || u > figure.width - w || v > figure.height - h;
+    if (!always && (outside || !clear(figure, u, v, w, h))) continue;
     keep(figure, u, v, w, h);
     element(
       "svg:text",

@@ -50,17 +50,18 @@ function paintFigure(figure) {
         figure.base,
       );
   });
-  figure.nodes.forEach((node, k) => {
-    const r = radiusAt(node.at);
-    if (node.own)
-      label(figure, node.own, spots[k], r + 2, [
-        [0, 1],
-        [0, -1],
-        [1, 0],
-        [-1, 0],
-      ]);
-  });
   paintMarks(figure, see, radiusAt);
+  // Names that a person gave are drawn always, and first where they cover nothing.
+  figure.nodes.forEach((node, k) => {
+    const near = radiusAt(node.at) + 2,
+      sides = [0, 4, 2, 6, 1, 3, 5, 7].map((eighth) => (eighth * Math.PI) / 4),
+      directions = sides.map((angle) => [Math.sin(angle), Math.cos(angle)]);
+    if (node.own && ![near, 2 * near, 3 * near].some((far) => named(far, directions)))
+      named(near, directions, true);
+    function named(far, directions, always) {
+      return label(figure, node.own, spots[k], far, directions, "own", always);
+    }
+  });
   paintFloors(figure, see, r);
   const named = new Set();
   for (const m of figure.marks)
