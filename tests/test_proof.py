@@ -198,7 +198,10 @@ def test_check_bound_prints_the_bound(tmp_path: Path, capsys: pytest.CaptureFixt
     del data["certificate"]
     maps.write_text(json.dumps(data))
     assert main(["check", "--bound", str(trace), str(maps)]) == 1
-    assert "certificate: expected one in the file of maps" in capsys.readouterr().err
+    assert (
+        "certificate: expected one in the file of maps, got none; leave out --bound"
+        in capsys.readouterr().err
+    )
     assert main(["check", "--bound", "--set", "without=deterministic", str(trace), str(maps)]) == 1
     assert "which the proof rests on" in capsys.readouterr().err
 

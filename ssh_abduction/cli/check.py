@@ -222,8 +222,8 @@ def _bound(
         )
     if not isinstance(data, dict) or "certificate" not in data:
         raise MapError(
-            "certificate: expected one in the file of maps, got none; use a file that solve "
-            "--json wrote"
+            "certificate: expected one in the file of maps, got none; leave out --bound, "
+            "or use a file that solve wrote without --onto"
         )
     bound = check_bound(trace, data["certificate"])
     said += [f"bound: {fault}" for fault in bound.faults]
