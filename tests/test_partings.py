@@ -72,9 +72,9 @@ def drive(
     """
     parts = [walked(corners, 0.2) for corners in passes]
     moved = [parts[0], *(points_moved(pose, part) for part in parts[1:])]
-    gap = [(1000.0, 0.0)]  # between passes, the robot drives far
+    gap = [(1000.0, 0.0), (0.0, 1000.0)]  # between passes, the robot drives far
     points = np.concatenate([part for one in moved for part in (one, gap)][:-1])
-    begins = np.cumsum([0, *(len(part) + 1 for part in parts[:-1])])
+    begins = np.cumsum([0, *(len(part) + len(gap) for part in parts[:-1])])
     track = Track(np.column_stack([points, np.zeros(len(points))]), np.zeros((len(points), 3, 3)))
     scans = [int(begin) + 10 for begin in begins]
     closings = [
@@ -120,6 +120,16 @@ def test_each_pass_of_a_parting_gets_a_visit(
     assert [(every[one.first].scan, every[one.last].scan) for one in closed] == [
         (visits[one.first].scan, visits[one.last].scan) for one in closings
     ]
+
+
+@pytest.mark.parametrize(("along", "count"), [(20.0, 2), (40.0, 0)])
+def test_parting_is_found_up_to_24_m_from_a_closure(along: float, count: int) -> None:
+    straight = [(0, 0), (along + 10, 0)]
+    lane = [(0, 0), (along, 0), (along + 3, 3), (along + 10, 3)]
+    track, visits, closings = drive([straight, lane], (5.0, -3.0, 0.4))
+    new = added(visits, with_partings(track, visits, closings)[0])
+    assert len(new) == count
+    assert all(math.dist(visit.middle, (along + 0.5, 0)) < 0.5 for visit in new[:1])
 
 
 def test_nearby_visit_serves_as_the_parting() -> None:

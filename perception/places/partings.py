@@ -21,6 +21,7 @@ from bisect import bisect
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +33,10 @@ from perception.places.stays import RIM, SAME, STAY, are_near, joined, taken, wi
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit, Way
 
-# A stretch reaches REACH metres of trajectory to both sides of a visit. Its points are PACE metres
-# apart.
-REACH, PACE = 12.0, 0.25
+# A stretch reaches REACH metres of trajectory to both sides of a visit. Partings between them and
+# FARTHER metres are found after those, as the trajectories are aligned less well there. The points
+# of a stretch are PACE metres apart.
+REACH, FARTHER, PACE = 12.0, 24.0, 0.25
 # Two stretches run together if they are within BESIDE metres for TOGETHER metres. Then they diverge
 # if each is more than APART metres from the other one within AHEAD metres. The parting is BEFORE
 # metres before the point where they are BESIDE metres apart.
@@ -143,9 +145,9 @@ class _DrivePoints:
         begin, end = max(self._cuts[k - 1], way - reach), min(self._cuts[k], way + reach)
         return range(math.ceil(begin / PACE), min(math.floor(end / PACE) + 1, len(self.points)))
 
-    def partings(self, one: _Alignment) -> Iterator[tuple[_Pass, _Pass]]:
+    def partings(self, one: _Alignment, reach: float) -> Iterator[tuple[_Pass, _Pass]]:
         """Yield the earlier and the later pass of each parting of two stretches."""
-        ours, theirs = self.stretch(one.first), self.stretch(one.last)
+        ours, theirs = self.stretch(one.first, reach), self.stretch(one.last, reach)
         if ours.stop > theirs.start:  # Stretches share no points.
             middle, gap = round((one.first + one.last) / 2 / PACE), round(LEAST / 2 / PACE)
             ours = range(ours.start, max(ours.start, middle - gap))
@@ -205,8 +207,8 @@ def _tracked(drive: _DrivePoints) -> Iterator[_Alignment]:
 def _added(drive: _DrivePoints, relations: Sequence[_Alignment]) -> list[_Pass]:
     """List the passes of partings that are not near a known visit."""
     found: list[_Pass] = []
-    for one in relations:
-        for pair in drive.partings(one):
+    for reach, one in product((REACH, FARTHER), relations):
+        for pair in drive.partings(one, reach):
             if not any(drive.is_near(some) or _is_known(some, found) for some in pair):
                 place = _passes(drive, pair, relations)
                 found += [] if any(map(drive.is_near, place)) else place
