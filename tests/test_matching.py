@@ -19,6 +19,7 @@ from perception.places.matching import Match, Scene, Turned, match
 from perception.places.tracing import closure_of, to_trace
 from perception.places.track import Track, Trust, points_turned
 from perception.places.visits import Visit
+from perception.places.walls import MARGIN
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.odometry import displacement_between
 
@@ -174,6 +175,27 @@ def test_match_against_the_odometer_gets_a_large_covariance(share: float, is_wid
     assert abs(pose[2]) < 0.05
     assert found == pytest.approx(share, abs=0.1)
     assert bool(covariance[2, 2] > 0.4**2) is is_wide
+
+
+def test_walls_far_from_a_scan_count_if_the_match_needs_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The odometer turned by 0.3 radians, so a wall 21 m away is far outside of the scan."""
+    along = np.linspace(-3, 3, 61)
+    sides = [(along, np.full(61, 1.5)), (along, np.full(61, -1.5))]
+    sides.append((np.full(61, 20.0), along / 3 - 7))
+    walls = np.concatenate([np.stack(side, axis=1) for side in sides])
+    normals = np.repeat([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], 61, axis=0)
+    recent, turned = deque([(walls, normals)]), (0.0, 0.0, 0.3)
+    found = []
+    for margin in (MARGIN, math.inf):
+        monkeypatch.setattr("perception.places.walls.MARGIN", margin)
+        prior = Trust().covariance(turned)
+        found.append(_matched(walls, normals, recent, (0.0, 0.0, 0.0), turned, prior))
+    (pose, covariance, share), (same, other, equal) = found
+    assert (pose, share) == (same, equal)
+    assert share > 0.9
+    assert (covariance == other).all()
 
 
 def test_covariance_of_a_point_sums_all_increments() -> None:

@@ -20,8 +20,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from perception.places.jumps import Doubt, Unknown, is_missing, unknown_steps
 from perception.places.track import (
@@ -33,25 +31,15 @@ from perception.places.track import (
     rotation,
     wrapped,
 )
+from perception.places.walls import MOVED, ScanFit, in_sight, surfaces
 from perception.readers.scans import Pose, RobotLog, Scan
 from perception.readers.stored import in_turn
 from ssh_abduction.data.odometry import displacement_between, moved
 
 # Number of previous scans to match a scan with.
 RECENT = 40
-# Longer beams are not matched, in metres, since neighbouring beams are too far apart to show a
-# wall.
-FARTHEST = 25.0
 # Largest number of points of a scan to match, evenly spread. It bounds the time for a scan.
 POINTS = 150
-# Standard deviation in metres of the distance from a point to its wall: noise of the laser and
-# unevenness of walls.
-ROUGHNESS = 0.05
-# Errors of neighbouring points are correlated: this many points count as one independent point.
-TOGETHER = 3
-# Largest distance in metres from a point to a wall: BEGIN in the first round, then SHRINK times as
-# large in each round, but at least END. ROUNDS is the largest number of rounds.
-BEGIN, END, SHRINK, ROUNDS = 1.0, 0.25, 0.75, 12
 # A match is poor if less than the share POOR of the points lies on walls. Then HEADINGS headings
 # are tried, because odometers miss turns, and logs miss lines.
 POOR, HEADINGS = 0.5, 24
@@ -198,7 +186,7 @@ def poses_of_scans(
             onward = displacement_between(last.scan.odometry, scan.odometry)
             step = _ScanMotion(scan, points, normals, recent, last.pose, onward, before, trust)
             one = step.judged(doubt_of(i, onward))
-            one = one if _in_sight(scan).any() else replace(one, share=math.nan)
+            one = one if in_sight(scan).any() else replace(one, share=math.nan)
             before = displacement_between(last.pose, one.pose)
         if one.broken:
             recent.clear()
@@ -332,41 +320,6 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
     return found
 
 
-def surfaces(scan: Scan) -> tuple[Array, Array]:
-    """Find points on smooth surfaces, (m, 2) metres, and unit normals, in the robot's frame."""
-    laser, ranges, good = scan.laser, scan.ranges, _in_sight(scan)
-    r = np.where(good, ranges, 0.0)
-    points = np.stack([r * np.cos(laser.bearings), r * np.sin(laser.bearings)], axis=1)
-    normals = np.full(points.shape, np.nan)
-    # The farthest neighbours that still lie on one line with the point give the best normal.
-    for k in (1, 2, 3):
-        if len(points) <= 2 * k:
-            break
-        middle = slice(k, len(points) - k)
-        line = points[2 * k :] - points[: -2 * k]
-        length = np.hypot(*line.T)
-        normal = np.stack([-line[:, 1], line[:, 0]], axis=1) / np.maximum(length, 1e-9)[:, None]
-        off = np.abs(_products(points[middle] - points[: -2 * k], normal))
-        smooth = (
-            good[2 * k :]
-            & good[: -2 * k]
-            & good[middle]
-            & (length > 1e-6)
-            & (length < 0.25 + 0.1 * r[middle])
-            & (off < ROUGHNESS)
-        )
-        normals[middle][smooth] = normal[smooth]
-    on_surface = good & np.isfinite(normals[:, 0])
-    return points_moved(laser.mount, points[on_surface]), points_turned(
-        laser.mount[2], normals[on_surface]
-    )
-
-
-def _in_sight(scan: Scan) -> NDArray[np.bool_]:
-    """Mask of the beams that meet something near enough to be matched, (beams,)."""
-    return np.asarray(np.isfinite(scan.ranges) & (scan.ranges < min(FARTHEST, scan.laser.reach)))
-
-
 def _matched(
     points: Array,
     normals: Array,
@@ -390,10 +343,11 @@ def _matched(
     pose, information, share = guess, weight, 0.0
     if len(walls) and len(points):
         kept = np.unique(np.linspace(0, len(points) - 1, min(len(points), POINTS)).astype(int))
-        # These settings build the tree faster, and queries take no longer.
-        tree = cKDTree(walls, compact_nodes=False, balanced_tree=False)
-        fit = _ScanFit(points[kept], normals[kept], walls, wall_normals, tree)
-        share, pose, information = fit.improved(guess, weight)
+        fit = ScanFit(points[kept], normals[kept], walls, wall_normals)
+        share, pose, information = fit.near(guess).improved(guess, weight)
+        moves = points_moved(pose, fit.points) - points_moved(guess, fit.points)
+        if share < POOR or np.abs(moves).max() > MOVED:
+            share, pose, information = fit.improved(guess, weight)
         # A poor match may have a wrong heading: try others.
         if share < POOR:
             turns = (wrapped(2 * math.pi * k / HEADINGS) for k in range(HEADINGS))
@@ -409,11 +363,6 @@ def _matched(
     if share < CLEAR and astray @ np.linalg.solve(prior, astray) > CONTRARY:
         covariance += np.diag(astray**2)
     return (float(pose[0]), float(pose[1]), wrapped(float(pose[2]))), covariance, share
-
-
-def _products(first: Array, second: Array) -> Array:
-    """The scalar products of vectors, (n, 2) each: (n,). A sum over an axis is slower."""
-    return np.asarray(first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1])
 
 
 def _accumulating(information: Array, prior: Array) -> Array:
@@ -433,54 +382,3 @@ def _accumulating(information: Array, prior: Array) -> Array:
     return np.asarray(
         by_odometer @ np.linalg.inv(prior) @ by_odometer.T + 2 / (RECENT + 1) * by_walls
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _ScanFit:
-    """Moves a scan until its points lie on walls.
-
-    Points are in the frame of the robot, walls in the frame of the track.
-    """
-
-    points: Array
-    normals: Array
-    walls: Array
-    wall_normals: Array
-    tree: cKDTree
-
-    def improved(self, guess: Array, weight: Array) -> tuple[float, Array, Array]:
-        """Move a pose until the points lie on the walls, by Gauss-Newton steps.
-
-        `weight` is the (3, 3) inverse covariance of the guess. Returns the share of the points on
-        walls, the pose, and its inverse covariance.
-        """
-        information, pose, share = weight, guess, 0.0
-        for count in range(ROUNDS):
-            placed = points_moved(pose, self.points)
-            distance, nearest = self.tree.query(
-                placed, distance_upper_bound=max(END, BEGIN * SHRINK**count)
-            )
-            met = np.flatnonzero(np.isfinite(distance))
-            alike = _products(
-                points_turned(pose[2], self.normals[met]), self.wall_normals[nearest[met]]
-            )
-            met = met[np.abs(alike) > 0.8]
-            share = float((distance[met] < END).sum() / len(placed))
-            if len(met) < 5:
-                break
-            normal = self.wall_normals[nearest[met]]
-            off = _products(placed[met] - self.walls[nearest[met]], normal)
-            arm = placed[met] - pose[:2]
-            jacobian = np.column_stack(
-                [normal, arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]]
-            )
-            # Cauchy weights give little influence to points that are far off.
-            weights = 1 / (TOGETHER * ROUGHNESS**2 * (1 + (off / (2 * ROUGHNESS)) ** 2))
-            astray = pose - guess
-            astray[2] = wrapped(astray[2])
-            information = jacobian.T @ (jacobian * weights[:, None]) + weight
-            step = np.linalg.solve(information, jacobian.T @ (weights * off) + weight @ astray)
-            pose = pose - step
-            if np.abs(step).max() < 1e-4:
-                break
-        return share, pose, information

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from itertools import product
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 Bools = NDArray[np.bool_]
 Box = tuple[slice, slice]
@@ -27,9 +29,13 @@ def shrunk(mask: Bools, outside: bool = False) -> Bools:
 
 def near(mask: Bools, far: float, cell: float) -> Bools:
     """Find the cells within `far` metres of a cell of a mask. Cells are `cell` metres wide."""
-    if not mask.any():
-        return np.zeros_like(mask)
-    return np.asarray(ndimage.distance_transform_edt(~mask) * cell < far)
+    most, (rows, columns) = int(far / cell), mask.shape
+    padded, found = np.pad(mask, most), np.zeros_like(mask)
+    for row, column in product(range(-most, most + 1), repeat=2):
+        if math.hypot(row, column) * cell < far:
+            begin, left = most + row, most + column
+            found |= padded[begin : begin + rows, left : left + columns]
+    return found
 
 
 def box_of(mask: Bools) -> Box:

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from perception.places.local_map import CELL, PackedPatch, Patch
-from perception.places.masks import Bools
 from perception.places.track import Array, points_turned
 
 # The map within REACH metres of the middle of a place is matched, with shifts of up to MOST metres.
@@ -66,6 +65,19 @@ _MOVES = np.array(
 _Spectra = NDArray[np.complex64]
 _Floats = NDArray[np.float32]
 
+# Agreement of a wall point in a cell, for each code of a cell (`Scene`). Beyond FAR, in squared
+# cells, it no longer changes.
+FAR = 4000
+_far = np.repeat(np.sqrt(np.arange(FAR + 1)) * CELL, 2)
+_observed = np.arange(len(_far)) % 2 > 0
+_SHARP, _BLURRED = (
+    (
+        np.where(seen, np.exp(-(_far**2) / (2 * sigma**2)), 0)
+        - CLASH * (_observed & (_far > CLEAR))
+    ).astype(np.float32)
+    for seen, sigma in ((_observed, SHARP), (_observed | (_far <= CLEAR), BLURRED))
+)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
@@ -93,13 +105,14 @@ class Scene:
 
     Attributes:
         walls: (m, 2) wall points in metres, relative to the middle.
+        codes: For each cell, twice the squared distance to the nearest wall in cells, plus 1 if
+            the cell was observed. A scene with only these small numbers needs little memory.
+        shift: The middle in metres, relative to the middle of the cells.
     """
 
     walls: Array
-    _observed: Bools
-    _sharp: _Floats
-    _blurred: _Floats
-    _shift: Array
+    codes: NDArray[np.uint16]
+    shift: Array
 
     @staticmethod
     def of(patch: Patch | PackedPatch, middle: Array) -> Scene:
@@ -109,18 +122,11 @@ class Scene:
         axis = (np.arange(size) - size // 2) * CELL
         near = np.hypot(*np.meshgrid(axis, axis, indexing="ij")) <= REACH
         walls, free = occupied & near, patch.free & near
-        far = (
-            np.asarray(ndimage.distance_transform_edt(~walls)) * CELL if walls.any() else near * 9.0
-        )
-        clash = CLASH * (free & (far > CLEAR))
-        observed = free | walls
-        sharp, blurred = (
-            (np.where(seen, np.exp(-(far**2) / (2 * sigma**2)), 0.0) - clash).astype(np.float32)
-            for seen, sigma in ((observed, SHARP), (observed | (far <= CLEAR), BLURRED))
-        )
+        far = ndimage.distance_transform_edt(~walls) if walls.any() else np.sqrt(FAR)
+        squares = np.minimum(np.rint(np.square(far)), FAR).astype(np.uint16)
         shift = np.asarray(middle) - (patch.corner + size // 2 * CELL)
         points = (np.argwhere(walls) - size // 2) * CELL - shift
-        return Scene(points, observed, sharp, blurred, shift)
+        return Scene(points, 2 * squares + (free | walls), shift)
 
     @cached_property
     def spectra(self) -> _Spectra:
@@ -133,34 +139,38 @@ class Scene:
         They are (n, 2, m) x and y in metres of m points in n poses. For each pose, return the sum
         of the agreements, (n,), and the number of points whose cells this scene observed, (n,).
         """
-        cells = self.cells(points)
-        return self._sharp.ravel()[cells].sum(axis=1), self._observed.ravel()[cells].sum(axis=1)
+        codes = self.codes.ravel()[self.cells(points)]
+        return _SHARP[codes].sum(axis=1), (codes & 1).sum(axis=1)
 
     def mutual(self, other: Scene, turn: float, shift: Array) -> float:
         """The area that both scenes observed, as a share of the smaller one.
 
         The other one is rotated by `turn` radians, and its middle is shifted by `shift` metres.
         """
-        here = (np.argwhere(self._observed) - len(self._observed) // 2) * CELL - self._shift
+        observed = self.codes & 1
+        here = (np.argwhere(observed) - len(observed) // 2) * CELL - self.shift
         there = points_turned(-turn, here - shift)
-        seen = other._observed.ravel()[other.cells(there.T)].sum()
-        return float(seen / max(min(self._observed.sum(), other._observed.sum()), 1))
+        seen = (other.codes.ravel()[other.cells(there.T)] & 1).sum()
+        return float(seen / max(min(observed.sum(), (other.codes & 1).sum()), 1))
 
-    def cells(self, points: Array) -> NDArray[np.intp]:
+    def cells(self, points: Array) -> NDArray[np.int32]:
         """Number the cells in which points, (..., 2, m), lie.
 
         A point outside gets a border cell. Border cells are farther than REACH from the middle, so
         nothing was observed there.
         """
-        size = len(self._observed)
-        at = (points + self._shift[:, None]) / CELL + (size // 2 + 0.5)
-        rows, columns = np.moveaxis(np.clip(at, 0, size - 1).astype(np.intp), -2, 0)
+        size = len(self.codes)
+        offset = self.shift / CELL + (size // 2 + 0.5)
+        rows, columns = (
+            np.clip((points[..., k, :] / CELL + offset[k]).astype(np.int32), 0, size - 1)
+            for k in (0, 1)
+        )
         return np.asarray(rows * size + columns)
 
     def sampled(self, points: Array) -> _Floats:
-        """Look up the blurred walls and the observed flags, (2, m), at m points, (2, m)."""
-        cells = self.cells(points)
-        return np.stack([self._blurred.ravel()[cells], self._observed.ravel()[cells]])
+        """Look up the blurred walls and the observed flags, (2, ...), at points, (..., 2, m)."""
+        codes = self.codes.ravel()[self.cells(points)]
+        return np.stack([_BLURRED[codes], codes & 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,10 +192,10 @@ class Turned:
     def of(scene: Scene, turns: Sequence[float]) -> Turned:
         """Rotate a scene."""
         grids = np.zeros((3, len(turns), SIDE, SIDE), np.float32)
-        for k, turn in enumerate(turns):
-            grids[0, k] = _spread_out(points_turned(turn, scene.walls) / COARSE + SIDE // 2)
-            seen = scene.sampled(points_turned(-turn, _CENTRES).T)
-            grids[1:, k] = seen.reshape(2, SIDE, SIDE)
+        turned = _rotations(np.asarray(turns))
+        grids[0] = _spread_out(turned @ scene.walls.T / COARSE + SIDE // 2)
+        seen = scene.sampled(turned.transpose(0, 2, 1) @ _CENTRES.T)
+        grids[1:] = seen.reshape(2, -1, SIDE, SIDE)
         return Turned(scene, turns, np.asarray(fft.rfft2(grids, (SIZE, SIZE))))
 
     def part(self, begin: int, end: int) -> Turned:
@@ -193,17 +203,27 @@ class Turned:
         return Turned(self.scene, self.turns[begin:end], self.spectra[:, begin:end])
 
 
+def _rotations(turns: Array) -> Array:
+    """The matrices, (n, 2, 2), of rotations counterclockwise by angles in radians, (n,)."""
+    cos, sin = np.cos(turns), np.sin(turns)
+    return np.moveaxis(np.array([[cos, -sin], [sin, cos]]), 2, 0)
+
+
 def _spread_out(at: Array) -> Array:
-    """The weight of points in each cell, (SIDE, SIDE). Each is spread over four cells."""
+    """The weight of points, (n, 2, m), in each cell, (n, SIDE, SIDE).
+
+    Each point is spread over four cells.
+    """
     corner = np.floor(at)
-    rest = at - corner
-    cells = corner.astype(np.intp)
-    found = np.zeros(SIDE * SIDE)
+    rest, cells = at - corner, corner.astype(np.intp)
+    begin = np.arange(len(at))[:, None] * SIDE
+    found = np.zeros(len(at) * SIDE**2)
     for x, y in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        rows, columns = np.clip(cells + np.array([x, y]), 0, SIDE - 1).T
+        rows, columns = (np.clip(cells[:, k] + step, 0, SIDE - 1) for k, step in ((0, x), (1, y)))
         share = np.abs(1 - x - rest[:, 0]) * np.abs(1 - y - rest[:, 1])
-        found += np.bincount(rows * SIDE + columns, share, SIDE * SIDE)
-    return found.reshape(SIDE, SIDE)
+        numbers = (begin + rows) * SIDE + columns
+        found += np.bincount(numbers.ravel(), share.ravel(), len(found))
+    return found.reshape(-1, SIDE, SIDE)
 
 
 def match(first: Scene, second: Turned) -> Match | None:
@@ -257,9 +277,7 @@ def _refined(first: Scene, second: Scene, turn: float, shift: Array) -> tuple[fl
     least = OVERLAP * (len(first.walls) + len(second.walls))
 
     def scores_of(poses: Array) -> Array:
-        cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        turned = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), 2, 0)
-        shifts = poses[:, :2, None]
+        turned, shifts = _rotations(poses[:, 2]), poses[:, :2, None]
         # The points of each place are moved to the map of the other place.
         there, seen = first.agreement(turned @ second.walls.T + shifts)
         back, seen_back = second.agreement(turned.transpose(0, 2, 1) @ (first.walls.T - shifts))

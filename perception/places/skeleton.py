@@ -176,8 +176,7 @@ def pruned(graph: Graph) -> Graph:
         short = [
             (out, number)
             for number, edge in enumerate(graph.edges)
-            for one in (edge, edge.reverse)
-            if (out := _out(one, graph.nodes, degrees)) is not None
+            if (out := _out(edge, graph.nodes, degrees)) is not None
         ]
         if not short:
             return graph
@@ -186,11 +185,11 @@ def pruned(graph: Graph) -> Graph:
 
 def _out(edge: Edge, nodes: Mapping[int, Node], degrees: Mapping[int, int]) -> float | None:
     """Compute how many metres a dead end leads out of its junction's disc; None if it stays."""
-    if degrees[edge.ends[0]] < 3 or degrees[edge.ends[1]] > 1 or nodes[edge.ends[1]].cut:
+    tip, root = sorted(edge.ends, key=degrees.__getitem__)
+    if degrees[tip] > 1 or degrees[root] < 3 or nodes[tip].cut:
         return None
-    junction, end = (nodes[node] for node in edge.ends)
-    out = (edge.length + end.radius - junction.radius) * CELL
-    return out if out < max(OUT, SHARE * junction.radius * CELL) else None
+    out = (edge.length + nodes[tip].radius - nodes[root].radius) * CELL
+    return out if out < max(OUT, SHARE * nodes[root].radius * CELL) else None
 
 
 def junctions_merged(graph: Graph, distance: Array) -> list[Fork]:
@@ -265,6 +264,8 @@ def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float
     rows, columns = np.rint(cells).astype(int).T
     radii = distance[rows, columns]
     fits = np.minimum(along - first, along[-1] - last - along) >= radii + out
+    if not fits.any():
+        return
     turns = np.where(fits, _turns(cells, along, radii, out), 0.0)
     while turns.max() >= TURN:
         k = int(turns.argmax())

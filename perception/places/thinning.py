@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +67,8 @@ class Edge:
     @cached_property
     def length(self) -> float:
         """The length in cells."""
-        return float(np.hypot(*np.diff(self.cells, axis=0).T).sum())
+        steps = self.cells[1:] - self.cells[:-1]
+        return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
 
     @cached_property
     def reverse(self) -> Edge:
@@ -93,7 +94,7 @@ class Graph:
     @property
     def degrees(self) -> Counter[int]:
         """The number of ends of edges at each node."""
-        return Counter(node for edge in self.edges for node in edge.ends)
+        return Counter(chain.from_iterable(edge.ends for edge in self.edges))
 
     def without(self, edge: Edge) -> Graph:
         """Remove an edge. If two edges are left at one of its ends, they become one edge."""
@@ -132,34 +133,36 @@ def graph_of(lines: Bools, distance: Array) -> Graph:
     """
     # The cells are numbered row by row, with a margin, so that neighbours have fixed offsets.
     lines = np.pad(lines, 1)
-    columns = lines.shape[1]
-    steps = [row * columns + column for row, column in _STEPS]
-    cells = np.flatnonzero(lines)
-    neighbours = sum(lines.ravel()[cells + step].astype(int) for step in steps)
-    forks = np.zeros_like(lines)
-    forks.ravel()[cells[neighbours > 2]] = True
+    steps = [row * lines.shape[1] + column for row, column in _STEPS]
+    at = np.indices(lines.shape).reshape(2, -1).T
+    forks, single = np.zeros_like(lines), lines.copy()
+    forks.ravel()[_with_neighbours(lines, steps, range(3, 9))] = True
+    single[forks] = False
+    ends = set(_with_neighbours(single, steps, range(2)).tolist())
     known: dict[int, int] = {}
     nodes: dict[int, Node] = {}
     for number, part in enumerate(_parts(forks), 1):
         known |= dict.fromkeys(part, number)
-        cells = _at(part, columns)
+        cells = at[part] - 1
         nodes[number] = Node(cells.mean(axis=0), float(distance[cells[:, 0], cells[:, 1]].max()))
     graph = Graph(nodes, [])
-    for part in _parts(lines & ~forks):
-        line = _in_order(part, steps)
+    for part in _parts(single):
+        line = _in_order(part, ends, steps)
         beside = [
             sorted({known[cell + step] for step in steps if cell + step in known})
             for cell in (line[0], line[-1])
         ]
-        _add_line(graph, _at(line, columns), beside, distance)
-    for node in [*graph.nodes]:
-        graph = graph.joined_at(node)
+        _add_line(graph, at[line] - 1, beside, distance)
+    for node, degree in graph.degrees.items():
+        graph = graph.joined_at(node) if degree == 2 else graph
     return graph
 
 
-def _at(cells: Sequence[int], columns: int) -> NDArray[np.int64]:
-    """The rows and columns of numbered cells: (n, 2)."""
-    return np.stack(np.divmod(np.asarray(cells), columns), axis=1) - 1
+def _with_neighbours(lines: Bools, steps: Sequence[int], counts: range) -> NDArray[np.intp]:
+    """The numbers of the cells of lines whose number of neighbours is one of `counts`."""
+    cells, flat = np.flatnonzero(lines), lines.ravel().view(np.uint8)
+    neighbours = sum(flat[cells + step] for step in steps)
+    return cells[np.isin(neighbours, counts)]
 
 
 def _parts(mask: Bools) -> list[list[int]]:
@@ -172,14 +175,13 @@ def _parts(mask: Bools) -> list[list[int]]:
     return parts
 
 
-def _in_order(cells: Sequence[int], steps: Sequence[int]) -> list[int]:
+def _in_order(cells: Sequence[int], ends: Set[int], steps: Sequence[int]) -> list[int]:
     """The cells of a line from one end to the other.
 
     `steps` has the differences between the numbers of neighbouring cells, those to try first first.
     """
     left = set(cells)
-    is_end = (cell for cell in cells if sum(cell + step in left for step in steps) < 2)
-    cell: int | None = next(is_end, cells[0])
+    cell: int | None = next((cell for cell in cells if cell in ends), cells[0])
     line = []
     while cell is not None:
         line.append(cell)
