@@ -22,7 +22,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from perception.errors import PerceptionError, equal_length
 from perception.reciprocal import ReciprocalTransformer
 from ssh_abduction.data.checks import a_number
-from ssh_abduction.data.errors import brief, is_whole
+from ssh_abduction.data.errors import brief, is_whole, said_of
 from ssh_abduction.data.trace import Trace
 
 Shape = tuple[int, int, int]
@@ -122,10 +122,8 @@ def features_of(trace: Trace) -> ReciprocalTransformer | PanoramaTransformer:
     shape = trace.extra.get(FIELD)
     if shape is None:
         return ReciprocalTransformer()
-    try:
+    with said_of(trace.source or "trace"):
         rows, columns, colours = _numbers(FIELD, shape, 3)
-    except PerceptionError as error:
-        raise PerceptionError(f"{trace.source or 'trace'}: {error}") from None
     return PanoramaTransformer((rows, columns, colours))
 
 

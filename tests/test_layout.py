@@ -323,10 +323,11 @@ def test_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("pandas", "matplotlib"):
         monkeypatch.setitem(sys.modules, module, None)
     ssh_map = mapped(SQUARE)
-    with pytest.raises(MapError, match="expected pandas, got none; install"):
+    with pytest.raises(MapError, match="expected the package pandas, got none; pip install pandas"):
         to_pandas(ssh_map)
     with pytest.raises(
-        MapError, match=r"expected matplotlib, got none; install 'ssh-abduction\[plot\]'"
+        MapError,
+        match=r"expected the package matplotlib, got none; pip install 'ssh-abduction\[plot\]'",
     ):
         plot(ssh_map)
 

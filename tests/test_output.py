@@ -236,7 +236,7 @@ def test_missing_matplotlib_is_an_error_before_the_work(
         captured = capsys.readouterr()
         assert captured.out == ""
         assert (
-            captured.err == "ssh-abduction: plot: expected matplotlib to draw with, got none; "
+            captured.err == "ssh-abduction: plot: expected the package matplotlib, got none; "
             "pip install 'ssh-abduction[plot]'\n"
         )
         assert not never.exists()

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ssh_abduction.cli.jobs import FileQuestion, StopFlag, solved_in_worker
 from ssh_abduction.cli.outcome import warn
+from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError, SolverError, brief
 from ssh_abduction.solver import POLL, workers
 
@@ -38,13 +39,8 @@ def answers_on_cluster(
     cores. The work ends early when `stop` is set. Raises AbductionError if the package
     `distributed`, the scheduler or its workers are missing.
     """
-    try:
+    with needed("--scheduler", "distributed", "'ssh-abduction[cluster]'"):
         from distributed import Client
-    except ImportError:
-        raise AbductionError(
-            "--scheduler: expected the package distributed, got none; pip install "
-            "'ssh-abduction[cluster]'"
-        ) from None
     if not re.search(r"^inproc:|:\d+$", address):
         raise AbductionError(
             "--scheduler: expected an address with a port, such as tcp://host:8786, got "

@@ -6,6 +6,7 @@ import argparse
 import re
 
 from ssh_abduction.cli.parsing import Verbs
+from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError
 
 SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")
@@ -26,13 +27,8 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    try:
+    with needed("completion", "shtab", "'ssh-abduction[completion]'"):
         import shtab
-    except ImportError:
-        raise AbductionError(
-            "completion: expected the package shtab, got none; pip install "
-            "'ssh-abduction[completion]'"
-        ) from None
     if options.shell not in shtab.SUPPORTED_SHELLS:
         raise AbductionError(
             f"completion: expected a shtab that knows {options.shell}, got {shtab.__version__}; "

@@ -9,7 +9,7 @@ from ssh_abduction.cli.options import add_maps, add_trace, read_maps, some_maps,
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.data.errors import MapError, named
+from ssh_abduction.data.errors import MapError, named, said_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
 
@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
     near = NEAR if options.near is None else options.near
     named_truth = tells_names(trace)
     found, judged = None, []
-    try:
+    with said_of(named(options.maps), MapError):
         if (
             options.near is not None
             or options.truth is not None
@@ -101,8 +101,6 @@ def run(options: argparse.Namespace) -> int:
             judged.append(evaluate_visits(maps, trace, near=near, relations=relations))
         if named_truth or not judged:
             found = evaluate(maps, trace)
-    except MapError as error:
-        raise MapError(f"{named(options.maps)}: {error}") from None
     for visits in judged:
         if not visits.places.judged:
             warn([_nothing_judged(visits)])

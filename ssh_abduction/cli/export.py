@@ -7,7 +7,7 @@ import argparse
 from ssh_abduction.cli.options import add_map, add_maps, output, trace_path
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
-from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.errors import MapError, said_of
 from ssh_abduction.data.trace import Trace
 
 # Repeats ssh_abduction.output.export, whose import of networkx would delay all verbs.
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
     listing = Listing.load(options.maps)
     chosen = listing.maps[listing.number(options.map)]
     turns = None if options.trace is None else Trace.load(options.trace)
-    try:
+    with said_of(listing.source, MapError):
         text = export_map(
             chosen,
             options.to,
@@ -76,8 +76,6 @@ def run(options: argparse.Namespace) -> int:
             turns=turns,
             hide_undecided=options.hide_undecided,
         )
-    except MapError as error:
-        raise MapError(f"{listing.source}: {error}") from None
     if options.output == "-":
         print(text.removesuffix("\n"))
     else:

@@ -20,7 +20,7 @@ from ssh_abduction.cli.options import (
 )
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import steps_in_words, table
-from ssh_abduction.data.errors import LocaliserError, MapError, named
+from ssh_abduction.data.errors import LocaliserError, MapError, named, said_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.trace import Trace
@@ -123,12 +123,9 @@ def _localiser(options: argparse.Namespace) -> Localiser:
 
         recogniser = load(options.recogniser).model
     mapped = Trace.load(options.trace) if options.trace else None
-    try:
+    of_recogniser = said_of(named(options.recogniser), LocaliserError)
+    with said_of(named(options.maps), MapError), of_recogniser:
         return Localiser(maps[(options.map or 1) - 1], recogniser, trace=mapped, chances=chances)
-    except MapError as error:
-        raise MapError(f"{named(options.maps)}: {error}") from None
-    except LocaliserError as error:
-        raise LocaliserError(f"{named(options.recogniser)}: {error}") from None
 
 
 def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:

@@ -19,7 +19,7 @@ from ssh_abduction.cli.options import (
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import table
-from ssh_abduction.data.errors import MapError, named, printable
+from ssh_abduction.data.errors import MapError, named, printable, said_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.runtime.program import interrupted_code
@@ -79,11 +79,9 @@ def run(options: argparse.Namespace) -> int:
     def interrupt() -> None:
         watch.interrupted = True
 
-    try:
-        with on_ctrl_c(interrupt), Guard(interrupt, lambda _: ("", interrupted_code()), None, None):
-            experiment = next_experiment(maps, trace, theory=theory, complete=complete, watch=watch)
-    except MapError as error:
-        raise MapError(f"{named(options.maps)}: {error}") from None
+    guard = Guard(interrupt, lambda _: ("", interrupted_code()), None, None)
+    with said_of(named(options.maps), MapError), on_ctrl_c(interrupt), guard:
+        experiment = next_experiment(maps, trace, theory=theory, complete=complete, watch=watch)
     if options.json:
         print(json_line(experiment.to_dict()))
     else:

@@ -9,7 +9,7 @@ from typing import Any
 from ssh_abduction.cli.options import add_map, add_maps
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import course, table
-from ssh_abduction.data.errors import MapError, printable
+from ssh_abduction.data.errors import MapError, printable, said_of
 from ssh_abduction.data.files import json_line
 
 
@@ -58,13 +58,9 @@ def run(options: argparse.Namespace) -> int:
     listing = Listing.load(options.maps)
     given = {name.text for ssh_map in listing.maps for name in ssh_map.names}
     avoid = _names(options.avoid, given)
-    try:
+    with said_of(listing.source, MapError):
         how: dict[str, Any] = {"by": options.by, "map": options.map}
         found = route(listing, options.start, options.goal, avoid=avoid, **how)
-    except MapError as error:
-        if str(error).startswith(f"{listing.source}:"):
-            raise
-        raise MapError(f"{listing.source}: {error}") from None
     if options.json:
         print(json_line(found.to_dict()))
         return 0

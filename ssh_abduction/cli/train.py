@@ -20,7 +20,7 @@ from ssh_abduction.cli.options import (
 )
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.data.errors import MapError, named
+from ssh_abduction.data.errors import MapError, named, said_of
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
@@ -175,12 +175,10 @@ def run_recognise(options: argparse.Namespace) -> int:
 
     stored = load(options.recogniser)
     images = images_of(Trace.load(options.trace))
-    try:
+    with said_of(options.recogniser, PerceptionError):
         labels: list[int | None] = [*stored.labels(images)]
         if (likelihood := stored.likelihood()) is not None:
             labels = likelihood.labels(images)
-    except PerceptionError as error:
-        raise PerceptionError(f"{options.recogniser}: {error}") from None
     if options.json:
         print(json.dumps(labels))
     else:

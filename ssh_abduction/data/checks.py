@@ -20,13 +20,25 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, TypeAlias, TypeVar
 
 from ssh_abduction.data.errors import AbductionError, brief, is_finite, is_whole
 
 T = TypeVar("T")
 Kind: TypeAlias = type[AbductionError]
+
+
+@contextmanager
+def needed(what: str, package: str, install: str, error: Kind = AbductionError) -> Iterator[None]:
+    """Raise `error`, with what to install for the use `what`, if the block imports in vain."""
+    try:
+        yield
+    except ImportError:
+        raise error(
+            f"{what}: expected the package {package}, got none; pip install {install}"
+        ) from None
 
 
 def a_number(

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ssh_abduction.data.checks import a_whole_number, an_instance
-from ssh_abduction.data.errors import TraceError, brief, named
+from ssh_abduction.data.errors import TraceError, brief, named, said_of
 from ssh_abduction.data.odometry import (
     Covariance,
     Displacement,
@@ -112,10 +112,8 @@ def parse_closures(value: Any) -> tuple[Closure, ...]:
         raise TraceError(f"closures: expected a list, got {brief(value)}; leave it out for none")
     found = []
     for i, entry in enumerate(value):
-        try:
+        with said_of(f"closures[{i}]"):
             found.append(Closure.of(entry))
-        except TraceError as error:
-            raise TraceError(f"closures[{i}]: {error}") from None
     return tuple(found)
 
 

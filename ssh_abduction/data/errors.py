@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 import numbers
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TypeGuard
 
 
@@ -46,6 +48,17 @@ class SolverError(AbductionError, ValueError):
 
 class RangeError(AbductionError, ValueError, IndexError):
     """There is no step or map with the given number. The text names the range."""
+
+
+@contextmanager
+def said_of(where: str, kind: type[AbductionError] = AbductionError) -> Iterator[None]:
+    """Put the name of a file or field before the text of an error of this kind in the block."""
+    try:
+        yield
+    except kind as error:
+        if str(error).startswith(f"{where}:"):
+            raise
+        raise type(error)(f"{where}: {error}") from None
 
 
 def named(source: object) -> str:

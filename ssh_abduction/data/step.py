@@ -8,7 +8,7 @@ from typing import Any
 
 from ssh_abduction.data.action import Action
 from ssh_abduction.data.checks import a_text, an_instance, an_object
-from ssh_abduction.data.errors import TraceError, brief
+from ssh_abduction.data.errors import TraceError, brief, said_of
 from ssh_abduction.data.observation import (
     View,
     checked_probability,
@@ -122,10 +122,8 @@ class Step:
         a_text("where", where, TraceError)
         seen = view_or_unknown(view, f"{where}: view")
         openings = None if star is None else parse_star(star, f"{where}: star")
-        try:
+        with said_of(where):
             return Step(seen, action, openings, displacement, covariance)  # type: ignore[arg-type]
-        except TraceError as error:
-            raise TraceError(f"{where}: {error}") from None
 
     @property
     def openings(self) -> Openings | None:

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 
 from ssh_abduction.data.action import Action, parse_action
 from ssh_abduction.data.closure import parse_closures
-from ssh_abduction.data.errors import TraceError, brief
+from ssh_abduction.data.errors import TraceError, brief, said_of
 from ssh_abduction.data.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, parse_json
 from ssh_abduction.data.observation import checked_image, checked_view
 from ssh_abduction.data.odometry import Odometry
@@ -174,14 +174,12 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
                 f"quote it or leave it out"
             )
     odometry = record.get("odometry")
-    try:
+    with said_of(where):
         return {
             **record,
             "odometry": None if odometry is None else Odometry.of(odometry),
             "closures": parse_closures(record.get("closures")),
         }
-    except TraceError as error:
-        raise TraceError(f"{where}: {error}") from None
 
 
 def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> Step:
@@ -202,7 +200,5 @@ def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> 
         given["action"] = known if known == action else action
     if given["star"] is not None:
         given["star"] = parse_star(given["star"], f"{where}: star")
-    try:
+    with said_of(where):
         return Step(**given, extra={k: v for k, v in record.items() if k not in _STEP_FIELDS})
-    except TraceError as error:
-        raise TraceError(f"{where}: {error}") from None

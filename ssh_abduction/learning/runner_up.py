@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from ssh_abduction.data.errors import TraceError
+from ssh_abduction.data.errors import TraceError, said_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.solver import Solution, Status, solve
@@ -90,10 +90,8 @@ def runner_up(trace: Trace) -> Trace | None:
                 f"{trace.at(i)}: {FIELD}: expected a view, as other steps have one, got none; "
                 "cluster the images again"
             )
-    try:
+    with said_of(f"{trace.source or 'trace'}: {FIELD}"):
         return trace.with_views(step.extra[FIELD] for step in trace.steps)
-    except TraceError as error:
-        raise TraceError(f"{trace.source or 'trace'}: {FIELD}: {error}") from None
 
 
 def second_map(

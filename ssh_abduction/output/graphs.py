@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import networkx as nx
 
-from ssh_abduction.data.checks import one_of
+from ssh_abduction.data.checks import needed, one_of
 from ssh_abduction.data.errors import MapError, xml_text
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.regions import ids_at
@@ -188,12 +188,8 @@ def to_pandas(ssh_map: SSHMap) -> pd.DataFrame:
         MapError: `ssh_map` is not a map, or pandas is not installed.
     """
     checked_map(ssh_map)
-    try:
+    with needed("to_pandas", "pandas", "pandas", MapError):
         import pandas as pd
-    except ImportError:
-        raise MapError(
-            "to_pandas: expected pandas, got none; install it with pip install pandas"
-        ) from None
     rows = []
     for s in (ssh_map.dstates[label] for label in ssh_map.dstate_at):
         row = {"dstate": s.id} | {name: getattr(s, name) for name in s.__slots__[1:]}

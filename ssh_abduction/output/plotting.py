@@ -6,6 +6,7 @@ import math
 from itertools import pairwise
 from typing import Any
 
+from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import DState, SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
@@ -116,12 +117,8 @@ def _nearest(spots: list[tuple[float, float]]) -> float:
 
 def _new_axes(spots: list[tuple[float, float]], unit: float) -> Any:
     """Make matplotlib axes that are large enough for spots."""
-    try:
+    with needed("plot", "matplotlib", "'ssh-abduction[plot]'", MapError):
         from matplotlib import pyplot
-    except ImportError:
-        raise MapError(
-            "plot: expected matplotlib, got none; install 'ssh-abduction[plot]'"
-        ) from None
     width, height = (
         min(20.0, (max(numbers) - min(numbers)) / unit * APART + 2)
         for numbers in zip(*spots, strict=True)

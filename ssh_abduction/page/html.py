@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.data.checks import a_function
+from ssh_abduction.data.checks import a_function, needed
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.map_file import write_map
 from ssh_abduction.data.maps import SSHMap
@@ -161,13 +161,8 @@ export default { render({ model, el }) {
 
 def widget_of(html: str) -> Any:
     """Make a notebook widget that shows a page in an iframe. Raises MapError without anywidget."""
-    try:
+    with needed("widget", "anywidget", "'ssh-abduction[notebook]'", MapError):
         import anywidget
         import traitlets
-    except ImportError:
-        raise MapError(
-            "widget: expected anywidget, got none; "
-            "install it with pip install 'ssh-abduction[notebook]'"
-        ) from None
     members = {"_esm": SHOW, "html": traitlets.Unicode(html).tag(sync=True)}
     return type("PageWidget", (anywidget.AnyWidget,), members)()

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ssh_abduction.data.checks import a_path, a_text, a_whole_number, an_instance, one_of
-from ssh_abduction.data.errors import TheoryError, TraceError, brief, named
+from ssh_abduction.data.errors import TheoryError, TraceError, brief, named, said_of
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.trace import Step, Trace, checked_trace
 from ssh_abduction.data.words import shortly
@@ -444,12 +444,10 @@ class Theory:
             data["rules"] = [
                 str(beside / file) if isinstance(file, str) else file for file in rules
             ]
-        try:
+        with said_of(named(path)):
             return PRESETS[preset]().replace(
                 **{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
             )
-        except TheoryError as error:
-            raise TheoryError(f"{named(path)}: {error}") from None
 
 
 def _read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:

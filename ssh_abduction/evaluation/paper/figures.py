@@ -16,6 +16,7 @@ from perception.features import TellingFeatures
 from perception.recognition import LearningCurve
 from simulator.laser import BEARINGS
 from simulator.world import World
+from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.maps import SSHMap
@@ -28,11 +29,10 @@ BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"
 def require_matplotlib() -> None:
     """Raise AbductionError if matplotlib cannot be loaded. Call this before hours of work."""
     try:
-        importlib.import_module("matplotlib")
-    except ImportError:
-        raise AbductionError(
-            "plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'"
-        ) from None
+        with needed("plot", "matplotlib", "'ssh-abduction[plot]'"):
+            importlib.import_module("matplotlib")
+    except AbductionError:
+        raise
     except Exception as error:  # matplotlib reads settings such as MPLBACKEND when it is loaded
         raise AbductionError(
             f"plot: expected matplotlib to load, got {type(error).__name__}: {error}; "
