@@ -277,7 +277,7 @@ def test_map_gives_the_place_of_a_step() -> None:
         ssh_map.dstates[label].place for label in ssh_map.labels
     ]
     for step in (-1, len(trace), 0.5, True):
-        with pytest.raises(MapError, match=f"step: expected 0 to {len(trace) - 1}, got"):
+        with pytest.raises(MapError, match=f"expected a step from 0 to {len(trace) - 1}, got"):
             ssh_map.place_of(step)  # type: ignore[arg-type]
 
 

@@ -393,14 +393,14 @@ def test_solve_refuses_wrong_limits(choices: dict[str, Any], name: str) -> None:
 @pytest.mark.parametrize(
     ("choices", "message"),
     [
-        ({"boundary": "soft"}, "boundary: expected one of none, strict, defeasible, got 'soft'"),
+        ({"boundary": "soft"}, "boundary: expected none, strict or defeasible, got 'soft'"),
         (
             {"prefer": ("dstates", "streets")},
-            "prefer: expected names out of dstates, paths, places, excuses, auto, got 'streets'",
+            "prefer: expected dstates, paths, places, excuses or auto, got 'streets'",
         ),
         ({"prefer": ("dstates", "dstates")}, "prefer: expected each name once"),
         ({"prefer": ("excuses",)}, "prefer: expected boundary=defeasible with excuses, got strict"),
-        ({"without": ("gravity",)}, "without: expected names out of"),
+        ({"without": ("gravity",)}, "without: expected functional_view, deterministic, "),
         ({"level": "causal"}, "boundary: expected none with level=causal"),
         ({"next_place": 1}, "next_place: expected true or false"),
         ({"colour": "red"}, "theory: expected fields out of"),

@@ -9,11 +9,12 @@ ProvenBound(dstates=4, refuted=(), faults=())
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
+from ssh_abduction.data.checks import an_object
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.trace import Step, Trace
 
@@ -45,10 +46,7 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
     certificate lists the words of pairs. If it has no words at all, the word of a pair is the
     actions that the trace has after both steps. Raises MapError if the certificate is malformed.
     """
-    if not isinstance(certificate, Mapping):
-        raise MapError(
-            f"certificate: expected an object, got {brief(certificate)}; write it with solve --json"
-        )
+    an_object("certificate", certificate, MapError, mend="write it with solve --json")
     if "clique" not in certificate:
         raise MapError(
             "certificate: clique: expected a clique, got none; write the file with solve --json"

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
-from ssh_abduction.data.checks import a_whole_number, an_object
+from ssh_abduction.data.checks import a_whole_number, an_object, one_of
 from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole, is_writable
 from ssh_abduction.data.observation import plain_number, plain_text
 from ssh_abduction.data.star import SPREAD, near_quarter
@@ -50,16 +50,10 @@ class Action:
         name, kind, turn = self.name, self.kind, self.turn
         if not isinstance(name, str) or not name or "\0" in name or not is_writable(name):
             raise TraceError(f"action.name: expected a text, got {brief(name)}; name the action")
-        if not isinstance(kind, str | None) or kind not in (None, *_KINDS):
-            raise TraceError(
-                f"action.kind: expected one of {', '.join(_KINDS)}, got {brief(kind)}; "
-                f"leave it out for other actions"
-            )
-        if not isinstance(turn, str | None) or turn not in (None, *_TURNS):
-            raise TraceError(
-                f'action.turn: expected "right", "left" or "around", got {brief(turn)}; '
-                f"choose the nearest"
-            )
+        if kind is not None:
+            one_of("action.kind", kind, _KINDS, TraceError, mend="leave it out for other actions")
+        if turn is not None:
+            one_of("action.turn", turn, _TURNS, TraceError, mend="choose the nearest")
         if turn is not None and kind != "turn":
             raise TraceError(
                 f'action.kind: expected "turn", as the action has a turn, got {brief(kind)}; '

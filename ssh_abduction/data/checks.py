@@ -171,11 +171,13 @@ def a_list(
     raise error(f"{name}: expected {what}, got {brief(value)}; {mend}")
 
 
-def an_object(name: str, value: object, error: Kind) -> Mapping[str, Any]:
+def an_object(
+    name: str, value: object, error: Kind, *, mend: str = 'write {"name": value}'
+) -> Mapping[str, Any]:
     """Return a value if it is a mapping whose keys are texts, or raise `error`."""
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return value
-    raise error(f'{name}: expected an object, got {brief(value)}; write {{"name": value}}')
+    raise error(f"{name}: expected an object, got {brief(value)}; {mend}")
 
 
 def a_function(name: str, value: object, error: Kind, *, what: str) -> Callable[..., Any]:

@@ -23,7 +23,7 @@ from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.data.checks import a_whole_number, all_instances, an_instance, one_of
+from ssh_abduction.data.checks import a_list, a_whole_number, all_instances, an_instance, one_of
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import firsts, gathered, parts
@@ -156,11 +156,8 @@ class SSHMap:
         Raises:
             MapError: If the trace has no such step.
         """
-        if not is_whole(step) or not 0 <= step < len(self.dstate_at):
-            raise MapError(
-                f"step: expected 0 to {len(self.dstate_at) - 1}, got {brief(step)}; "
-                f"name a step of the trace that was mapped"
-            )
+        last, mend = len(self.dstate_at) - 1, "name a step of the trace that was mapped"
+        a_whole_number("step", step, MapError, 0, last, what="a step", mend=mend)
         return self.dstates[self.dstate_at[step]].place
 
     def right_of(self, path: int, direction: int) -> tuple[int, ...]:
@@ -407,12 +404,8 @@ def maps_of(data: Any, where: str) -> list[SSHMap]:
     """
     if isinstance(data, Mapping) and "maps" in data:
         check_format(data, SOLUTION_FORMAT, where)
-        if not isinstance(data["maps"], list):
-            raise MapError(
-                f"{where}: maps: expected a list, got {brief(data['maps'])}; "
-                f"write it with solve --json"
-            )
-        return [SSHMap.from_dict(m, f"{where}: maps[{i}]") for i, m in enumerate(data["maps"])]
+        maps = a_list(f"{where}: maps", data["maps"], MapError, mend="write it with solve --json")
+        return [SSHMap.from_dict(m, f"{where}: maps[{i}]") for i, m in enumerate(maps)]
     if isinstance(data, Mapping):
         check_format(data, MAP_FORMAT, where)
     return [SSHMap.from_dict(data, where)]

@@ -64,14 +64,17 @@ def checked_image(value: Any, where: str) -> tuple[float, ...] | int:
                 f"count from 0"
             )
         return value
-    if not isinstance(value, list | tuple):
-        raise TraceError(
-            f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]"
-        )
-    for i, x in enumerate(value):
+    for i, x in enumerate(numbers_listed(value, where)):
         if not is_finite(x):
             finite(x, f"{where}[{i}]")  # raises
     return tuple(plain_number(x) for x in value)
+
+
+def numbers_listed(value: Any, where: str) -> list[Any] | tuple[Any, ...]:
+    """Return a value if it is a list or a tuple, or raise TraceError."""
+    if isinstance(value, list | tuple):
+        return value
+    raise TraceError(f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]")
 
 
 def frozen_image(value: Any) -> tuple[float, ...] | int:

@@ -83,11 +83,7 @@ class Odometry:
         """
         if isinstance(value, Odometry):
             return value
-        if not isinstance(value, Mapping):
-            raise TraceError(
-                f"odometry: expected an object, got {brief(value)}; "
-                f'write {{"along": 0.05, "heading": 0.005}}'
-            )
+        an_object("odometry", value, TraceError, mend='write {"along": 0.05, "heading": 0.005}')
         known = {name: value[name] for name in NUMBERS if value.get(name) is not None}
         return cls(**known, extra={name: v for name, v in value.items() if name not in NUMBERS})
 

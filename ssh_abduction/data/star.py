@@ -24,7 +24,7 @@ from typing import Any, TypeAlias
 
 from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.errors import TraceError, brief, is_whole
-from ssh_abduction.data.observation import finite, plain_number
+from ssh_abduction.data.observation import finite, numbers_listed, plain_number
 
 Openings: TypeAlias = tuple[bool, bool, bool, bool]
 Entry: TypeAlias = "float | Gateway | None"
@@ -317,11 +317,7 @@ def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
     """
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
-    if not isinstance(value, list | tuple):
-        raise TraceError(
-            f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]"
-        )
-    given = [int(x) if isinstance(x, bool) else x for x in value]
+    given = [int(x) if isinstance(x, bool) else x for x in numbers_listed(value, where)]
     four = len(given) == 4 and all(
         x is None or x in (0, 1) for x in given if not isinstance(x, Mapping | Gateway)
     )

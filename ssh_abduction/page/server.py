@@ -24,6 +24,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
+from ssh_abduction.data.checks import a_list, one_of
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page import answers
@@ -110,8 +111,7 @@ class PageServer(ThreadingHTTPServer):
         `assuming`, the cost of each assumption, or `content`, the new content of the page. Raises
         AbductionError for a malformed question or one without an answer, and LimitError.
         """
-        if question not in ("explain", "solve"):
-            raise MapError(f"expected explain or solve, got {brief(question)}; ask one of the two")
+        one_of("question", question, ("explain", "solve"), MapError, mend="ask one of the two")
         theory = self._assuming(data)
         pair = self._pair(data.get("pair")) if question == "explain" else None
         known = self._listing.maps
@@ -176,12 +176,8 @@ class PageServer(ThreadingHTTPServer):
         """Add the assumptions in a question to the theory. Raise MapError for malformed ones."""
         theory = self._theory or Theory.topological()
         for name in ("same", "different"):
-            pairs = data.get(name, [])
-            if not isinstance(pairs, list):
-                raise MapError(
-                    f"{name}: expected pairs of steps, got {brief(pairs)}; "
-                    "send a list such as [[0, 8]]"
-                )
+            what, mend = "pairs of steps", "send a list such as [[0, 8]]"
+            pairs = a_list(name, data.get(name, []), MapError, what=what, mend=mend)
             theory = theory.replace(
                 **{name: tuple(dict.fromkeys([*getattr(theory, name), *map(self._pair, pairs)]))}
             )

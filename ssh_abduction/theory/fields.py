@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from ssh_abduction.data.checks import a_whole_number
+from ssh_abduction.data.checks import a_flag, a_whole_number, one_of
 from ssh_abduction.data.errors import TheoryError, brief, is_finite
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.rules import Rules
@@ -94,17 +94,11 @@ def normalise(theory: Theory) -> None:
     Raises TheoryError if a field is wrong, or two contradict each other.
     """
     for name, values in CHOICES.items():
-        if not isinstance(getattr(theory, name), str) or getattr(theory, name) not in values:
-            raise TheoryError(
-                f"{name}: expected one of {', '.join(values)}, got {brief(getattr(theory, name))}"
-                "; take one of them"
-            )
+        one_of(name, getattr(theory, name), values, TheoryError)
     for field in fields(theory):
-        if isinstance(field.default, bool) and not isinstance(getattr(theory, field.name), bool):
-            raise TheoryError(
-                f"{field.name}: expected true or false, got {brief(getattr(theory, field.name))}"
-                "; write one of them"
-            )
+        if isinstance(field.default, bool):
+            flag = a_flag(field.name, getattr(theory, field.name), TheoryError)
+            object.__setattr__(theory, field.name, flag)
     _check_numbers(theory)
     _check_prices(theory)
     _set_names(theory, "prefer", (*COUNTS, *AUTO))
@@ -275,11 +269,7 @@ def _set_names(theory: Theory, field: str, allowed: Iterable[str]) -> None:
     )
     known = list(allowed)
     for i, name in enumerate(names):
-        if name not in known:
-            raise TheoryError(
-                f"{field}: expected names out of {', '.join(known)}, got {brief(name)}"
-                "; take some of these"
-            )
+        one_of(field, name, known, TheoryError, mend="take some of these")
         if name in names[:i]:
             raise TheoryError(
                 f"{field}: expected each name once, got {brief(name)} twice; leave one out"

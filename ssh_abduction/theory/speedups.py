@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Final
 
-from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.checks import a_flag, an_instance
 from ssh_abduction.data.errors import SolverError, brief
 from ssh_abduction.data.words import shortly
 from ssh_abduction.theory import encodings
@@ -51,9 +51,7 @@ class Speedups:
 
     def __post_init__(self) -> None:
         for name in SPEEDUPS:
-            if not isinstance(value := getattr(self, name), bool):
-                wrong = f"speedups: {name}: expected true or false, got {brief(value)}"
-                raise SolverError(f"{wrong}; take one of them")
+            a_flag(f"speedups: {name}", getattr(self, name), SolverError)
 
     def __repr__(self) -> str:
         return shortly(self)

@@ -18,7 +18,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from ssh_abduction.data.checks import a_path, a_text, a_whole_number, an_instance, one_of
+from ssh_abduction.data.checks import a_path, a_text, a_whole_number, an_instance, an_object, one_of
 from ssh_abduction.data.errors import TheoryError, TraceError, brief, named, said_of
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.trace import Step, Trace, checked_trace
@@ -411,13 +411,10 @@ class Theory:
         Raises:
             TheoryError: A field is wrong.
         """
-        if not isinstance(data, Mapping):
-            raise TheoryError(
-                f"theory: expected an object, got {brief(data)}; take one that to_dict made"
-            )
+        an_object("theory", data, TheoryError, mend="take one that to_dict made")
         preset = cls.causal() if data.get("level") == "causal" else cls()
         return preset.replace(
-            **{str(k): tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+            **{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
         )
 
     @classmethod
@@ -434,11 +431,7 @@ class Theory:
         a_path("path", path, TheoryError)
         data = _read_toml(path)
         preset = data.pop("preset", "causal" if data.get("level") == "causal" else "topological")
-        if not isinstance(preset, str) or preset not in PRESETS:
-            raise TheoryError(
-                f"{named(path)}: preset: expected one of {', '.join(PRESETS)}, got {brief(preset)}"
-                "; take one of them"
-            )
+        preset = one_of(f"{named(path)}: preset", preset, PRESETS, TheoryError)
         if isinstance(rules := data.get("rules"), list):
             beside = Path(path).parent
             data["rules"] = [

@@ -20,6 +20,7 @@ from simulator.laser import Laser
 from simulator.robot import Body
 from simulator.tours import simulate
 from simulator.world import World
+from ssh_abduction.data.checks import one_of
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.evaluation.paper import figures
@@ -70,10 +71,7 @@ def reproduce(
     Raises:
         AbductionError: There is no such experiment, no seed, or no matplotlib, or a process died.
     """
-    if name not in EXPERIMENTS:
-        raise AbductionError(
-            f"experiment: expected one of {', '.join(EXPERIMENTS)}, got {name!r}; write one of them"
-        )
+    one_of("experiment", name, EXPERIMENTS, AbductionError)
     if not seeds:
         raise AbductionError("seeds: expected at least one, got none; write 0-19")
     figures.require_matplotlib()  # now, and not after hours of work
