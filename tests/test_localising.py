@@ -93,7 +93,7 @@ def test_long_trace_is_solved_from_some_of_its_visits() -> None:
         maps = tuple(search)
     engine = search._parts.prefixes.engine
     assert isinstance(engine, FramedEngine)
-    assert len(engine._visits.program.visits) < 0.8 * len(engine._visits.chart.stars)
+    assert len(engine._visits.program.known.visits) < 0.8 * len(engine._visits.chart.stars)
     expected = solve(trace, max_maps=None, speedups=Speedups.without("lazy"))
     assert search.complete
     assert set(maps) == set(expected.maps)

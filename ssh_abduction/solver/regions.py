@@ -22,7 +22,7 @@ from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_map
 from ssh_abduction.data.regions import Region, of_members
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.asp.control import Control
+from ssh_abduction.solver.asp.control import new_control
 from ssh_abduction.solver.asp.facts.regions_lp import members_in, region_facts
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle
@@ -75,11 +75,7 @@ def derived(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> tuple[Reg
     if not ssh_map.places:
         return ()
     look_at_clock()
-    control = Control()
-    control.load_encodings("regions")
-    control.add("base", [], region_facts(ssh_map, trace, axioms))
-    control.ground([("base", [])])
-    return of_members(members_in(control))
+    return of_members(members_in(new_control("regions", region_facts(ssh_map, trace, axioms))))
 
 
 class Deriving:

@@ -93,6 +93,7 @@ class Control(clingo.Control):
         self.preparing = preparing
         self.seconds = self.mebibytes = 0.0
         self._check = check
+        self._told = 0  # how often `tell` was called
 
     def __del__(self) -> None:
         try:
@@ -140,6 +141,12 @@ class Control(clingo.Control):
     def add(self, *program: Any) -> None:
         with self._alone():
             super().add(*program)
+
+    def tell(self, rules: str) -> None:
+        """Ground further rules, in a program part of their own."""
+        self._told += 1
+        self.add(f"told_{self._told}", [], rules)
+        self.ground([(f"told_{self._told}", [])])
 
     def ground(
         self,
@@ -239,7 +246,7 @@ class Asker:
         mode: str,
         models: int,
         *,
-        assumptions: Sequence[tuple[clingo.Symbol, bool] | int] = (),
+        assumptions: Sequence[tuple[clingo.Symbol, bool]] = (),
         conflicts: int = -1,
         on_bound: Callable[[Sequence[int]], None] | None = None,
         control: Control | None = None,
@@ -267,62 +274,10 @@ class Asker:
         Raises:
             LimitError: A limit is reached.
         """
-        project = "no" if mode.partition(",")[0] == "opt" else "project"
-        with self._solving(
-            control or self.control, assumptions, mode, models, project, conflicts, on_bound
-        ) as handle:
-            handle.resume()
-            while True:
-                if not self._has_come(handle, until):
-                    return False
-                model = handle.model()
-                if model is None:
-                    return bool(_result(handle, conflicts).exhausted)
-                answer = read(model)
-                if ahead:
-                    handle.resume()
-                yield answer
-                if not ahead:
-                    handle.resume()
-
-    def verdict(
-        self,
-        read: Callable[[clingo.Model], Answer],
-        assumed: Sequence[int],
-        conflicts: int = -1,
-        mode: str = "ignore",
-    ) -> tuple[Answer | None, list[int] | None]:
-        """Find an answer in which some literals are true, or an unsat core of these literals.
-
-        Returns the value that `read` makes and None; or None and the core, a list of literals that
-        cannot all be true. Both are None if `conflicts` ended the search; -1 conflicts mean no
-        limit. `mode` is clingo's option --opt-mode. Raises LimitError if a limit is reached.
-        """
-        with self._solving(self.control, assumed, mode, 1, "no", conflicts) as handle:
-            self._has_come(handle, lambda: False)
-            model = handle.model()
-            if model is not None:
-                return read(model), None
-            if not _result(handle, conflicts).unsatisfiable:
-                return None, None
-            known = set(assumed)
-            # A core may also have external atoms, as clingo assumes these, too.
-            return None, [literal for literal in handle.core() if literal in known]
-
-    @contextmanager
-    def _solving(
-        self,
-        control: Control,
-        assumptions: Sequence[tuple[clingo.Symbol, bool] | int],
-        mode: str,
-        models: int,
-        project: str,
-        conflicts: int,
-        on_bound: Callable[[Sequence[int]], None] | None = None,
-    ) -> Iterator[clingo.SolveHandle]:
-        """Run a search of clingo, as `Control.searching` does."""
+        control = control or self.control
         configuration: Any = control.configuration.solve
-        configuration.opt_mode, configuration.models, configuration.project = mode, models, project
+        configuration.opt_mode, configuration.models = mode, models
+        configuration.project = "no" if mode.partition(",")[0] == "opt" else "project"
         configuration.solve_limit = f"{conflicts},-1"
         self.watch.check(
             control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes
@@ -331,7 +286,22 @@ class Asker:
         began = time.perf_counter()
         with control.searching(assumptions=assumptions, yield_=True, on_unsat=on_bound) as handle:
             self.solve_seconds += time.perf_counter() - began
-            yield handle
+            handle.resume()
+            while True:
+                if not self._has_come(handle, until):
+                    return False
+                model = handle.model()
+                if model is None:
+                    result = handle.get()
+                    if result.interrupted and conflicts < 0:
+                        raise LimitError("interrupted")
+                    return bool(result.exhausted)
+                answer = read(model)
+                if ahead:
+                    handle.resume()
+                yield answer
+                if not ahead:
+                    handle.resume()
 
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
         """Wait for an answer or the end; False if `until` ended the wait. May raise LimitError."""
@@ -360,17 +330,14 @@ def mapped(
             yield function(answer)
 
 
-def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
-    """Return the result of a search. Raises LimitError if it was interrupted without a limit."""
-    result = handle.get()
-    if result.interrupted and conflicts < 0:
-        raise LimitError("interrupted")
-    return result
-
-
-def new_control(encoding: str, base: str, options: Sequence[str]) -> Control:
-    """Make a control with these options of clingo, and ground an encoding with facts `base`."""
-    control = Control(options)
+def new_control(
+    encoding: str,
+    base: str,
+    options: Sequence[str] = (),
+    check: Callable[[], None] = lambda: None,
+) -> Control:
+    """Make a control as `Control` does, and ground an encoding with facts `base`."""
+    control = Control(options, check)
     control.load_encodings(encoding)
     control.add("base", [], base)
     control.ground([("base", [])])

@@ -57,11 +57,10 @@ class Doubts:
                 rules.append(further_rules.one_in_doubt(number, self._condition(sort, i, j)))
         numbers = [(self._number_of[sort, i, j], one) for sort, i, j, one in doubts]
         rules.append(further_rules.some_doubt(self._questions, numbers))
-        part, asked = f"doubts_{self._questions}", further_rules.asked(self._questions)
+        asked = further_rules.asked(self._questions)
         self._questions += 1
         with self._asker.grounding_timed():
-            self._control.add(part, [], "\n".join(rules))
-            self._control.ground([(part, [])])
+            self._control.tell("\n".join(rules))
         self._control.assign_external(asked, True)
         try:
             with closing(self._asker.answers(read, mode, 1, control=self._control)) as answers:
@@ -85,10 +84,6 @@ class Settled:
         self._reader = reader
         self._doubts = Doubts(asker, control, reader.condition)
         self._any: SSHMap | None = None
-
-    def has_map(self) -> bool:
-        """Whether there is a map with these dstates."""
-        return self.any_map() is not None
 
     def any_map(self) -> SSHMap | None:
         """Return some map, always the same one; None if there is none."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 import clingo
 
-from ssh_abduction.solver.asp.control import Asker, Control
+from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import faulty_lp
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.engines.base import Task
@@ -128,9 +128,7 @@ class FaultyControl:
             if new := sorted(self.given.difference(given.steps)):
                 self._give(new)
             for number in range(given.forbidden, len(self.forbidden)):
-                rule = faulty_lp.not_all_one(self.forbidden[number])
-                control.add(f"forbidden_{number}", [], rule)
-                control.ground([(f"forbidden_{number}", [])])
+                control.tell(faulty_lp.not_all_one(self.forbidden[number]))
             given.forbidden = len(self.forbidden)
 
     def forget(self) -> None:
@@ -140,11 +138,8 @@ class FaultyControl:
     def _begin(self) -> None:
         """Make a control with the present names, but without steps."""
         self._given = _Given(dict(self.names), set(self.full))
-        control = self._asker.control = Control(OPTIONS, self._asker.watch.check)
-        control.load_encodings("faulty")
         base = faulty_lp.faulty_base(self._log.actions, self.names, self._price)
-        control.add("base", [], base)
-        control.ground([("base", [])])
+        self._asker.control = new_control("faulty", base, OPTIONS, self._asker.watch.check)
 
     def _give(self, new: list[int]) -> None:
         """Ground the rules for new steps, as one batch."""
@@ -159,8 +154,7 @@ class FaultyControl:
         control.add(f"batch_{batch}", [], rules)
         control.ground([(f"batch_{batch}", []), ("more", number_symbols(batch))])
         if self._most_faults is not None:
-            control.add(f"most_{batch}", [], faulty_lp.at_most_faults(self._most_faults))
-            control.ground([(f"most_{batch}", [])])
+            control.tell(faulty_lp.at_most_faults(self._most_faults))
         given.steps += new
         given.batches += 1
 

@@ -155,10 +155,7 @@ class FramedEngine:
         if not self._framed:
             return
         mode = listing(cost)
-        for naming in self._namings_of_cost(cost):
-            settled = self._fitting.settled(naming, mode)
-            if settled.has_map():
-                yield settled
+        yield from (self._fitting.settled(name, mode) for name in self._namings_of_cost(cost))
 
     def _namings_of_cost(self, cost: tuple[int, ...]) -> Iterator[NodeLabels]:
         """Yield the known labels of maps of this cost; if none are known, search for all."""
@@ -189,7 +186,7 @@ class FramedEngine:
         visits.take_back(labels)
         passed = (
             self._task.speedups.sides
-            and len(visits.program.fits) <= MANY_PAIRS
+            and len(visits.program.known.fits) <= MANY_PAIRS
             and self._sides.say_of_path(
                 *fitting.contrary(self._chart, labels), visits.program.standing(labels)
             )

@@ -114,10 +114,8 @@ class FramelessEngine:
         )
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
-        for labels in self._labels_of(cost):
-            settled = self._fitting.settled(labels, listing(cost))
-            if settled.has_map():
-                yield settled
+        mode = listing(cost)
+        yield from (self._fitting.settled(labels, mode) for labels in self._labels_of(cost))
 
     def _labels_of(self, cost: tuple[int, ...]) -> Iterable[list[int]]:
         """Return the known labels of maps of this cost; if none are known, search for all."""

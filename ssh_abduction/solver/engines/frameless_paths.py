@@ -91,7 +91,6 @@ class PlacesAndPaths:
         self._actions = dict(zip(task.log.actions, task.trace.actions, strict=True))
         # Forbidden sets of equalities that include an equality of places.
         self._refused: list[Collection[Equality]] = []
-        self._forbidden = 0  # the number of sets of links that were forbidden
         # Dstates for whose paths clingo has the axioms, as keys of `NameProgram.names`.
         self._grounded: set[tuple[int, int]] = set()
         # The last labels, and the control for their places and paths.
@@ -220,11 +219,8 @@ class PlacesAndPaths:
         members: list[Link | _Far] = minimal_part(self._clash, [*links, *far])
         placed = {at for member in members if isinstance(member, _Far) for at in member.placed}
         self.named.program.add_links_at({step for step, _ in placed})
-        self._forbidden += 1
-        self.named.program.add_rules(
-            f"forbidden_{self._forbidden}",
-            names_lp.forbidden_links([x for x in members if not isinstance(x, _Far)], placed),
-        )
+        links = [member for member in members if not isinstance(member, _Far)]
+        self._asker.control.tell(names_lp.forbidden_links(links, placed))
 
     def _clash(self, members: list[Link | _Far]) -> bool:
         """Whether no places and paths fit these links and constraints."""

@@ -205,22 +205,15 @@ class NameProgram:
                     far += [(t, int(u)) for u in np.flatnonzero(excluded)]
                 known.is_open[t] = True
         known.links.update(dict.fromkeys(added))
-        self.add_rules(
-            f"batch_{known.batches}", names_lp.batch_facts(known.batches, given, added, far)
-        )
+        self._asker.control.tell(names_lp.batch_facts(known.batches, given, added, far))
         self._asker.control.ground([("more", number_symbols(known.batches))])
         known.batches += 1
-
-    def add_rules(self, part: str, rules: str) -> None:
-        """Ground rules for clingo, in a program part of this name."""
-        self._asker.control.add(part, [], rules)
-        self._asker.control.ground([(part, [])])
 
     def give_forbidden(self, number: int) -> None:
         """Give clingo the rule against the set `forbidden[number]`, and the nodes of this set."""
         pairs = self.forbidden[number]
         self.add_links_at({step for pair in pairs for step in pair})
-        self.add_rules(f"not_together_{number}", names_lp.not_together(number, pairs))
+        self._asker.control.tell(names_lp.not_together(number, pairs))
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
         """Whether the dstates of a map agree with the evidence about pairs of steps."""

@@ -82,8 +82,8 @@ class StepEngine:
                 self._ground_steps(min(size, self.size + (AT_FIRST if many else 1)))
             self._let_end_with(size - 1)
             if is_new:
-                for number in range(len(self._forbidden)):
-                    self._give_forbidden(number)
+                for equalities in self._forbidden:
+                    self.asker.control.tell(further_rules.forbidden_equalities(equalities))
                 self._tell_number()
 
     def _ground_steps(self, stop: int) -> None:
@@ -137,7 +137,7 @@ class StepEngine:
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._forbidden.append(equalities)
-        self._give_forbidden(len(self._forbidden) - 1)
+        self.asker.control.tell(further_rules.forbidden_equalities(equalities))
         return True
 
     def ask_for(self, number: int, count: Count) -> None:
@@ -151,18 +151,8 @@ class StepEngine:
         """Give clingo the rule that fixes a count to the number asked for, if there is one."""
         if self._number is None:
             return
-        part = f"number_{self._number[0]}"
-        self.asker.control.add(part, [], further_rules.exactly(*self._number))
-        self.asker.control.ground([(part, [])])
+        self.asker.control.tell(further_rules.exactly(*self._number))
         self.asker.control.assign_external(further_rules.of_number(*self._number), True)
-
-    def _give_forbidden(self, number: int) -> None:
-        """Give clingo the rule that excludes the forbidden set of equalities at this index."""
-        part = f"forbidden_{number}"
-        self.asker.control.add(
-            part, [], further_rules.forbidden_equalities(self._forbidden[number])
-        )
-        self.asker.control.ground([(part, [])])
 
     def _read(self, model: clingo.Model) -> Found:
         return Found(

@@ -102,9 +102,9 @@ class VisitLabels:
                 return False
             if self.size and len(chart.seen) <= GROWN * self._nodes_at_start:
                 program = self.program
-                has_all = len(program.visits) == len(self.chart.stars)
+                has_all = len(program.known.visits) == len(self.chart.stars)
                 new = range(len(self.chart.stars), len(chart.stars)) if has_all else ()
-                self._give(chart, {*program.visits, *new}, range(len(chart.seen)))
+                self._give(chart, {*program.known.visits, *new}, range(len(chart.seen)))
             else:
                 # `_order_of_choice` also finds the clique, and `_first_visits` needs it.
                 order = self._order_of_choice(chart)
@@ -132,7 +132,7 @@ class VisitLabels:
         self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False
     ) -> None:
         """Give clingo (if `anew`, a new control) all that it lacks about these visits."""
-        known = 0 if anew else len(self.program.fits)
+        known = 0 if anew else len(self.program.known.fits)
         fits = fits_in_time(self._asker.watch, chart, visits, known)
         size, self.size = self.size, 0  # an error may leave this prefix incomplete
         if anew:
@@ -145,8 +145,8 @@ class VisitLabels:
 
     def _give_more(self, visits: Iterable[int]) -> None:
         """Give clingo these visits in addition to those that it has."""
-        more = {*self.program.visits, *visits}
-        assert more != self.program.visits  # else the search would never end
+        more = {*self.program.known.visits, *visits}
+        assert more != self.program.known.visits  # else the search would never end
         with self._asker.grounding_timed():
             self._give(self.chart, more, range(len(self.chart.seen)))
 
@@ -208,7 +208,8 @@ class VisitLabels:
         yield from map(list, self._found)
         while True:
             known = [
-                program.spanning(found, program.nodes) for found in self._found[self._excluded :]
+                program.spanning(found, program.known.place_of)
+                for found in self._found[self._excluded :]
             ]
             batch = program.batch
             program.add_rules(
@@ -216,7 +217,7 @@ class VisitLabels:
             )
             self._excluded = len(self._found)
             labels = self._first_labels(
-                lambda: self._asker.verdict(self.program.read, [], mode=f"enum,{dstates}")[0]
+                lambda: next(self._asker.answers(self.program.read, f"enum,{dstates}", 1), None)
             )
             if labels is None:
                 return
@@ -236,7 +237,7 @@ class VisitLabels:
         """
         program = self.program
         clashing = {self.chart.facing[node][0] for clash in clashes for node in clash}
-        if unknown := clashing - program.visits:
+        if unknown := clashing - program.known.visits:
             self._give_more(unknown)
         rules = []
         for clash in clashes:
@@ -244,10 +245,11 @@ class VisitLabels:
             different = [
                 pair
                 for a, b in combinations(first.values(), 2)
-                if (pair := program.pair(a, b)) in program.fits
+                if (pair := program.pair(a, b)) in program.known.fits
             ]
             together = program.spanning(labels, clash)
-            if program.fits.issuperset(together):  # if not, clingo cannot find such labels anyway
+            # If some do not fit, clingo cannot find such labels anyway.
+            if program.known.fits.issuperset(together):
                 rules.append(visits_lp.forbidden_pairs(together, different))
         program.add_rules("\n".join(rules))
 
@@ -264,9 +266,9 @@ class VisitLabels:
         apart = [(a, b) for a, b in pairs if a != b]
         away = [(a, b) for a, b in places if facing[a][0] != facing[b][0]]
         visits = {facing[node][0] for pair in (*apart, *away) for node in pair}
-        if unknown := visits - program.visits:
+        if unknown := visits - program.known.visits:
             self._give_more(unknown)
-        fits = program.fits
+        fits = program.known.fits
         choices = [[pair] for a, b in apart if (pair := program.pair(a, b)) in fits]
         for a, b in away:
             (i, _), (j, _) = sorted((facing[a], facing[b]))

@@ -6,7 +6,7 @@ them. Fewer visits are a relaxation, so a bound proven for them holds for the tr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import clingo
@@ -28,11 +28,13 @@ SECONDS_A_PAIR = 3e-5
 
 
 @dataclass
-class _GivenVisits:
+class GivenVisits:
     """A record of everything about the chart that the control was given.
 
     Attributes:
-        place_of: For each node, its number in the order in which clingo decides nodes.
+        visits: The visits that clingo has.
+        place_of: For each node, its number in the order in which clingo decides nodes (see
+            `visit_labels.py`).
         ends: The visits that end in the steps given to the control so far.
         turns: The turns, as (node, direction, node).
         fits: The pairs of visits that may be at one place.
@@ -52,6 +54,7 @@ class VisitProgram:
 
     Attributes:
         batch: The number of the last batch of visits; -1 before the first.
+        known: What clingo was given.
         least: A lower bound on the number of dstates: how many nodes are the first at their dstate
             in every answer.
     """
@@ -65,25 +68,10 @@ class VisitProgram:
         cores = ["--opt-strategy=usc"] if task.speedups.core_guided else []
         asker.control = new_control("visits", "", ["--heuristic=Domain", *cores])
         self.least = 0
-        self._known = _GivenVisits()
+        self.known = GivenVisits()
         self._pair_of = PairOf()
-        self._parts = 0
+        self._closed = 0  # how often rules of transitivity were given
         sides.begin()
-
-    @property
-    def visits(self) -> Set[int]:
-        """The visits that clingo has."""
-        return self._known.visits
-
-    @property
-    def fits(self) -> frozenset[Pair]:
-        """The pairs of visits that clingo may put at one place."""
-        return self._known.fits
-
-    @property
-    def nodes(self) -> Iterable[int]:
-        """The nodes that clingo has, in the order of choice (see `visit_labels.py`)."""
-        return self._known.place_of
 
     def give(
         self, chart: FramedChart, visits: set[int], order: Iterable[int], fits: frozenset[Pair]
@@ -94,7 +82,7 @@ class VisitProgram:
         those new to clingo come after all others. `fits` are the pairs of these visits that may be
         at one place.
         """
-        control, known = self._asker.control, self._known
+        control, known = self._asker.control, self.known
         if self.batch >= 0:
             control.release_external(visits_lp.listing_atom(self.batch))
         self.chart = chart
@@ -158,20 +146,18 @@ class VisitProgram:
         have relaxed an unsat core, but lack the rule that limits how many members are violated.
         """
         with self._asker.grounding_timed():
-            name = f"told_{self._parts}"
-            self._parts += 1
-            self._asker.control.add(name, [], rules)
-            self._asker.control.ground([(name, [])])
+            self._asker.control.tell(rules)
             if part is not None:
                 self._asker.control.ground([(part, number_symbols(number))])
 
     def close(self, threes: Iterable[Three]) -> None:
         """Give clingo the rules of transitivity for these triples of visits."""
-        self.add_rules(visits_lp.three_facts(self._parts, threes), "closed", self._parts)
+        self._closed += 1
+        self.add_rules(visits_lp.three_facts(self._closed, threes), "closed", self._closed)
 
     def intransitive(self, pairs: Sequence[Pair]) -> list[Three]:
         """Find the triples of visits at which an answer is not transitive."""
-        return intransitive(pairs, self._known.fits, self.chart)
+        return intransitive(pairs, self.known.fits, self.chart)
 
     def located(self, pairs: Iterable[Pair]) -> Located:
         """Locate all visits by the pairs in a transitive answer; else return the missed visits."""
@@ -180,7 +166,7 @@ class VisitProgram:
             first.setdefault(j, (i, r))
         number: dict[int, int] = {}
         states: dict[int, State] = {}
-        for visit in sorted(self._known.visits):
+        for visit in sorted(self.known.visits):
             i, r = first.get(visit, (visit, 0))
             states[visit] = 4 * number.setdefault(i, len(number)) + -r % 4
         return located(self.chart, states)
@@ -193,7 +179,7 @@ class VisitProgram:
 
     def standing(self, labels: Sequence[int]) -> dict[int, tuple[int, int]]:
         """Return a visit and its slot (direction) for each dstate that has a node in clingo."""
-        return {labels[node]: self.chart.facing[node] for node in self._known.place_of}
+        return {labels[node]: self.chart.facing[node] for node in self.known.place_of}
 
     def spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
         """List the pairs of visits that must be at one place if nodes have these dstates."""
