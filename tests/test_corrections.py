@@ -242,8 +242,9 @@ def test_corrections_take_names_and_stay_with_their_steps(
         assert told in capsys.readouterr().err
     assert main(["explain", maps, "pantry", "path0"]) == 0
     assert capsys.readouterr().out.startswith("place 1 ")
-    assert main(["explain", maps, "pantri"]) == 1
-    assert "did you mean pantry?" in capsys.readouterr().err
+    for words in (["pantri"], ["pantri", "path0"]):
+        assert main(["explain", maps, *words]) == 1
+        assert "did you mean pantry?" in capsys.readouterr().err
 
 
 def test_two_names_of_one_place_can_both_be_changed(

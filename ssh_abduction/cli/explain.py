@@ -27,7 +27,7 @@ from ssh_abduction.cli.options import (
 from ssh_abduction.cli.outcome import on_ctrl_c
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.data.drives import step_named
-from ssh_abduction.data.errors import AbductionError, named
+from ssh_abduction.data.errors import AbductionError, brief, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.map_parts import thing_named
@@ -152,12 +152,12 @@ def _place_asked(words: Sequence[str], listing: Listing | None) -> tuple[int, in
     kinds = [kind for kind, _ in found]
     if kinds in (["place"], ["place", "path"]):
         return found[0][1], found[1][1] if found[1:] else None
-    if len(words) not in (0, 2):
+    if len(words) not in (0, 2) or "path" in kinds:
         texts = [name.text for name in names]
+        hints = (meant(word, texts, 3) for word, kind in zip(words, kinds, strict=True) if not kind)
         raise AbductionError(
-            f"steps: expected two, or none, got {len(words)}; name the two steps that are "
-            "to be explained, or a place and a path, as in p7 path2"
-            + "".join(meant(word, texts, 3) for word in words[:1])
+            f"steps: expected two steps, or none, got {brief(' '.join(words))}; name the two steps "
+            f"that are to be explained, or a place and a path, as in p7 path2{''.join(hints)}"
         )
     return None
 
