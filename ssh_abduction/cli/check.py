@@ -223,7 +223,7 @@ def _bound(
     if not isinstance(data, dict) or "certificate" not in data:
         raise MapError(
             "certificate: expected one in the file of maps, got none; leave out --bound, "
-            "or use a file that solve wrote without --onto"
+            "or take a file that solve --onto did not write"
         )
     bound = check_bound(trace, data["certificate"])
     said += [f"bound: {fault}" for fault in bound.faults]
