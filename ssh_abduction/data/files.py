@@ -1,4 +1,4 @@
-"""Parse JSON that may be malformed, write files atomically, and find files of the package."""
+"""Parse JSON that may be malformed, write files atomically, and read files of the package."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from string import Template
 from typing import Any
 
 from ssh_abduction.data.errors import AbductionError, brief, named
@@ -107,6 +108,11 @@ def shipped(name: str) -> Path:
     package = Path(__file__).resolve().parent.parent
     packaged = package / name
     return packaged if packaged.is_dir() else package.parent / name
+
+
+def filled(template: Path, **values: str) -> str:
+    """Return the text of a template of the package, with a value in the place of each $name."""
+    return Template(template.read_text(encoding="utf-8")).substitute(values)
 
 
 def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:

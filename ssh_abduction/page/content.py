@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise
+from itertools import count, pairwise
 from statistics import median
 from typing import Any
 
@@ -68,33 +68,28 @@ def content_of(
         check_of_trace(listing.maps[:1], trace, listing.source)
     found = compare(listing)
     maps = [ssh_map.renumbered() for ssh_map in listing.maps]
-    # List what maps share once, and let each map refer to it by number.
-    labelings, places, orders, faults = _Pool(), _Pool(), _Pool(), _Pool()
-    regions = _Pool()
+    # List what maps share once, and let each map refer to it by number, in the order of first use.
+    labelings, places, orders, faults, regions = (
+        defaultdict[Any, int](count().__next__) for _ in range(5)
+    )
     entries: list[dict[str, Any]] = []
     for ssh_map, name in zip(maps, found.ids, strict=True):
         one: dict[str, Any] = {
             "id": name,
-            "labeling": labelings.number(
-                (ssh_map.dstate_at, tuple(str(s.shown) for s in ssh_map.dstates))
-            ),
-            "places": places.number(tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)),
-            "orders": orders.number(tuple((path.id, path.order) for path in ssh_map.paths)),
+            "labeling": labelings[ssh_map.dstate_at, tuple(str(s.shown) for s in ssh_map.dstates)],
+            "places": places[tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)],
+            "orders": orders[tuple((path.id, path.order) for path in ssh_map.paths)],
         }
         if leaps := _leaps(ssh_map):
             one["leaps"] = leaps
         if ssh_map.regions:
-            one["regions"] = regions.number(
-                tuple((r.places, r.bounds, r.door) for r in ssh_map.regions)
-            )
+            one["regions"] = regions[tuple((r.places, r.bounds, r.door) for r in ssh_map.regions)]
         if ssh_map.names:
             one["names"] = {f"{n.kind} {n.id}": n.text for n in ssh_map.names}
         if ssh_map.fit:
             one["chi2"] = round(ssh_map.fit.chi2, 1)
         if ssh_map.faults:
-            one["faults"] = [
-                faults.number((fault.step, str(fault), fault.kind)) for fault in ssh_map.faults
-            ]
+            one["faults"] = [faults[fault.step, str(fault), fault.kind] for fault in ssh_map.faults]
             one["cost"] = round(sum(fault.cost for fault in ssh_map.faults), 1)
         entries.append(one)
     layouts = _layouts(maps, entries, trace)
@@ -115,11 +110,11 @@ def content_of(
         "choices": [_choice(choice.to_dict()) for choice in found.choices],
         "replays": replays(maps, [one["labeling"] for one in entries], trace, run),
         "maps": entries,
-        "labelings": [{"labels": labels, "views": views} for labels, views in labelings.items],
-        "places": _differences(places.items),
-        "orders": orders.items,
-        "faults": faults.items,
-        "regions": regions.items,
+        "labelings": [{"labels": labels, "views": views} for labels, views in labelings],
+        "places": _differences(list(places)),
+        "orders": list(orders),
+        "faults": list(faults),
+        "regions": list(regions),
         "layouts": drawings,
         "spots": [
             [round(x, 3), round(y, 3), None if h is None else round(h, 3)] for x, y, h in spots
@@ -185,20 +180,6 @@ def _shared_by(pair: DrivePair) -> str:
     parts = [f"{counted(len(pair.forced), f'{pair.of}s')} in common in all maps"]
     parts += [f"{counted(len(pair.possible), 'possible joins')}, in some maps"]
     return "; ".join(parts[not pair.forced : 1 + bool(pair.possible)])
-
-
-class _Pool:
-    """A list of distinct values, each with a number in the order of their first use."""
-
-    def __init__(self) -> None:
-        self._numbers: dict[Hashable, int] = {}
-
-    def number(self, item: Hashable) -> int:
-        return self._numbers.setdefault(item, len(self._numbers))
-
-    @property
-    def items(self) -> list[Any]:
-        return list(self._numbers)
 
 
 def _choice(data: dict[str, Any]) -> dict[str, Any]:

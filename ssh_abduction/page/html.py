@@ -14,6 +14,7 @@ from typing import Any
 
 from ssh_abduction.data.checks import a_function, needed
 from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.files import filled
 from ssh_abduction.data.map_file import write_map
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
@@ -123,17 +124,7 @@ def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:
         f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; "
         f"connect-src '{asked}'; base-uri 'none'; form-action 'none'"
     )
-    page = _file("page.html")
-    for name, value in {
-        "POLICY": policy,
-        "STYLE": style,
-        "SCRIPT": script,
-        "CONTENT": text,
-    }.items():
-        before, mark, after = page.partition(f"@{name}@")
-        assert mark, name
-        page = before + value + after
-    return page
+    return filled(HERE / "page.html", policy=policy, style=style, script=script, content=text)
 
 
 @cache
@@ -146,23 +137,10 @@ def _digest(text: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-SHOW = """
-export default { render({ model, el }) {
-  const frame = document.createElement("iframe");
-  frame.sandbox = "allow-scripts";
-  frame.style.cssText =
-    "display:block;box-sizing:border-box;width:100%;height:680px;border:1px solid #8888";
-  frame.title = "Maps";
-  frame.srcdoc = model.get("html");
-  el.append(frame);
-} };
-"""
-
-
 def widget_of(html: str) -> Any:
     """Make a notebook widget that shows a page in an iframe. Raises MapError without anywidget."""
     with needed("widget", "anywidget", "'ssh-abduction[notebook]'", MapError):
         import anywidget
         import traitlets
-    members = {"_esm": SHOW, "html": traitlets.Unicode(html).tag(sync=True)}
+    members = {"_esm": _file("script/widget.js"), "html": traitlets.Unicode(html).tag(sync=True)}
     return type("PageWidget", (anywidget.AnyWidget,), members)()

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from perception.places.importing import Imported
 from perception.readers.scans import RobotLog
 from ssh_abduction.checker.joins import joins_in_words
 from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.files import filled
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.ladder import Rung
 from ssh_abduction.output.drawing import escaped
@@ -24,18 +26,7 @@ from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.robot_logs.log_picture import SURE, doubtful_joins, figure, paths_mean_something
 from ssh_abduction.solver import Solution, Status
 
-STYLE = """
-:root { color-scheme: light dark; --ink: #1c1c1c; --paper: #ffffff; --line: #c8c8c8 }
-@media (prefers-color-scheme: dark) { :root { --ink: #e6e6e6; --paper: #16181c; --line: #44484f } }
-body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper) }
-body { max-width: 70rem; margin: 2rem auto; padding: 0 1rem }
-table { border-collapse: collapse; display: block; overflow-x: auto }
-th, td { border-bottom: 1px solid var(--line); padding: .2rem .8rem .2rem 0; text-align: left }
-figure { margin: 1rem 0; background: white; border: 1px solid var(--line) }
-figure svg { width: 100%; height: auto; display: block }
-figcaption { color: #333; padding: .4rem .6rem }
-code { overflow-wrap: anywhere }
-"""
+TEMPLATE = Path(__file__).parent / "report.html"
 
 
 def report(
@@ -69,15 +60,8 @@ def report(
         "<h2>The log</h2>" + _log(log, run),
         "<h2>Visits</h2>" + _visits(imported, solution),
     ]
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width">'
-        '<meta http-equiv="Content-Security-Policy" '
-        "content=\"default-src 'none'; style-src 'unsafe-inline'\">"
-        f"<title>{escaped(name)}</title><style>{STYLE}</style>\n"
-        + "\n".join(part for part in parts if part)
-        + "\n</html>\n"
-    )
+    body = "\n".join(part for part in parts if part)
+    return filled(TEMPLATE, name=escaped(name), body=body)
 
 
 def _summary(solution: Solution, run: Mapping[str, Any]) -> str:

@@ -22,7 +22,7 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.checks import one_of
 from ssh_abduction.data.errors import AbductionError
-from ssh_abduction.data.files import write_file
+from ssh_abduction.data.files import filled, write_file
 from ssh_abduction.evaluation.paper import figures
 from ssh_abduction.evaluation.paper.claim_table import summary
 from ssh_abduction.evaluation.paper.experiments import (
@@ -280,35 +280,15 @@ def _page(name: str, runs: Sequence[SeedRun], table: Sequence[dict[str, Any]], f
     )
     differs = "\n".join(f"<li>{escape(text)}</li>" for text in DIFFERENCES[name])
     title = World.named(EXPERIMENTS[name].world).name
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>Bootstrap learning: {escape(title)}</title>
-<style>
-body{{font:15px/1.5 Helvetica,Arial,sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}
-body{{color:#222}}
-table{{border-collapse:collapse}}
-td,th{{padding:.25em .8em;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}}
-.ours td{{color:#555;font-style:italic}}
-figure{{display:inline-block;margin:1em 1em 1em 0;vertical-align:top;max-width:28em}}
-img{{max-width:100%}}
-figcaption{{font-size:13px;color:#555}}
-</style></head>
-<body><h1>{escape(title)}: claim, paper, here</h1>
-<p>Kuipers &amp; Beeson, “Bootstrap Learning for Place Recognition”, AAAI 2002. {len(runs)} seeds;
-figures are of seed {runs[0].seed}.
-The world, the robot and its laser were fixed before the seeds were run, on other seeds.
-Figures have the paper's numbers, by the order of its text, as its pages were not at hand.
-Figures and rows that the paper does not have are marked as ours.
-<code>configuration.json</code> lists the command, settings and versions to repeat all this.</p>
-<table><tr><th>claim</th><th>paper</th><th>here</th><th>holds in seeds</th></tr>
-{rows}
-</table>
-<h2>What differs from the paper</h2>
-<ul>
-{differs}
-</ul>
-{shown}
-</body></html>
-"""
+    return filled(
+        Path(__file__).parent / "report.html",
+        title=escape(title),
+        seeds=str(len(runs)),
+        first=str(runs[0].seed),
+        rows=rows,
+        differs=differs,
+        shown=shown,
+    )
 
 
 def claimed(row: dict[str, Any]) -> str:
