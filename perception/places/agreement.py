@@ -47,8 +47,8 @@ LEAST_PARTED = 3
 # Distance of the scans of a pair: at least the first number and less than the second, in metres
 # (GAP) or radians (TURN_OF_PAIR).
 GAP, TURN_OF_PAIR = (0.8, 2.4), (0.35, 1.2)
-# Number of pairs to compare.
-PAIRS = 60
+# Number of pairs to compare, and about how many points of the second scan of each pair.
+PAIRS, POINTS = 60, 90
 # Points coincide within MEET metres; points beyond NEAR metres are ignored.
 MEET, NEAR = 0.3, 8.0
 # Directions of the laser, in degrees, and fields of view to try. In all good logs, points coincide
@@ -242,6 +242,7 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
         at, looks = complex(x, y), np.exp(1j * (angle + turns))
         dx, dy, turn = displacement_between(first.odometry, second.odometry)
         here, there = _points(first, stretch), _points(second, stretch)
+        there = there[:: 1 + len(there) // POINTS]
         if first.laser != second.laser or not len(here) or not len(there):
             continue
         # Transform from the laser of the second scan to the robot then, to the robot at the first

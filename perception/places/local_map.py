@@ -8,7 +8,6 @@ matters only within a window (Beeson, Modayil & Kuipers 2010).
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import deque
 from collections.abc import Sequence
@@ -92,6 +91,12 @@ class PackedPatch:
         return np.asarray(bits.view(np.bool_).reshape(self.shape))
 
 
+def _repeated(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Each index of `counts` as often as its count says, and the numbers 0, 1, ... of each."""
+    which = np.repeat(np.arange(len(counts)), counts)
+    return which, np.arange(len(which)) - (np.cumsum(counts) - counts)[which]
+
+
 class BeamCells:
     """The cells that the beams of each recent scan passed and met, found once for each scan.
 
@@ -125,23 +130,18 @@ class BeamCells:
         x = pose[0] + cos * scan.laser.mount[0] - sin * scan.laser.mount[1]
         y = pose[1] + sin * scan.laser.mount[0] + cos * scan.laser.mount[1]
         angles = pose[2] + scan.laser.mount[2] + scan.laser.bearings
+        ahead, aside = np.cos(angles), np.sin(angles)
         valid = ~np.isnan(scan.ranges)
         ranges = np.minimum(np.where(valid, scan.ranges, 0.0), SIGHT)
         met = valid & (scan.ranges < min(SIGHT, scan.laser.reach))
         # Sample each beam along its free part.
         along = np.arange(0.0, SIGHT, 0.8 * CELL)
-        through = along < (ranges - CELL)[:, None]
-        rays = np.broadcast_to(along, through.shape)[through]
-        which = np.nonzero(through)[0]
+        beam, number = _repeated(np.searchsorted(along, ranges - CELL))
+        far = along[number]
         cells = np.zeros(self.side**2, np.bool_)
-        cells[self._numbers(x + np.cos(angles)[which] * rays, y + np.sin(angles)[which] * rays)] = (
-            True
-        )
-        ends = np.unique(
-            self._numbers(
-                x + ranges[met] * np.cos(angles[met]), y + ranges[met] * np.sin(angles[met])
-            )
-        )
+        cells[self._numbers(x + ahead[beam] * far, y + aside[beam] * far)] = True
+        far = ranges[met]
+        ends = np.unique(self._numbers(x + ahead[met] * far, y + aside[met] * far))
         cells[ends] = False
         return np.flatnonzero(cells).astype(np.int32), ends
 
@@ -197,10 +197,11 @@ class LocalMaps:
     ) -> Bools:
         """Mask of the cells, from the cell `first` on, of the trajectory of the window."""
         path = self._recent.poses(begin, end)[:, :2]
-        legs = [
-            np.linspace(a, b, 2 + int(math.dist(a, b) / CELL)) for a, b in itertools.pairwise(path)
-        ]
-        cells = np.rint(np.concatenate([path, *legs]) / CELL).astype(int) - first
+        steps = np.diff(path, axis=0)
+        counts = 1 + (np.hypot(*steps.T) / CELL).astype(int)
+        leg, number = _repeated(counts)
+        points = path[leg] + number[:, None] * (steps / counts[:, None])[leg]
+        cells = np.rint(np.concatenate([path, points]) / CELL).astype(int) - first
         cells = cells[((cells >= 0) & (cells < shape)).all(axis=1)]
         trail = np.zeros(shape, bool)
         trail[cells[:, 0], cells[:, 1]] = True
