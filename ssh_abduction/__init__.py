@@ -9,21 +9,29 @@ module of Python. `__main__` moves that folder to the end of the search path.
 TYPE_CHECKING = False  # as in typing, which takes longer to load than this whole module
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from typing import Any
 
-    from ssh_abduction.checker import check
-    from ssh_abduction.data import AbductionError, SSHMap, Trace
-    from ssh_abduction.evaluation import evaluate
-    from ssh_abduction.explain import explain_pair, explain_trace
-    from ssh_abduction.learning import BootstrapLearner
-    from ssh_abduction.online import Explorer, Localiser, OnlineMapper, route
-    from ssh_abduction.output import export_map
-    from ssh_abduction.page import view_page
-    from ssh_abduction.rivals import compare, next_experiment
-    from ssh_abduction.robot_logs import map_log
-    from ssh_abduction.solver import Solution, solve
-    from ssh_abduction.theory import Theory
+    from ssh_abduction.checker import check as check
+    from ssh_abduction.data import AbductionError as AbductionError
+    from ssh_abduction.data import SSHMap as SSHMap
+    from ssh_abduction.data import Trace as Trace
+    from ssh_abduction.evaluation import evaluate as evaluate
+    from ssh_abduction.explain import explain_pair as explain_pair
+    from ssh_abduction.explain import explain_trace as explain_trace
+    from ssh_abduction.learning import BootstrapLearner as BootstrapLearner
+    from ssh_abduction.online import Explorer as Explorer
+    from ssh_abduction.online import Localiser as Localiser
+    from ssh_abduction.online import OnlineMapper as OnlineMapper
+    from ssh_abduction.online import route as route
+    from ssh_abduction.output import export_map as export_map
+    from ssh_abduction.page import view_page as view_page
+    from ssh_abduction.rivals import compare as compare
+    from ssh_abduction.rivals import next_experiment as next_experiment
+    from ssh_abduction.robot_logs import map_log as map_log
+    from ssh_abduction.solver import Solution as Solution
+    from ssh_abduction.solver import solve as solve
+    from ssh_abduction.theory import Theory as Theory
 
     __version__: str
 
@@ -44,36 +52,12 @@ _MOVED = {"Path": "data.MapPath", "SSHError": "data.AbductionError"} | {
     for name in names.split()
 }
 
-__all__ = [
-    "AbductionError",
-    "BootstrapLearner",
-    "Explorer",
-    "Localiser",
-    "OnlineMapper",
-    "SSHMap",
-    "Solution",
-    "Theory",
-    "Trace",
-    "check",
-    "compare",
-    "evaluate",
-    "explain_pair",
-    "explain_trace",
-    "export_map",
-    "map_log",
-    "next_experiment",
-    "route",
-    "solve",
-    "view_page",
-]
 
-
-def lazy_names(
-    package: str, exported: "Sequence[str]"
-) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
+def lazy_names(package: str) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
     """Make the `__getattr__` and `__dir__` of a package that loads each name when it is first used.
 
-    The imports below `if TYPE_CHECKING` in the source of the package say where each name is.
+    The package exports the names that its source imports by `as`, below `if TYPE_CHECKING`. They
+    are its `__all__`.
 
     Returns:
         The function `__getattr__`, which loads and returns the value of a name, and the function
@@ -83,13 +67,18 @@ def lazy_names(
 
     where: dict[str, tuple[str, str]] = {}  # the module of each name, and its name there
 
+    def exported() -> "list[str]":
+        if not where:
+            where.update(_exports_of(package))
+        return sorted(where)
+
     def load(name: str) -> "Any":
         from importlib import import_module
 
-        if name not in exported:
+        if name == "__all__":
+            return exported()
+        if name not in exported():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        if not where:
-            where.update(_imports_of(package))
         module, there = where[name]
         loaded = import_module(module)
         value = (
@@ -99,26 +88,27 @@ def lazy_names(
         return value
 
     def names() -> "list[str]":
-        return sorted({*vars(sys.modules[package]), *exported})
+        return sorted({*vars(sys.modules[package]), *exported()})
 
     return load, names
 
 
-def _imports_of(package: str) -> "dict[str, tuple[str, str]]":
-    """Read the names that a package imports, each with its module and its name there."""
+def _exports_of(package: str) -> "dict[str, tuple[str, str]]":
+    """Read the names that a package imports by `as`, each with its module and its name there."""
     import ast
     import sys
 
     spec: Any = sys.modules[package].__spec__
     return {
-        alias.asname or alias.name: (node.module, alias.name)
+        alias.asname: (node.module, alias.name)
         for node in ast.walk(ast.parse(spec.loader.get_source(package)))
         if isinstance(node, ast.ImportFrom) and node.module is not None
         for alias in node.names
+        if alias.asname is not None
     }
 
 
-_load, __dir__ = lazy_names(__name__, __all__)
+_load, __dir__ = lazy_names(__name__)
 
 
 def __getattr__(name: str) -> "Any":

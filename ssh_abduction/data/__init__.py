@@ -9,56 +9,35 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.data.closure import Closure
-    from ssh_abduction.data.corrections import Corrections, Naming, Passage, Said
-    from ssh_abduction.data.corrections_file import load_corrections, save_corrections
-    from ssh_abduction.data.drives import Drive, drives_of, together
-    from ssh_abduction.data.errors import (
-        AbductionError,
-        LocaliserError,
-        MapError,
-        RangeError,
-        SolverError,
-        TheoryError,
-        TraceError,
-    )
-    from ssh_abduction.data.maps import DState, Fault, Fit, MapPath, Name, Pose, SSHMap
-    from ssh_abduction.data.odometry import Odometry
-    from ssh_abduction.data.regions import Region
-    from ssh_abduction.data.star import Star
-    from ssh_abduction.data.trace import Action, Step, Trace
+    from ssh_abduction.data.closure import Closure as Closure
+    from ssh_abduction.data.corrections import Corrections as Corrections
+    from ssh_abduction.data.corrections import Naming as Naming
+    from ssh_abduction.data.corrections import Passage as Passage
+    from ssh_abduction.data.corrections import Said as Said
+    from ssh_abduction.data.corrections_file import load_corrections as load_corrections
+    from ssh_abduction.data.corrections_file import save_corrections as save_corrections
+    from ssh_abduction.data.drives import Drive as Drive
+    from ssh_abduction.data.drives import drives_of as drives_of
+    from ssh_abduction.data.drives import together as together
+    from ssh_abduction.data.errors import AbductionError as AbductionError
+    from ssh_abduction.data.errors import LocaliserError as LocaliserError
+    from ssh_abduction.data.errors import MapError as MapError
+    from ssh_abduction.data.errors import RangeError as RangeError
+    from ssh_abduction.data.errors import SolverError as SolverError
+    from ssh_abduction.data.errors import TheoryError as TheoryError
+    from ssh_abduction.data.errors import TraceError as TraceError
+    from ssh_abduction.data.maps import DState as DState
+    from ssh_abduction.data.maps import Fault as Fault
+    from ssh_abduction.data.maps import Fit as Fit
+    from ssh_abduction.data.maps import MapPath as MapPath
+    from ssh_abduction.data.maps import Name as Name
+    from ssh_abduction.data.maps import Pose as Pose
+    from ssh_abduction.data.maps import SSHMap as SSHMap
+    from ssh_abduction.data.odometry import Odometry as Odometry
+    from ssh_abduction.data.regions import Region as Region
+    from ssh_abduction.data.star import Star as Star
+    from ssh_abduction.data.trace import Action as Action
+    from ssh_abduction.data.trace import Step as Step
+    from ssh_abduction.data.trace import Trace as Trace
 
-__all__ = [
-    "AbductionError",
-    "Action",
-    "Closure",
-    "Corrections",
-    "DState",
-    "Drive",
-    "Fault",
-    "Fit",
-    "LocaliserError",
-    "MapError",
-    "MapPath",
-    "Name",
-    "Naming",
-    "Odometry",
-    "Passage",
-    "Pose",
-    "RangeError",
-    "Region",
-    "SSHMap",
-    "Said",
-    "SolverError",
-    "Star",
-    "Step",
-    "TheoryError",
-    "Trace",
-    "TraceError",
-    "drives_of",
-    "load_corrections",
-    "save_corrections",
-    "together",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, __all__)
+__getattr__, __dir__ = lazy_names(__name__)

@@ -5,38 +5,19 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.evaluation.named_truth import (
-        Evaluation,
-        MapEvaluation,
-        evaluate,
-        tells_names,
-    )
-    from ssh_abduction.evaluation.pose_truth import (
-        JudgedPairs,
-        MapPairs,
-        MapVisits,
-        VisitsEvaluation,
-        evaluate_visits,
-        told_poses,
-    )
-    from ssh_abduction.evaluation.relations import Relation, Relations
-    from ssh_abduction.evaluation.trajectory import Trajectory, TrajectoryWarning
+    from ssh_abduction.evaluation.named_truth import Evaluation as Evaluation
+    from ssh_abduction.evaluation.named_truth import MapEvaluation as MapEvaluation
+    from ssh_abduction.evaluation.named_truth import evaluate as evaluate
+    from ssh_abduction.evaluation.named_truth import tells_names as tells_names
+    from ssh_abduction.evaluation.pose_truth import JudgedPairs as JudgedPairs
+    from ssh_abduction.evaluation.pose_truth import MapPairs as MapPairs
+    from ssh_abduction.evaluation.pose_truth import MapVisits as MapVisits
+    from ssh_abduction.evaluation.pose_truth import VisitsEvaluation as VisitsEvaluation
+    from ssh_abduction.evaluation.pose_truth import evaluate_visits as evaluate_visits
+    from ssh_abduction.evaluation.pose_truth import told_poses as told_poses
+    from ssh_abduction.evaluation.relations import Relation as Relation
+    from ssh_abduction.evaluation.relations import Relations as Relations
+    from ssh_abduction.evaluation.trajectory import Trajectory as Trajectory
+    from ssh_abduction.evaluation.trajectory import TrajectoryWarning as TrajectoryWarning
 
-__all__ = [
-    "Evaluation",
-    "JudgedPairs",
-    "MapEvaluation",
-    "MapPairs",
-    "MapVisits",
-    "Relation",
-    "Relations",
-    "Trajectory",
-    "TrajectoryWarning",
-    "VisitsEvaluation",
-    "evaluate",
-    "evaluate_visits",
-    "tells_names",
-    "told_poses",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, __all__)
+__getattr__, __dir__ = lazy_names(__name__)

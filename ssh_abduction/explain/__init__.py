@@ -5,19 +5,12 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.explain.mend import explain_trace
-    from ssh_abduction.explain.no_map import Explanation, explain, why_apart
-    from ssh_abduction.explain.pairs import explain_pair
-    from ssh_abduction.explain.sides import PlaceExplanation, explain_place
+    from ssh_abduction.explain.mend import explain_trace as explain_trace
+    from ssh_abduction.explain.no_map import Explanation as Explanation
+    from ssh_abduction.explain.no_map import explain as explain
+    from ssh_abduction.explain.no_map import why_apart as why_apart
+    from ssh_abduction.explain.pairs import explain_pair as explain_pair
+    from ssh_abduction.explain.sides import PlaceExplanation as PlaceExplanation
+    from ssh_abduction.explain.sides import explain_place as explain_place
 
-__all__ = [
-    "Explanation",
-    "PlaceExplanation",
-    "explain",
-    "explain_pair",
-    "explain_place",
-    "explain_trace",
-    "why_apart",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, __all__)
+__getattr__, __dir__ = lazy_names(__name__)

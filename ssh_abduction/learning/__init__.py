@@ -5,8 +5,6 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.learning.learner import BootstrapLearner
+    from ssh_abduction.learning.learner import BootstrapLearner as BootstrapLearner
 
-__all__ = ["BootstrapLearner"]
-
-__getattr__, __dir__ = lazy_names(__name__, __all__)
+__getattr__, __dir__ = lazy_names(__name__)

@@ -5,23 +5,14 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.online.belief import Belief
-    from ssh_abduction.online.chances import Chances
-    from ssh_abduction.online.explorer import Exploration, Explorer
-    from ssh_abduction.online.localiser import Localiser
-    from ssh_abduction.online.mapper import OnlineMapper
-    from ssh_abduction.online.routes import Move, Route, route
+    from ssh_abduction.online.belief import Belief as Belief
+    from ssh_abduction.online.chances import Chances as Chances
+    from ssh_abduction.online.explorer import Exploration as Exploration
+    from ssh_abduction.online.explorer import Explorer as Explorer
+    from ssh_abduction.online.localiser import Localiser as Localiser
+    from ssh_abduction.online.mapper import OnlineMapper as OnlineMapper
+    from ssh_abduction.online.routes import Move as Move
+    from ssh_abduction.online.routes import Route as Route
+    from ssh_abduction.online.routes import route as route
 
-__all__ = [
-    "Belief",
-    "Chances",
-    "Exploration",
-    "Explorer",
-    "Localiser",
-    "Move",
-    "OnlineMapper",
-    "Route",
-    "route",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, __all__)
+__getattr__, __dir__ = lazy_names(__name__)

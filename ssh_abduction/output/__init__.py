@@ -8,23 +8,14 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.output.cards import map_card, trace_card
-    from ssh_abduction.output.dot import to_dot
-    from ssh_abduction.output.export import export_map
-    from ssh_abduction.output.graphs import to_graphml, to_networkx, to_pandas
-    from ssh_abduction.output.picture import to_svg
-    from ssh_abduction.output.plotting import plot
+    from ssh_abduction.output.cards import map_card as map_card
+    from ssh_abduction.output.cards import trace_card as trace_card
+    from ssh_abduction.output.dot import to_dot as to_dot
+    from ssh_abduction.output.export import export_map as export_map
+    from ssh_abduction.output.graphs import to_graphml as to_graphml
+    from ssh_abduction.output.graphs import to_networkx as to_networkx
+    from ssh_abduction.output.graphs import to_pandas as to_pandas
+    from ssh_abduction.output.picture import to_svg as to_svg
+    from ssh_abduction.output.plotting import plot as plot
 
-__all__ = [
-    "export_map",
-    "map_card",
-    "plot",
-    "to_dot",
-    "to_graphml",
-    "to_networkx",
-    "to_pandas",
-    "to_svg",
-    "trace_card",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, __all__)
+__getattr__, __dir__ = lazy_names(__name__)

@@ -5,8 +5,7 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.page.html import Page, view_page
+    from ssh_abduction.page.html import Page as Page
+    from ssh_abduction.page.html import view_page as view_page
 
-__all__ = ["Page", "view_page"]
-
-__getattr__, __dir__ = lazy_names(__name__, __all__)
+__getattr__, __dir__ = lazy_names(__name__)

@@ -5,26 +5,16 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.rivals.comparison import Comparison, compare
-    from ssh_abduction.rivals.differences import Difference, difference
-    from ssh_abduction.rivals.drive_joins import DrivePair, joins_of_drives
-    from ssh_abduction.rivals.experiment import Experiment
-    from ssh_abduction.rivals.explore import next_experiment
-    from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.rivals.sides import SharedSides, shared_sides
+    from ssh_abduction.rivals.comparison import Comparison as Comparison
+    from ssh_abduction.rivals.comparison import compare as compare
+    from ssh_abduction.rivals.differences import Difference as Difference
+    from ssh_abduction.rivals.differences import difference as difference
+    from ssh_abduction.rivals.drive_joins import DrivePair as DrivePair
+    from ssh_abduction.rivals.drive_joins import joins_of_drives as joins_of_drives
+    from ssh_abduction.rivals.experiment import Experiment as Experiment
+    from ssh_abduction.rivals.explore import next_experiment as next_experiment
+    from ssh_abduction.rivals.listing import Listing as Listing
+    from ssh_abduction.rivals.sides import SharedSides as SharedSides
+    from ssh_abduction.rivals.sides import shared_sides as shared_sides
 
-__all__ = [
-    "Comparison",
-    "Difference",
-    "DrivePair",
-    "Experiment",
-    "Listing",
-    "SharedSides",
-    "compare",
-    "difference",
-    "joins_of_drives",
-    "next_experiment",
-    "shared_sides",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, __all__)
+__getattr__, __dir__ = lazy_names(__name__)

@@ -5,8 +5,7 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.robot_logs.log_maps import LogMap, map_log
+    from ssh_abduction.robot_logs.log_maps import LogMap as LogMap
+    from ssh_abduction.robot_logs.log_maps import map_log as map_log
 
-__all__ = ["LogMap", "map_log"]
-
-__getattr__, __dir__ = lazy_names(__name__, __all__)
+__getattr__, __dir__ = lazy_names(__name__)

@@ -10,128 +10,70 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.solver.asp import facts, workers
-    from ssh_abduction.solver.asp.control import Control
-    from ssh_abduction.solver.asp.limits import (
-        POLL,
-        LimitError,
-        Stop,
-        Watch,
-        check_limit,
-        resident_memory,
-    )
-    from ssh_abduction.solver.asp.rules import check_rules
-    from ssh_abduction.solver.asp.workers import end_all, in_process
-    from ssh_abduction.solver.costs.estimating import maps_apart
-    from ssh_abduction.solver.costs.misfit import Misfit
-    from ssh_abduction.solver.entry import find_backbone, solve
-    from ssh_abduction.solver.front import Front, Point, fault_front
-    from ssh_abduction.solver.geometry.fit import fit
-    from ssh_abduction.solver.geometry.ranking import Ranking
-    from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
-    from ssh_abduction.solver.guesses.tree import Sketch
-    from ssh_abduction.solver.judging import InternalError, Judging
-    from ssh_abduction.solver.obeying import obeyed, with_kept_apart, with_names
-    from ssh_abduction.solver.regions import find_regions, with_regions
-    from ssh_abduction.solver.search import Search
-    from ssh_abduction.solver.solution.recorded import (
-        drives_in,
-        joins_in,
-        theory_in,
-        trace_in,
-        warnings_in,
-    )
-    from ssh_abduction.solver.solution.result import Solution
-    from ssh_abduction.solver.solution.sharing import (
-        SORTS,
-        Backbone,
-        Shared,
-        Sharing,
-        Sort,
-        stretches,
-    )
-    from ssh_abduction.solver.solution.weighed import EQUAL, Weighed, probability_in_words
-    from ssh_abduction.solver.solution.writing import ending, opening, summary_of, written_map
-    from ssh_abduction.solver.start import Limits, Start
-    from ssh_abduction.solver.steps.certificate import RESTS_ON, Certificate
-    from ssh_abduction.solver.steps.log import Outcome, observation
-    from ssh_abduction.solver.values import (
-        Bound,
-        Cost,
-        Effort,
-        Level,
-        Progress,
-        Seconds,
-        Status,
-        cost_as_counted,
-    )
+    from ssh_abduction.solver.asp import facts as facts
+    from ssh_abduction.solver.asp import workers as workers
+    from ssh_abduction.solver.asp.control import Control as Control
+    from ssh_abduction.solver.asp.limits import POLL as POLL
+    from ssh_abduction.solver.asp.limits import LimitError as LimitError
+    from ssh_abduction.solver.asp.limits import Stop as Stop
+    from ssh_abduction.solver.asp.limits import Watch as Watch
+    from ssh_abduction.solver.asp.limits import check_limit as check_limit
+    from ssh_abduction.solver.asp.limits import resident_memory as resident_memory
+    from ssh_abduction.solver.asp.rules import check_rules as check_rules
+    from ssh_abduction.solver.asp.workers import end_all as end_all
+    from ssh_abduction.solver.asp.workers import in_process as in_process
+    from ssh_abduction.solver.costs.estimating import maps_apart as maps_apart
+    from ssh_abduction.solver.costs.misfit import Misfit as Misfit
+    from ssh_abduction.solver.entry import find_backbone as find_backbone
+    from ssh_abduction.solver.entry import solve as solve
+    from ssh_abduction.solver.front import Front as Front
+    from ssh_abduction.solver.front import Point as Point
+    from ssh_abduction.solver.front import fault_front as fault_front
+    from ssh_abduction.solver.geometry.fit import fit as fit
+    from ssh_abduction.solver.geometry.ranking import Ranking as Ranking
+    from ssh_abduction.solver.guesses.gated import sketch_beyond as sketch_beyond
+    from ssh_abduction.solver.guesses.gated import sketches_of as sketches_of
+    from ssh_abduction.solver.guesses.tree import Sketch as Sketch
+    from ssh_abduction.solver.judging import InternalError as InternalError
+    from ssh_abduction.solver.judging import Judging as Judging
+    from ssh_abduction.solver.obeying import obeyed as obeyed
+    from ssh_abduction.solver.obeying import with_kept_apart as with_kept_apart
+    from ssh_abduction.solver.obeying import with_names as with_names
+    from ssh_abduction.solver.regions import find_regions as find_regions
+    from ssh_abduction.solver.regions import with_regions as with_regions
+    from ssh_abduction.solver.search import Search as Search
+    from ssh_abduction.solver.solution.recorded import drives_in as drives_in
+    from ssh_abduction.solver.solution.recorded import joins_in as joins_in
+    from ssh_abduction.solver.solution.recorded import theory_in as theory_in
+    from ssh_abduction.solver.solution.recorded import trace_in as trace_in
+    from ssh_abduction.solver.solution.recorded import warnings_in as warnings_in
+    from ssh_abduction.solver.solution.result import Solution as Solution
+    from ssh_abduction.solver.solution.sharing import SORTS as SORTS
+    from ssh_abduction.solver.solution.sharing import Backbone as Backbone
+    from ssh_abduction.solver.solution.sharing import Shared as Shared
+    from ssh_abduction.solver.solution.sharing import Sharing as Sharing
+    from ssh_abduction.solver.solution.sharing import Sort as Sort
+    from ssh_abduction.solver.solution.sharing import stretches as stretches
+    from ssh_abduction.solver.solution.weighed import EQUAL as EQUAL
+    from ssh_abduction.solver.solution.weighed import Weighed as Weighed
+    from ssh_abduction.solver.solution.weighed import probability_in_words as probability_in_words
+    from ssh_abduction.solver.solution.writing import ending as ending
+    from ssh_abduction.solver.solution.writing import opening as opening
+    from ssh_abduction.solver.solution.writing import summary_of as summary_of
+    from ssh_abduction.solver.solution.writing import written_map as written_map
+    from ssh_abduction.solver.start import Limits as Limits
+    from ssh_abduction.solver.start import Start as Start
+    from ssh_abduction.solver.steps.certificate import RESTS_ON as RESTS_ON
+    from ssh_abduction.solver.steps.certificate import Certificate as Certificate
+    from ssh_abduction.solver.steps.log import Outcome as Outcome
+    from ssh_abduction.solver.steps.log import observation as observation
+    from ssh_abduction.solver.values import Bound as Bound
+    from ssh_abduction.solver.values import Cost as Cost
+    from ssh_abduction.solver.values import Effort as Effort
+    from ssh_abduction.solver.values import Level as Level
+    from ssh_abduction.solver.values import Progress as Progress
+    from ssh_abduction.solver.values import Seconds as Seconds
+    from ssh_abduction.solver.values import Status as Status
+    from ssh_abduction.solver.values import cost_as_counted as cost_as_counted
 
-__all__ = [
-    "EQUAL",
-    "POLL",
-    "RESTS_ON",
-    "SORTS",
-    "Backbone",
-    "Bound",
-    "Certificate",
-    "Control",
-    "Cost",
-    "Effort",
-    "Front",
-    "InternalError",
-    "Judging",
-    "Level",
-    "LimitError",
-    "Limits",
-    "Misfit",
-    "Outcome",
-    "Point",
-    "Progress",
-    "Ranking",
-    "Search",
-    "Seconds",
-    "Shared",
-    "Sharing",
-    "Sketch",
-    "Solution",
-    "Sort",
-    "Start",
-    "Status",
-    "Stop",
-    "Watch",
-    "Weighed",
-    "check_limit",
-    "check_rules",
-    "cost_as_counted",
-    "drives_in",
-    "end_all",
-    "ending",
-    "facts",
-    "fault_front",
-    "find_backbone",
-    "find_regions",
-    "fit",
-    "in_process",
-    "joins_in",
-    "maps_apart",
-    "obeyed",
-    "observation",
-    "opening",
-    "probability_in_words",
-    "resident_memory",
-    "sketch_beyond",
-    "sketches_of",
-    "solve",
-    "stretches",
-    "summary_of",
-    "theory_in",
-    "trace_in",
-    "warnings_in",
-    "with_kept_apart",
-    "with_names",
-    "with_regions",
-    "workers",
-    "written_map",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, __all__)
+__getattr__, __dir__ = lazy_names(__name__)
