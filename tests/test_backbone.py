@@ -36,7 +36,6 @@ from ssh_abduction.solver import (
     map_list,
     prefixes,
 )
-from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.frameless import FramelessEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
@@ -220,7 +219,7 @@ def test_endless_list_leaves_time_to_prove_the_backbone() -> None:
     search = Search(
         rectangle(14), theory, max_maps=None, time_limit=1000, _start=Start(reasons=True)
     )
-    with patch.object(Watch, "reserve_begins", 0.5):
+    with patch.object(map_list, "PROVING", 0.9995):
         count = sum(1 for _ in search)
     solution = search.solution()
     assert solution.stopped == "time limit"

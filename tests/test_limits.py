@@ -81,7 +81,6 @@ def noisy(tmp_path: Path) -> Path:
 
 def test_grounding_stops_at_the_time_limit() -> None:
     watch = Watch(0.2)
-    watch.use_reserve()
     watch.start()
     control = Control((), watch.check)
     control.add("base", [], JOINS)
@@ -111,7 +110,6 @@ def test_watch_refuses_work_beyond_a_limit(
     seconds: float, mebibytes: float, reason: str | None
 ) -> None:
     watch = Watch(100.0, peak_memory() + 100)
-    watch.use_reserve()
     watch.start()
     stopped = None
     try:

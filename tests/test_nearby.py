@@ -15,9 +15,9 @@ from test_speedups import PLAIN, machines
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import Search, Status, choosing, fallback
+from ssh_abduction.solver import Search, Status, choosing
 from ssh_abduction.solver.asp.facts import answer_maps
-from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import (
     name_program,
@@ -26,11 +26,9 @@ from ssh_abduction.solver.engines import (
     pinned,
     small_maps,
 )
-from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.guesses.annealing import annealed
-from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import Speedups
@@ -145,31 +143,6 @@ def test_limit_leaves_the_small_map_found_near_a_guess() -> None:
     merged = len(set(Log(walk.trace, CAUSAL).merged()))
     assert solution.cost.dstates <= len(truth) < merged / 2
     assert check(walk.trace, solution.maps[0], CAUSAL) == ()
-
-
-def test_search_of_the_whole_trace_uses_the_reserved_time() -> None:
-    """The reserved time is for that search, and a restart would lose its progress. So it may use
-    the whole limit from its start. If it is stopped without a map, no other search for any map
-    follows."""
-    trace = maze(10, 10, steps=500, seed=0, stars=True).trace
-    begun: list[tuple[bool, bool]] = []
-    minimise = Prefixes.minimise
-
-    def stop(self: Prefixes) -> Found | None:
-        """The clock runs normally for a prefix. The time is over when the search of the whole trace
-        begins."""
-        if self.engine.size < len(trace):
-            return minimise(self)
-        begun.append((self._task.watch.has_reserve, self._known.best is None))
-        raise LimitError("time limit")
-
-    with (
-        patch.object(fallback, "salvage", side_effect=AssertionError),
-        patch.object(Prefixes, "minimise", stop),
-    ):
-        solution = solve(trace, time_limit=1000)
-    assert begun == [(False, True)]
-    assert solution.stopped == "time limit"
 
 
 def _labels_of(chart: Chart, states: tuple[object, ...], number: dict[object, int]) -> list[int]:

@@ -510,17 +510,17 @@ def test_growth_continues_after_a_limit_with_the_same_maps() -> None:
     theory = settle(trace).theory
 
     class Impatient(Watch):
-        left = 100
+        checks = 100
 
         def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
-            self.left -= 1
-            if not self.left:
+            self.checks -= 1
+            if not self.checks:
                 raise LimitError("time limit")
 
     watch = Impatient(None, None, lambda: None)
     engine = StepEngine(Task.of(Problem.of(trace, theory), watch), paths=10)
     engine.grow(4)
-    watch.left = 2
+    watch.checks = 2
     with pytest.raises(LimitError):
         engine.grow(len(trace))
     assert 4 < engine.size < len(trace)

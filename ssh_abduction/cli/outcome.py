@@ -50,7 +50,6 @@ def why_no_map(search: Search) -> Explanation | None:
     if search.status is not Status.UNSATISFIABLE or search.theory.jumped:
         return None
     watch = Watch(EXPLAINING, clock=time.thread_time)
-    watch.use_reserve()
     watch.start()
 
     def over() -> bool:

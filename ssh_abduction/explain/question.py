@@ -60,7 +60,6 @@ class LimitedQuestion(ABC, Generic[_Answer]):
         check_of_trace(self._known_maps, trace, "known", views=False)
         self.stopped: Stop | None = None
         self._watch = Watch(time_limit, memory_limit)
-        self._watch.use_reserve()
         self._search: Search | None = None
 
     def answer(self) -> _Answer:

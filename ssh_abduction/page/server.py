@@ -223,7 +223,6 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse()
             return
         watch = Watch(self.server.net)
-        watch.use_reserve()
         try:
             data = json.loads(self.rfile.read(length))
             if not isinstance(data, dict):

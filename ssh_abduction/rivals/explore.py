@@ -142,7 +142,6 @@ def next_experiment(
     _check(rivals, trace)
     if watch is None:
         watch = Watch(time_limit, memory_limit)
-    watch.use_reserve()
     watch.start()
     laboratory = Laboratory(rivals, trace, theory, extra, can, implied, watch)
     plan = laboratory.plan()

@@ -253,7 +253,6 @@ class Candidates:
                 len(ssh_map.paths),
             )
             self._known.keep(found, ssh_map.dstate_at)
-            self._task.watch.use_reserve()
 
     def _with_unknown_views(self, ssh_map: SSHMap) -> SSHMap:
         """Give each dstate of a map its view in the original trace, see `_with_all_views`."""

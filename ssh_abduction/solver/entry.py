@@ -197,7 +197,6 @@ def find_backbone(
     for ssh_map in minimal:
         sharing.absorb(ssh_map)
     watch = Watch(time_limit, memory_limit)
-    watch.use_reserve()
     watch.start()
     cost, proven = solution.costs[0].preferred_by(solution.theory), False
     with suppress(LimitError, KeyboardInterrupt), heeding(watch.check):

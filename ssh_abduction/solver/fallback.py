@@ -10,7 +10,6 @@ from dataclasses import replace
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import each_looking, heeding
-from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.map_list import Priced, note
@@ -26,30 +25,20 @@ INTERRUPTED = 0.6
 # If a stopped search has no map, it looks for a clash in stretches of this many steps, for at most
 # CLASHING seconds. A short stretch takes a few hundredths of a second.
 STRETCHES, CLASHING = (2, 3, 4, 6, 8, 12), 0.3
-_log = log_of(__name__)
 
 
-def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
+def fall_back(parts: Parts, answer: Answer) -> None:
     """Make some map of the whole trace if none is known, and prove a bound from distinct steps.
 
     If the search was not stopped, or has proven its minimum, do nothing. The map, the bound and the
-    status go to `parts.known`. `may_search` says whether clingo may look for a map in the reserved
-    last part of the time limit.
+    status go to `parts.known`.
     """
     known = parts.known
     if not known.stopped or known.status is Status.OPTIMAL:
         return
-    may_salvage = (
-        may_search
-        and known.best is None
-        and known.stopped == "time limit"
-        and parts.watch.has_reserve
-    )
     parts.watch.start()  # what is done after the limit counts, too
     with suppress(KeyboardInterrupt):
         parts.candidates.sketch(overtime(parts))
-    if may_salvage:
-        salvage(parts)
     answer.count_apart()
     if known.best is not None and known.status is Status.UNKNOWN:
         known.status = Status.FEASIBLE
@@ -106,27 +95,6 @@ def late_clash(
     if clash is not None:
         known.status, known.complete, known.stopped = Status.UNSATISFIABLE, True, None
     return clash
-
-
-def salvage(parts: Parts) -> None:
-    """Use the reserved last part of the time limit to find any map of the whole trace by clingo."""
-    _log.info("looking for any map in the last part of the time limit")
-    known, watch = parts.known, parts.watch
-    watch.use_reserve()
-    watch.start()
-    known.lower = None  # do not stop at this bound: no map of that cost was found
-    try:
-        with heeding(watch.check):
-            parts.prefixes.engine.grow(len(parts.task.trace))
-            found = parts.prefixes.minimise()
-            known.status = Status.OPTIMAL if found else Status.UNSATISFIABLE
-        if not found:
-            known.complete, known.stopped = True, None
-    except LimitError as limit:
-        known.stopped = limit.reason
-    except KeyboardInterrupt:
-        known.stopped = "interrupted"
-    parts.end_clingo()
 
 
 def best_map(parts: Parts) -> Iterator[Priced]:

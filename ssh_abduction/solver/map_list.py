@@ -18,6 +18,8 @@ from ssh_abduction.solver.values import Status
 # time so far if that is more. If clingo proves that there is none, the list is complete.
 ONE_MORE = 1.0
 ONE_MORE_SHARE = 0.1
+# This share of the time limit is kept for proving what all minimal maps share.
+PROVING = 0.2
 _log = log_of(__name__)
 
 Priced: TypeAlias = tuple[SSHMap, tuple[int, ...]]
@@ -33,7 +35,7 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
     known, watch, most = parts.known, parts.watch, parts.limits.most
     if known.status is Status.OPTIMAL:
         _log.info("minimal maps cost %s; they are listed", _cost_in_words(parts))
-        ends = watch.reserve_begins if keeps_time else math.inf
+        ends = (1 - PROVING) * (watch.elapsed() + watch.left()) if keeps_time else math.inf
         ends = ends if ends > watch.elapsed() else math.inf
         watch.stage_ends = ends
         for ssh_map, cost in found:

@@ -55,6 +55,7 @@ class Parts:
         self.watch.start(began)  # settling the theory compares pairs of steps, which may take long
         self.task = Task.of(problem, self.watch, speedups)
         self.known = Known(problem.theory)
+        self.watch.lacks_map = lambda: self.known.best is None
         self.judging = Judging(problem)
         self.rivals = Rivals(self.task, self.judging)
         self.candidates = Candidates(self.task, self.known, self.judging, self.report)
@@ -69,7 +70,6 @@ class Parts:
 
     def _engine_after(self, after: Parts) -> Engine:
         """Return the engine of an earlier search if it can take more steps, else a new engine."""
-        self.watch.use_reserve()
         before = after.prefixes.engine
         is_outgrown = isinstance(before, StepEngine) and may_name(self.task)
         # A search that was interrupted may have stopped while clingo grounded a step.

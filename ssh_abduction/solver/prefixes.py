@@ -49,7 +49,7 @@ from ssh_abduction.data.gateways import with_allowed_headings
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.facts import readable
-from ssh_abduction.solver.asp.limits import LAST, LimitError, StageTimeError
+from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.refusing import first_accepted
 from ssh_abduction.solver.engines.stepwise import StepEngine, paths_needed
@@ -102,8 +102,6 @@ class Prefixes:
         """Extend the prefix until a minimal map of it predicts all later steps, or none exists."""
         size, steps = min(len(self._task.trace), self.start), len(self._task.trace)
         while True:
-            if size == steps:
-                self._task.watch.use_reserve(LAST)  # it was reserved for the whole trace
             _log.debug("%s is given %d of %d steps", type(self.engine).__name__, size, steps)
             self.engine.grow(size)
             minimal = self.minimise()
@@ -177,7 +175,6 @@ class Prefixes:
                     self._known.keep(
                         replace(found, map=self._whole(found.map, replayed)), replayed.labels
                     )
-                    self._task.watch.use_reserve()
                 self._report()
                 if (
                     not self._at_once

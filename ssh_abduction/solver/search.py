@@ -300,7 +300,7 @@ class Search:
             raise
         finally:
             parts.end_clingo()
-        fall_back(parts, self._answer, may_search=not self._stages.mends)
+        fall_back(parts, self._answer)
         self.clash = self.clash or late_clash(
             parts, lambda trace, theory: self._solve_mended(trace, theory, 1, CLASHING)
         )
@@ -371,7 +371,6 @@ class Search:
     def _reason(self) -> None:
         """Prove what all minimal maps share, if not all of them are listed."""
         watch = self._parts.watch
-        watch.use_reserve()
         watch.start()
         spent = watch.elapsed()
         is_unlimited = watch.left() == math.inf
@@ -396,7 +395,6 @@ class Search:
         """
         watch = self._parts.watch
         if not watch.running:
-            watch.use_reserve()
             watch.start()
         try:
             watch.check()

@@ -26,7 +26,6 @@ class Stages:
     """Runs the stages in which one search finds the minimal cost.
 
     Attributes:
-        mends: Whether the search tried to mend the trace (guess its faults and correct them).
         mended_maps: Minimal maps that mending the trace found, and whether they are all; else None.
     """
 
@@ -35,7 +34,6 @@ class Stages:
 
         If `goes_on`, the search goes on from an earlier search for the first steps.
         """
-        self.mends = False
         self.mended_maps: tuple[tuple[SSHMap, ...], bool] | None = None
         self._parts, self._solve_mended, self._goes_on = parts, solve_mended, goes_on
 
@@ -56,10 +54,11 @@ class Stages:
         """
         parts, task = self._parts, self._parts.task
         engine, steps = parts.prefixes.engine, len(task.trace)
-        if row("mending").holds_for(task.theory) and may_name(task) and self._mend():
+        mends = row("mending").holds_for(task.theory) and may_name(task)
+        if mends and self._mend():
             return
-        self.mends |= bool(task.theory.changed)  # only the readable encodings have changed gateways
-        if self.mends and steps > choosing.READABLE:
+        # Only the readable encodings have changed gateways.
+        if (mends or task.theory.changed) and steps > choosing.READABLE:
             raise LimitError("no proof")
         if parts.known.status is Status.OPTIMAL:  # an earlier search proved a map minimal
             if not engine.size:
@@ -111,10 +110,8 @@ class Stages:
         from ssh_abduction.solver.mending import Mending  # loads numpy
 
         parts, known, most = self._parts, self._parts.known, self._parts.limits.most
-        self.mends = True
         _log.info("looking for maps with faults by mending the trace")
         mending = Mending(parts.task, self._solve_mended)
-        parts.watch.use_reserve()
         try:
             for found in mending.maps():
                 parts.candidates.offer(found.map)

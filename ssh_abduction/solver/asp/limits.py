@@ -11,12 +11,9 @@ from typing import Literal, TypeAlias
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
 
-# The search for minimal maps of prefixes ends when this share of the time limit is left. The rest
-# of the time is reserved for finding any map of the whole trace, minimal or not.
-RESERVE = 0.2
-# If a search of the whole trace has found no map, it ends when this share of the time limit is
-# left. The rest of the time is reserved for making a map without a search.
-LAST = 0.05
+# A search that has found no map of the whole trace ends when this share of the time limit is left.
+# The rest of the time is for making a map without a search.
+RESERVE = 0.1
 # Seconds between two checks of the clock and of Ctrl-C while clingo is busy. Limits may be exceeded
 # by a second, and a check takes far less time than this.
 POLL = 0.05
@@ -89,13 +86,14 @@ class Watch:
         self._on_tick, self._clock = on_tick, clock or now
         self._next_tick = TICK
         self._limit = limit
-        self._allowed = None if limit is None else limit * (1 - RESERVE)
         self._memory = memory
         self._started: float | None = None
         self._spent = 0.0
         # `check` raises StageTimeError once, when the clock shows more seconds than this.
         self.stage_ends = math.inf
         self.interrupted = False
+        # Whether the last part of the time limit is reserved for making a map without a search.
+        self.lacks_map: Callable[[], bool] = lambda: False
 
     def start(self, since: float | None = None) -> None:
         """Let the clock run, from `since` if it is given. If it runs already, do nothing."""
@@ -103,39 +101,23 @@ class Watch:
             self._started = self._clock() if since is None else since
 
     @property
-    def has_reserve(self) -> bool:
-        """Whether the last part of the time limit is still reserved for finding any map."""
-        return self._allowed is not None and self._allowed <= self.reserve_begins
-
-    @property
     def running(self) -> bool:
         """Whether the clock runs."""
         return self._started is not None
-
-    def use_reserve(self, last: float = 0.0) -> None:
-        """Allow the search to use the reserved time, too, but not the `last` share of the limit."""
-        if self._limit is not None and self._allowed is not None:
-            self._allowed = max(self._allowed, self._limit * (1 - last))
 
     def stop(self) -> None:
         """Stop the clock. `start` lets it go on."""
         self._spent, self._started = self.elapsed(), None
 
-    @property
-    def reserve_begins(self) -> float:
-        """The seconds after which only the reserved part of the time limit is left."""
-        return math.inf if self._limit is None else self._limit * (1 - RESERVE)
-
     def part(self, seconds: float, clock: Callable[[], float] | None = None) -> Watch:
         """Start a new watch whose limit is this many seconds. Limits of this watch also end it."""
         part = Watch(seconds, self._memory, self.check, clock)
-        part.use_reserve()
         part.start()
         return part
 
     def shorten(self, seconds: float) -> None:
-        """Lower the time limit to this many seconds since the start, without a reserve."""
-        self._limit = self._allowed = seconds if self._limit is None else min(seconds, self._limit)
+        """Lower the time limit to this many seconds since the start."""
+        self._limit = seconds if self._limit is None else min(seconds, self._limit)
 
     def elapsed(self) -> float:
         """Return the seconds on the clock."""
@@ -175,7 +157,8 @@ class Watch:
 
     def allows(self, seconds: float) -> bool:
         """Whether there is time for work that takes this many seconds and cannot be interrupted."""
-        return self._allowed is None or self.elapsed() + seconds <= self._allowed
+        reserved = RESERVE * self._limit if self._limit and self.lacks_map() else 0.0
+        return seconds + reserved <= self.left()
 
     def memory_left(self) -> float | None:
         """Return the MiB that are left until the memory limit; None for no limit."""

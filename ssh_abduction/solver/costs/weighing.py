@@ -159,7 +159,6 @@ class Weighing:
         parts, self._of_labels = self._parts, of_labels
         parts.known.status = Status.UNKNOWN  # what was proven is about counts
         self._improved = parts.watch.elapsed()
-        parts.watch.use_reserve()
         if parts.known.best is not None:
             self.add(parts.known.best)
         self._least = {"places": least_places(parts.task.problem)}
