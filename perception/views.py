@@ -315,7 +315,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         if self.n_init > MOST_STARTS:
             raise PerceptionError(
                 f"n_init: expected at most {MOST_STARTS} starts, got {brief(self.n_init)}; a "
-                "few dozen are many"
+                "few dozen are enough"
             )
         # scikit-learn takes seeds of 32 bits.
         if self.random_state is not None and not isinstance(

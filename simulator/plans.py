@@ -154,8 +154,8 @@ class Plan:
     def courses(self) -> dict[Leg, tuple[int, int]]:
         """The path and direction of a robot that leaves a room through a door.
 
-        It is a dict. The key is the index of the room and that of the door. The value is the index
-        of the path in `paths`, and 1 if the robot goes along the path or -1 if it goes against it.
+        The result is a dict. A key has the indices of the room and of the door. A value has the
+        index of the path in `paths`, and 1 if the robot goes along the path or -1 if against it.
         """
         return {
             leg: (number, direction)

@@ -55,7 +55,7 @@ LARGEST = 64 * 2**20
 
 
 def checked_segments(name: str, value: object) -> Array:
-    """Return a value if it is an array of segments, (n, 4), finite and not empty.
+    """Return a value if it is an array of segments, of shape (n, 4), finite and not empty.
 
     Raises SimulatorError, which names the value.
     """

@@ -208,7 +208,7 @@ def _add_line(
 
 
 def _end(cell: NDArray[np.int64], distance: Array) -> Node:
-    """The node at the end of a line. It is cut if its disc reaches the border of the map."""
+    """Make the node at the end of a line. It counts as cut if its disc reaches the map's border."""
     rows, columns = distance.shape
     row, column = int(cell[0]), int(cell[1])
     border = min(row, column, rows - 1 - row, columns - 1 - column)

@@ -61,7 +61,7 @@ def add_parser(verbs: Verbs) -> None:
         "recogniser that train wrote for this map, to use images instead of views",
     )
     said = {
-        "misread": "at a step, the view or the star (the gateways seen) does not fit the dstate "
+        "misread": "at a step, the view or image does not fit the dstate "
         "where the robot is (default: 0.01)",
         "slipped": "an action fails, or the robot is kidnapped during it (default: 0.01)",
         "unmapped": "the robot is outside the map at the start, after a slip, or after an action "

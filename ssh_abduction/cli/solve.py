@@ -177,7 +177,7 @@ def run(options: argparse.Namespace) -> int:
         return batch.run(options)
     if options.joint_trace is not None and not options.together:
         raise AbductionError(
-            "joint_trace: expected --together, got one trace; add it, or leave it out"
+            "joint_trace: expected --together, got one trace; add it, or leave joint_trace out"
         )
     trace = _joint(options.traces) if options.together else Trace.load(options.traces[0])
     if options.joint_trace is not None:

@@ -295,7 +295,7 @@ class _Drawing:
     def _course(self, s: DState, whole: bool) -> tuple[Course, float]:
         """The course of a dstate, and the angle from the course to the dstate in radians, 0 or pi.
 
-        A course is drawn straight. It is a `whole` path, or a part of one.
+        A course is drawn straight: the whole path if `whole` is True, otherwise a part of it.
         """
         if s.path is None:
             return (-1 - s.id,), 0.0

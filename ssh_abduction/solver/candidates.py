@@ -131,7 +131,10 @@ class Candidates:
         yield from filter(self._judging.accepts, map(self._with_unknown_views, joining.maps()))
 
     def go_on(self, beam: Beam) -> None:
-        """Extend the maps of a beam to the end, the longest first, until one is a better map."""
+        """Extend the partial maps of a beam to the whole trace, until one is better than the best map.
+
+        The longest map comes first.
+        """
         before = self._known.best
         for first in beam.partial():
             done = self._task.trace.prefix(len(first.dstate_at))

@@ -50,8 +50,8 @@ class Displacement(Evidence):
         joint: The most returns that are tested together: 1 or 2.
         returns: How many returns may be true.
         has_places: Whether maps have places.
-        turns_stay: Whether no steps of two visits are at one place if their first steps are not,
-            because turns stay at their place.
+        turns_stay: Whether turns stay at their place. Then two visits are at one place only if
+            their first steps are.
         has_one_view: Whether a dstate has only one view.
         may_be_wrong: Whether a map may treat displacements as wrong.
         known: The tested returns of the last few traces, for reuse.
