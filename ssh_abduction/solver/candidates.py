@@ -131,9 +131,9 @@ class Candidates:
         yield from filter(self._judging.accepts, map(self._with_unknown_views, joining.maps()))
 
     def go_on(self, beam: Beam) -> None:
-        """Extend the partial maps of a beam to the whole trace, until one is better than the best map.
+        """Extend the partial maps of a beam to the whole trace, the longest first.
 
-        The longest map comes first.
+        Stop when one is better than the best map so far.
         """
         before = self._known.best
         for first in beam.partial():
