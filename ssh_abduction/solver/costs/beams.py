@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.candidates import SKETCH_SHARE
+from ssh_abduction.solver.costs.merging_places import with_merged_places
+from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.solution.weighed import EQUAL
@@ -53,14 +55,18 @@ class Beams:
     """
 
     def __init__(
-        self, parts: Parts, add: Callable[[SSHMap], float], keep_best: Callable[[], None]
+        self,
+        parts: Parts,
+        misfit: Misfit,
+        add: Callable[[SSHMap], float],
+        keep_best: Callable[[], None],
     ) -> None:
         """Prepare the beam searches.
 
-        `add` computes the cost of a map in nats, and keeps the map if the cost is small.
+        `misfit` computes the cost of a map in nats, and `add` keeps the map if it is small.
         `keep_best` makes the cheapest known map the best map of the search.
         """
-        self._parts, self._add, self._keep_best = parts, add, keep_best
+        self._parts, self._misfit, self._add, self._keep_best = parts, misfit, add, keep_best
         # The cost of the best map of a broad beam, and the estimate of it by this beam.
         self._best = math.inf, math.inf
         self.broken = -math.inf
@@ -153,13 +159,18 @@ class Beams:
     def _ends(self, beam: Beam, width: int) -> bool:
         """Keep the maps that a beam ends with. Return whether it ended in time."""
         try:
-            nats = [self._add(ssh_map) for ssh_map in self._parts.candidates.maps_of(beam)]
+            found = {self._add(one): one for one in self._parts.candidates.maps_of(beam)}
         except StageTimeError:
             return False
         self._ended = width
         if width >= BROAD:
+            with suppress(StageTimeError):
+                if found:
+                    best, accepts = found[min(found)], self._parts.judging.accepts
+                    merged = with_merged_places(best, self._misfit, accepts)
+                    found[self._add(merged)] = merged
             estimate = beam.best.nats if beam.best else math.inf
-            self._best = min(self._best, (min(nats, default=math.inf), estimate))
+            self._best = min(self._best, (min(found, default=math.inf), estimate))
             # A beam without axioms would be the same if the checker refused nothing.
             self.broken = -math.inf if beam.refuses else 0.0
         return True

@@ -131,7 +131,7 @@ class Weighing:
         self.bound = 0.0
         self.proven = False
         self._of_labels: OfLabels | None = None
-        self._beams = Beams(parts, self.add, self.keep_best)
+        self._beams = Beams(parts, self._misfit, self.add, self.keep_best)
         # For each number of groups of drives that share dstates, the cheapest map.
         self._of_groups: dict[int, Candidate] = {}
         self._improved = 0.0  # the seconds on the clock when the best map was found
