@@ -160,9 +160,11 @@ class Scene:
         nothing was observed there.
         """
         size = len(self.codes)
-        offset = self.shift / CELL + (size // 2 + 0.5)
+        middle = size // 2 + 0.5
         rows, columns = (
-            np.clip((points[..., k, :] / CELL + offset[k]).astype(np.int32), 0, size - 1)
+            np.clip(
+                ((points[..., k, :] + self.shift[k]) / CELL + middle).astype(np.int32), 0, size - 1
+            )
             for k in (0, 1)
         )
         return np.asarray(rows * size + columns)
