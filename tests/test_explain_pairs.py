@@ -320,7 +320,7 @@ def test_known_maps_that_break_the_theory_are_ignored() -> None:
     assert known[0].dstate_at[0] == known[0].dstate_at[8]
     search = Search(SQUARE, theory, time_limit=1e-9, _start=Start(known=known))
     assert all(ssh_map.dstate_at[0] != ssh_map.dstate_at[8] for ssh_map in search)
-    with pytest.raises(MapError, match="maps are of another trace"):
+    with pytest.raises(MapError, match="one for each step of the trace, got"):
         explain_pair(SQUARE.prefix(9), 0, 8, known=known)
 
 

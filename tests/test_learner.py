@@ -684,7 +684,7 @@ def test_errors_of_learning_verbs_are_one_line(
         (["cluster", str(one), "-o", str(tmp_path / "x")], "minimum of 2 is required"),
         (
             ["train", str(tmp_path / "maps.json"), str(trace), "-o", str(tmp_path / "x")],
-            "expected labels for the 2 steps",
+            "labels: expected 2, one for each step of the trace",
         ),
         (["recognise", str(tmp_path / "cut.skops"), str(trace)], "expected a .skops file"),
         (["reproduce", "taylor-hall", "--seeds", "x"], "--seeds: expected numbers"),

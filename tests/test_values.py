@@ -476,7 +476,7 @@ def test_solution_of_another_trace_is_refused(tmp_path: Path) -> None:
     aces.solution().save(tmp_path / "maps.json")
     with pytest.raises(
         MapError,
-        match="expected 400, one for each step of the trace, got 23; the maps are of another trace",
+        match="expected 400, one for each step of the trace, got 23; solve this trace",
     ):
         Solution.load(tmp_path / "maps.json", RECTANGLE)
     other = ACES.with_views(["hall", *ACES.views[1:]])  # type: ignore[list-item]

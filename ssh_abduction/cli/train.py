@@ -22,7 +22,7 @@ from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named, said_of
 from ssh_abduction.data.map_file import read_json
-from ssh_abduction.data.maps import SSHMap, maps_of
+from ssh_abduction.data.maps import SSHMap, check_labels, maps_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import attributes_of
 
@@ -119,13 +119,10 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
         bool(data.get("complete", True)) if isinstance(data, dict) else True,
         data.get("status", "optimal") == "optimal" if isinstance(data, dict) else True,
     )
-    if len(labels) != len(trace):
-        raise MapError(
-            f"{options.maps}: expected labels for the {len(trace)} steps of {options.trace}, got "
-            f"{len(labels)}; solve this trace"
-        )
+    chosen = maps[(options.map or 1) - 1]
+    check_labels(chosen, trace, named(options.maps))
     sure = labels >= 0
-    return images_of(trace)[sure], labels[sure], maps[(options.map or 1) - 1], features_of(trace)
+    return images_of(trace)[sure], labels[sure], chosen, features_of(trace)
 
 
 def run_train(options: argparse.Namespace) -> int:

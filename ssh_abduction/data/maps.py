@@ -52,6 +52,7 @@ __all__ = [
     "Name",
     "Pose",
     "SSHMap",
+    "check_labels",
     "check_of_trace",
     "checked_map",
     "checked_maps",
@@ -411,6 +412,15 @@ def maps_of(data: Any, where: str) -> list[SSHMap]:
     return [SSHMap.from_dict(data, where)]
 
 
+def check_labels(ssh_map: SSHMap, trace: Trace, where: str) -> None:
+    """Raise MapError unless a map, named `where`, has a label for each step of a trace."""
+    if len(ssh_map.dstate_at) != len(trace):
+        raise MapError(
+            f"{where}: labels: expected {len(trace)}, one for each step of the trace, got "
+            f"{len(ssh_map.dstate_at)}; solve this trace"
+        )
+
+
 def check_of_trace(maps: Iterable[SSHMap], trace: Trace, where: str, *, views: bool = True) -> None:
     """Raise MapError if the dstate of a step has another view than the step.
 
@@ -418,11 +428,7 @@ def check_of_trace(maps: Iterable[SSHMap], trace: Trace, where: str, *, views: b
     as some theories let a dstate have several. `where` is the source of the maps.
     """
     for i, ssh_map in enumerate(maps):
-        if len(ssh_map.dstate_at) != len(trace):
-            raise MapError(
-                f"{where}: maps[{i}].labels: expected {len(trace)}, one for each step of the "
-                f"trace, got {len(ssh_map.dstate_at)}; the maps are of another trace"
-            )
+        check_labels(ssh_map, trace, f"{where}: maps[{i}]")
         misread = {fault.step for fault in ssh_map.faults}
         for t, (step, label) in enumerate(zip(trace.steps, ssh_map.dstate_at, strict=True)):
             seen, there = step.view, ssh_map.dstates[label].view

@@ -35,7 +35,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
-from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
+from ssh_abduction.data.maps import SSHMap, check_labels, checked_map, checked_maps
 from ssh_abduction.data.trace import Trace, View, checked_trace
 from ssh_abduction.data.words import counted
 
@@ -263,11 +263,7 @@ def map_of_trace(ssh_map: object, where: str, trace: Trace) -> SSHMap:
     Raises MapError, which names the map `where`.
     """
     ssh_map = checked_map(ssh_map, where)
-    if len(ssh_map.dstate_at) != len(trace):
-        raise MapError(
-            f"{where}: labels: expected {len(trace)}, one for each step of the trace, "
-            f"got {len(ssh_map.dstate_at)}; solve this trace"
-        )
+    check_labels(ssh_map, trace, where)
     if strange := set(ssh_map.dstate_at) - set(range(len(ssh_map.dstates))):
         raise MapError(
             f"{where}: labels: expected 0 to {len(ssh_map.dstates) - 1}, the dstates of the map, "

@@ -65,7 +65,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.errors import LocaliserError, MapError, TraceError, brief, named
-from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.maps import SSHMap, check_labels, checked_map
 from ssh_abduction.data.trace import Action, Step, Trace, View, checked_trace
 from ssh_abduction.online.belief import AKIN, NOVEL, TINY, Belief, Observation
 from ssh_abduction.online.chances import Chances
@@ -109,11 +109,8 @@ class Localiser:
         chances, mend = Chances() if chances is None else chances, "make Chances(misread=…)"
         self.chances = an_instance("chances", chances, Chances, LocaliserError, mend=mend)
         self._number = len(ssh_map.dstates)
-        if trace is not None and len(checked_trace(trace)) != len(ssh_map.dstate_at):
-            raise MapError(
-                f"map: labels: expected {len(trace)}, one for each step of the trace, got "
-                f"{len(ssh_map.dstate_at)}; take the trace that the map was found for"
-            )
+        if trace is not None:
+            check_labels(ssh_map, checked_trace(trace), "map")
         self._shown = view_ratios(ssh_map, trace)
         self._moves = Moves(ssh_map, trace)
         # The results of `_alike` for views, as the same views occur again and again.

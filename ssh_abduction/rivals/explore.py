@@ -52,7 +52,7 @@ import numpy as np
 
 from ssh_abduction.data.checks import a_flag, a_function, a_list, an_instance
 from ssh_abduction.data.errors import MapError, brief
-from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.maps import SSHMap, check_labels, checked_map
 from ssh_abduction.data.trace import Action, Trace, checked_trace
 from ssh_abduction.rivals.consequences import Consequence, Consequences, is_possible
 from ssh_abduction.rivals.experiment import (
@@ -397,11 +397,7 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
             )
         if trace is None:
             continue
-        if len(labels) != len(trace):
-            raise MapError(
-                f"maps[{i}]: labels: expected {len(trace)}, one for each step of the trace, "
-                f"got {len(labels)}; solve this trace"
-            )
+        check_labels(ssh_map, trace, f"maps[{i}]")
         # an ignored view or action may differ from the map
         wrong = {(fault.step, fault.kind) for fault in ssh_map.faults}
         links = set(ssh_map.links)
