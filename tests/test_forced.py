@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 from unittest.mock import patch
@@ -26,6 +26,7 @@ from ssh_abduction.theory.settle import settle
 EQUAL = 1e-6
 ROUGH = {**truth.NOISE, "along": 0.3, "across": 0.1, "heading": 0.02, "scale": 0.05, "bend": 0.0035}
 FINE = {**truth.NOISE, "scale": 0.05, "bend": 0.0035}
+STRAIGHT = {**ROUGH, "bend": 0.0}
 THEORIES = {
     "frames": Theory.topological(),
     "joint": Theory.topological(),
@@ -57,9 +58,9 @@ def without_forcing() -> Iterator[None]:
         yield
 
 
-def case_of(kind: str, seed: int) -> Case:
+def case_of(kind: str, seed: int, noises: Sequence[dict[str, float]] = (ROUGH, FINE)) -> Case:
     draw = random.Random(seed)
-    noise = truth.Noise(Odometry(**draw.choice([ROUGH, FINE])))
+    noise = truth.Noise(Odometry(**draw.choice(noises)))
     if kind == "joint":
         (known,) = together.of_mazes(3, draw.randint(3, 6), [seed], noise, 2)
     else:

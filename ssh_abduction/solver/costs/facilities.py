@@ -60,7 +60,7 @@ class Facilities:
     def shares(self, most: Array) -> Array:
         """Compute the shares of the points, (n,). The share of each is at most its `most`, (n,)."""
         starts, kinds = self._starts()
-        program = _Program(self.price, most)
+        program = Program(self.price, most)
         for _ in range(RETRIES):
             shares = self._approximate(program, starts, kinds)
             saved, found, of_kind = self._most_saved(shares)
@@ -75,14 +75,14 @@ class Facilities:
         Also return what each point pays for each of its coordinates in the cheapest clustering, (n,
         d). This clustering may use fractions of clusters.
         """
-        program, pays = _Program(self.price, np.full(len(self.points), self.price)), 0 * self.points
+        program, pays = Program(self.price, np.full(len(self.points), self.price)), 0 * self.points
         shares = self._approximate(program, *self._starts())
         for members, centre, part in program.clustering():
             off = self.offsets(centre[None])[0, members]
             pays[members] += part * off**2 / 2 / self.variances[members]
         return shares, pays
 
-    def _approximate(self, program: _Program, starts: Array, kinds: NDArray[np.int_]) -> Array:
+    def _approximate(self, program: Program, starts: Array, kinds: NDArray[np.int_]) -> Array:
         """Compute shares that hold for all facilities that a search from some starts finds."""
         best = np.zeros(len(self.points))
         for _ in range(ROUNDS):
@@ -176,7 +176,7 @@ class Facilities:
         return most, np.concatenate(found), np.array(kinds, dtype=int)
 
 
-class _Program:
+class Program:
     """The linear program whose variables are the shares. It has one constraint for each cluster."""
 
     def __init__(self, price: float, most: Array) -> None:

@@ -33,7 +33,8 @@ from scipy.sparse.csgraph import connected_components
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.steps.apart import apart_matrix, clique, grown_clique
+from ssh_abduction.solver.costs.repeats import shares_of
+from ssh_abduction.solver.steps.apart import apart_classes, apart_matrix, clique, grown_clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
@@ -172,7 +173,7 @@ class _Cliques:
     """A clique in each part of the graph `apart`. Nodes of different parts are always apart."""
 
     def __init__(self, apart: Flags) -> None:
-        self._apart, self._random = apart, np.random.default_rng(0)
+        self.apart, self._random = apart, np.random.default_rng(0)
         self.part: Ints = connected_components(csr_array(~apart), directed=False)[1]
         self._members = [np.flatnonzero(self.part == p) for p in range(self.part.max() + 1)]
         self._cliques = [
@@ -180,9 +181,13 @@ class _Cliques:
         ]
         self.size = sum(map(len, self._cliques))
 
+    def size_of(self, node: int) -> int:
+        """Return the size of the clique in the part of a node."""
+        return len(self._cliques[self.part[node]])
+
     def size_with(self, pairs: Sequence[tuple[int, int]]) -> int:
         """Return the size of a clique of the whole graph if some more pairs are apart, too."""
-        apart, larger = self._apart, dict[int, Ints]()
+        apart, larger = self.apart, dict[int, Ints]()
         if not pairs:
             return self.size
         first, second = np.array(pairs).T
@@ -208,7 +213,7 @@ class _Joined:
     """
 
     def __init__(self, visits: Visits, of: Ints) -> None:
-        self._apart = _of_classes(visits.apart, of)
+        self._apart = apart_classes(visits.apart, of)
         self._turns = len(self._apart)
         self._links = np.unique(np.column_stack([of[:-1], visits.links, of[1:]]), axis=0)
         self._close()
@@ -222,13 +227,15 @@ class _Joined:
             self._into[b, action, arrives].append((a, out))
             if (action, arrives) not in self._ways[b]:
                 self._ways[b].append((action, arrives))
-        nodes = np.unique(np.column_stack([of[visits.visit], visits.direction]), axis=0)
+        nodes, self._node_of = np.unique(
+            np.column_stack([of[visits.visit], visits.direction]), axis=0, return_inverse=True
+        )
         a, x = nodes.T
         self._node = {(a, x): node for node, (a, x) in enumerate(nodes.tolist())}
         apart = self._apart[(x - x[:, None]) % self._turns, a[:, None], a]
         self._dstates = _Cliques(apart | (a[:, None] == a) & (x[:, None] != x))
         self._has_frames = visits.away is None
-        apart = self._apart if visits.away is None else _of_classes(visits.away[None], of)
+        apart = self._apart if visits.away is None else apart_classes(visits.away[None], of)
         self._places = _Cliques(np.logical_and.reduce(apart))
 
     @property
@@ -246,6 +253,18 @@ class _Joined:
                 then = self._apart[(arrives - arrives[:, None]) % self._turns, b[:, None], b]
                 e, f = np.nonzero(then)
                 self._apart[(out[f] - out[e]) % self._turns, a[e], a[f]] = True
+
+    def apart_steps(self) -> Flags:
+        """Flag the pairs of steps that are at different dstates."""
+        return self._dstates.apart[np.ix_(self._node_of, self._node_of)]
+
+    def dstates_of(self, steps: Ints) -> int:
+        """Return the least number of dstates of a part of the steps. Other steps are apart."""
+        return self._dstates.size_of(self._node_of[steps[0]])
+
+    def places_of(self, classes: Ints) -> int:
+        """Return the least number of places of some classes."""
+        return _Cliques(self._places.apart[np.ix_(classes, classes)]).size
 
     def may_join(self, a: int, b: int) -> bool:
         """Whether two classes may be at one place as in the map."""
@@ -337,13 +356,12 @@ class Forcing:
         """The returns that every cheap map is proven to have."""
         return self.visits.returns(self.joins)
 
-    def bounds(self, most: float) -> Iterator[float]:
-        """Yield rising lower bounds, at most `most`, on the cost of all maps.
+    def bounds(self, most: float, low: float = 0.0) -> Iterator[float]:
+        """Yield rising lower bounds, above `low` and at most `most`, on the cost of all maps.
 
         This leaves `joins` as it is. First try `most` itself. Branching takes much longer, so the
         first bounds do without.
         """
-        low = 0.0
         for branches, top in ((0, 2 * most), (1, most)):
             high = top
             while low < most and high - low > NEARLY * most:
@@ -361,20 +379,47 @@ class Forcing:
         self._laying = self._least_laying(most)
         self._forced(self.visits, self.joins, most, {}, 1)
 
+    def repeated(self, problem: Problem, labels: Sequence[int]) -> Iterator[float]:
+        """Yield rising lower bounds on the cost of every map with these joins (`repeats.py`).
+
+        `labels` has the dstate of each step in a known map.
+        """
+        classes = _Joined(self.visits, self.joins)
+        if classes.fails:
+            return
+        (dstate, place), (dstates, places) = self._prices, classes.counts
+        # Groups of drives that share no place have places of their own.
+        units = self._units()
+        least = min(classes.places_of(np.unique(self.joins[units == one])) for one in {*units})
+        low = (
+            dstates * dstate
+            + self._misfit.of_returns([]) / 2
+            + min(
+                max(groups * least, places) * place + (len({*units}) - groups) * self._overlap.price
+                for groups in range(1, len({*units}) + 1)
+            )
+        )
+        visit, apart = self._misfit.visit, classes.apart_steps()
+        for some, shares in shares_of(problem.trace, visit, apart, np.array(labels), dstate):
+            low += max(float(shares.sum()) - dstate * classes.dstates_of(some), 0.0)
+            yield low
+
+    def _units(self) -> Ints:
+        """Return the group of drives of each visit. Closures tie the drives of a group."""
+        first = np.unique(self.visits.visit, return_index=True)[1]
+        return np.array(self._overlap.unit_of_step)[first]
+
     def _least_laying(self, most: float) -> float:
         """Return what every map of a cost below `most` pays for drives that share places.
 
         If a map in which a drive shares no place with the others costs `most` or more, the drive
         shares one in each cheap map. Drives that closures tie count as one drive.
         """
-        unit = np.array(self._overlap.unit_of_step)[
-            np.unique(self.visits.visit, return_index=True)[1]
-        ]
-        units, laid = np.unique(unit), 0
+        units, laid = self._units(), 0
         base = self._misfit.of_returns(self.returns) / 2
-        for one in units if len(units) > 1 else ():
+        for one in {*units} if len({*units}) > 1 else ():
             look_at_clock()
-            classes = _Joined(self.visits.cut(unit == one), self.joins)
+            classes = _Joined(self.visits.cut(units == one), self.joins)
             laid += classes.fails or self._price(classes.counts) + base >= most
         # There are most groups of drives if those that must be laid on others form pairs.
         return self._overlap.price * (laid - laid // 2)
@@ -451,12 +496,3 @@ class Forcing:
                 ranked = sorted(worth.items(), key=lambda found: -found[1])
                 return joins, low, [(pair, price + misfit) for pair, price in ranked]
             joins = visits.joined(joins, forced)
-
-
-def _of_classes(apart: Flags, of: Ints) -> Flags:
-    """Flag two classes as apart if a member of one is apart from a member of the other."""
-    order = np.argsort(of, kind="stable")
-    starts = np.flatnonzero(np.diff(of[order], prepend=-1))
-    rows = np.logical_or.reduceat(apart[:, order][:, :, order], starts, axis=1)
-    found: Flags = np.logical_or.reduceat(rows, starts, axis=2)
-    return found

@@ -41,6 +41,7 @@ from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.choosing import READABLE, labelling_engine
+from ssh_abduction.solver.costs import repeats
 from ssh_abduction.solver.costs.beams import Beams
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
@@ -204,9 +205,8 @@ class Weighing:
         forcing = Forcing(task.problem, task.log, self._misfit, best.map, least)
         seconds = min(FORCING * self._parts.watch.left(), PATIENCE)
         with suppress(LimitError), heeding(Watch().part(seconds).check):
-            forcing.force(self._most)
-            for bound in forcing.bounds(best.nats) if forcing.low < best.nats - EQUAL else ():
-                self.bound = max(self.bound, bound)
+            for bound in self._bounds(forcing, best):
+                self.bound = max(self.bound, min(bound, best.nats))
         self.bound = max(self.bound, min(forcing.low, best.nats))
         returns = forcing.returns
         self._base = max(self._base, self._misfit.of_returns(returns) / 2)
@@ -217,6 +217,15 @@ class Weighing:
         return replace(
             Task.of(task.problem.changed(theory=theory), task.watch), speedups=task.speedups
         )
+
+    def _bounds(self, forcing: Forcing, best: Candidate) -> Iterator[float]:
+        """Yield lower bounds on the cost of all maps. Find joins that all cheap maps have."""
+        problem = self._parts.task.problem
+        if repeats.has_independent_errors(problem):
+            yield from forcing.repeated(problem, best.map.dstate_at)
+        forcing.force(self._most)
+        if forcing.low < best.nats - EQUAL:
+            yield from forcing.bounds(best.nats, self.bound)
 
     def keep_best(self) -> None:
         """Compute the cost of the search's best map. Make the cheapest known map the best one."""

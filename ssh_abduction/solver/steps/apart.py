@@ -258,3 +258,15 @@ def grown_clique(apart: Matrix, kept: list[int], random: np.random.Generator) ->
         degree -= inner[free[~stay]].sum(axis=0)
         free = free[stay]
     return found
+
+
+def apart_classes(apart: NDArray[np.bool_], of: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Flag two classes as apart if a member of one is apart from a member of the other.
+
+    `apart` flags pairs of members for several turns, (turns, n, n). `of` has their classes, (n,).
+    """
+    order = np.argsort(of, kind="stable")
+    starts = np.flatnonzero(np.diff(of[order], prepend=-1))
+    rows = np.logical_or.reduceat(apart[:, order][:, :, order], starts, axis=1)
+    found: NDArray[np.bool_] = np.logical_or.reduceat(rows, starts, axis=2)
+    return found
