@@ -376,7 +376,7 @@ def _halves(images: Floats, members: Integers) -> Iterator[Integers]:
 
 
 def _two_sweeps(images: Floats) -> float:
-    """A lower bound of the largest distance: from the image that is farthest from the centre."""
+    """A lower bound on the largest distance: the one from the image farthest from the centre."""
     start = images[_squares(images - images.mean(axis=0)).argmax()]
     return math.sqrt(_squares(images - start).max())
 

@@ -32,7 +32,7 @@ Kind: TypeAlias = type[AbductionError]
 
 @contextmanager
 def needed(what: str, package: str, install: str, error: Kind = AbductionError) -> Iterator[None]:
-    """Raise `error`, with what to install for the use `what`, if the block imports in vain."""
+    """Make a context in which a failed import raises `error`, which says what to install."""
     try:
         yield
     except ImportError:
