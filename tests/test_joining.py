@@ -16,11 +16,14 @@ from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import Closure, Odometry, Step, together
 from ssh_abduction.data.star import Gateway, Star
+from ssh_abduction.solver.costs import beams
 from ssh_abduction.solver.costs.estimating import doubt_of
 from ssh_abduction.solver.costs.misfit import Misfit
+from ssh_abduction.solver.costs.weighing import Weighing
 from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.search import Search
+from ssh_abduction.solver.solution.weighed import groups_of_drives
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import theory
 from ssh_abduction.theory.settle import Problem, settle
@@ -148,7 +151,7 @@ def test_drives_without_common_views_are_not_joined() -> None:
     tuesday = Trace.from_steps("xyz", ["travel"] * 2, displacements=[(5.0, 0.0, 0.0)] * 2)
     with pytest.warns(UserWarning, match="no view in common"):
         joint = together([monday, tuesday])
-    (apart,) = joined(settle(joint, Theory()))
+    *_, apart = joined(settle(joint, Theory()))
     assert [len(piece) for piece in apart.pieces] == [3, 3]
 
 
@@ -200,8 +203,10 @@ def test_map_that_keeps_drives_apart_is_not_sure_if_they_may_share_a_dstate() ->
 def test_drives_with_one_common_view_are_joined_only_by_a_closure() -> None:
     """One place may look like another by chance. A closure between them says that they are one."""
     joint = along("abcda", "ax")
-    (apart,) = joined(settle(joint, Theory()))
-    assert len(apart.pieces) == 2
+    problem = settle(joint, Theory())
+    rival, apart = joined(problem)
+    assert (len(rival.pieces), len(apart.pieces)) == (1, 2)
+    assert Misfit(problem).nats_of(rival) > Misfit(problem).nats_of(apart)
     found = solve(joint, time_limit=100).maps[0]
     assert len(found.pieces) == 2
     exact = ((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 1e-4))
@@ -210,10 +215,28 @@ def test_drives_with_one_common_view_are_joined_only_by_a_closure() -> None:
     assert found.dstate_at == (*range(5), 4, 5)
 
 
+@pytest.mark.parametrize("seed", [312, 313])
+def test_joined_map_has_a_probability_without_a_broad_beam(seed: int) -> None:
+    (known,) = of_mazes(3, 20, [seed], NOISE, drives=2)
+    weighing = Weighing(Search(known.trace)._parts)
+    with patch.object(beams, "WIDTHS", {1: 0.7}):
+        weighing.guess(lambda: False)
+    weighed = weighing.weighed()
+    assert weighed is not None
+    assert weighed.searched
+    assert weighed.broken == 0
+    groups = {groups_of_drives(rival.places, weighed.drives) for rival in weighed.rivals}
+    assert groups == {1, 2}
+    assert 0 < weighed.confidence < 1
+
+
 @pytest.mark.slow
 def test_search_joins_six_drives() -> None:
     (known,) = of_mazes(4, 60, [315], NOISE, drives=6)
-    *_, ssh_map = Search(known.trace)._parts.candidates.joined()
+    candidates = Search(known.trace)._parts.candidates
+    joining = candidates.joining()
+    assert joining is not None
+    *_, ssh_map = candidates.maps_of(joining)
     assert truth.is_true(ssh_map, known)
 
 

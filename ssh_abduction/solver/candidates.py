@@ -30,6 +30,7 @@ from ssh_abduction.theory.speedups import Speedups, row
 
 if TYPE_CHECKING:
     from ssh_abduction.solver.guesses.beam import Beam
+    from ssh_abduction.solver.guesses.joint_maps import Joining
 
 _log = log_of(__name__)
 
@@ -93,9 +94,9 @@ class Candidates:
             self._beams[width] = Beam(self._task.problem, self._task.log, width)
         return self._beams[width]
 
-    def maps_of(self, beam: Beam) -> Iterator[SSHMap]:
-        """Yield the maps that a beam finds and the checker accepts, the best one first."""
-        yield from filter(self._judging.accepts, map(self._with_unknown_views, beam.maps()))
+    def maps_of(self, search: Beam | Joining) -> Iterator[SSHMap]:
+        """Yield the maps that a search finds and the checker accepts, in its order."""
+        yield from filter(self._judging.accepts, map(self._with_unknown_views, search.maps()))
 
     def map_without(self, wrong: Collection[int], most: float = math.inf) -> SSHMap | None:
         """Find a map by a narrow beam if only the displacements to `wrong` steps are wrong.
@@ -116,19 +117,18 @@ class Candidates:
                 return whole
         return None
 
-    def joined(self) -> Iterator[SSHMap]:
-        """Yield maps that join the maps of single drives, if the checker accepts them.
+    def joining(self) -> Joining | None:
+        """Return a search that joins the maps of single drives.
 
-        Without displacements, or if lifts or faults within a drive are allowed, there are none.
+        None without displacements, or if lifts or faults within a drive are allowed.
         """
         theory = self._task.theory
         trusts_drives = not (theory.lifts or theory.replace(changed=0.0).has_faults)
         if self.beam(1) is None or not theory.several_drives or not trusts_drives:
-            return
+            return None
         from ssh_abduction.solver.guesses.joint_maps import Joining  # loads numpy
 
-        joining = Joining(self._task.problem, self._task.log)
-        yield from filter(self._judging.accepts, map(self._with_unknown_views, joining.maps()))
+        return Joining(self._task.problem, self._task.log)
 
     def go_on(self, beam: Beam) -> None:
         """Extend the partial maps of a beam to the whole trace, the longest first.

@@ -76,6 +76,7 @@ class Beams:
     def found(self, nats: float) -> bool:
         """Whether a broad beam ended with a map of this cost, and `broken` is known.
 
+        Joining the maps of drives, which broad beams find, counts as a broad beam.
         If displacements may be wrong, this is False: after a wrong one the pose is unknown, so the
         beam often drops the map of least cost.
         """
@@ -107,11 +108,11 @@ class Beams:
         several = theory.several_drives or theory.lifts
         shares = {w: min(end, JUMPED) if theory.jumped else end for w, end in WIDTHS.items()}
         widths = [width for width in WIDTHS if width <= BROAD or not several]
-        if several:
+        if several and (joining := parts.candidates.joining()) is not None:
             watch.stage_ends = time.end(JOINING)
             with suppress(StageTimeError):
-                for ssh_map in parts.candidates.joined():
-                    self._add(ssh_map)
+                nats = min(map(self._add, parts.candidates.maps_of(joining)), default=math.inf)
+                self._take(nats, -math.inf, joining.broken)
             self._keep_best()
             parts.report()
         for width in widths:
@@ -169,8 +170,13 @@ class Beams:
                     best, accepts = found[min(found)], self._parts.judging.accepts
                     merged = with_merged_places(best, self._misfit, accepts)
                     found[self._add(merged)] = merged
-            estimate = beam.best.nats if beam.best else math.inf
-            self._best = min(self._best, (min(found, default=math.inf), estimate))
             # A beam without axioms would be the same if the checker refused nothing.
-            self.broken = -math.inf if beam.refuses else 0.0
+            broken = -math.inf if beam.refuses else 0.0
+            estimate = beam.best.nats if beam.best else math.inf
+            self._take(min(found, default=math.inf), estimate, broken)
         return True
+
+    def _take(self, nats: float, estimate: float, broken: float) -> None:
+        """Keep what a broad beam, or joining the maps of drives, says about its best map."""
+        if (nats, estimate) <= self._best:
+            self._best, self.broken = (nats, estimate), broken

@@ -77,19 +77,25 @@ STARTS = 3
 
 
 class Joining:
-    """Joins the maps of the drives of one trace."""
+    """Joins the maps of the drives of one trace.
+
+    Attributes:
+        broken: How many nats the drives cost less if each is mapped alone, without axioms.
+    """
 
     def __init__(self, problem: Problem, log: Log) -> None:
         """Prepare the search. `maps` runs it."""
+        self.broken = 0.0
         self._problem, self._log = problem, log
         self._bare = problem.theory.replace(displacement="none", weigh="count")
         self.sights = Sights(problem.trace, self._bare, log, misreads=False)
 
     def maps(self, standing: Sequence[Part] = ()) -> Iterator[SSHMap]:
-        """Yield a map in which no drives are joined, and one in which they are.
+        """Yield a map in which no drives are joined, and last the cheapest map found.
 
-        The caller has to check them. If `standing` is not empty, it has the pieces of a map of the
-        first drives that must be kept.
+        If the cheapest map has pieces, also yield the cheapest map in which two of them are joined.
+        The caller has to check all maps. If `standing` is not empty, it has the pieces of a map of
+        the first drives that must be kept.
         """
         first = sum(len(part.labels) for part in standing)
         drives = [drive for drive in drives_of(self._problem.trace) if drive.first >= first]
@@ -97,7 +103,6 @@ class Joining:
         alone = [*standing, *(part for part in parts if part is not None)]
         if None in parts:
             return
-        yield from self._beside(alone)
         anchors = {
             (first, second): self._anchors(first, second)
             for first, second in combinations(alone, 2)
@@ -107,14 +112,22 @@ class Joining:
         joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
         best = min(joined, key=lambda parts: sum(map(self._nats, parts)), default=alone)
         if len(best) < len(alone):
-            yield from self._beside(best)
+            yield from self._beside(alone)
+        dearer = []
+        for pair in combinations(best, 2):
+            ways = [] if pair[1] in standing else self._anchors(*pair)
+            if (both := self._joined(*pair, ways, math.inf)) is not None:
+                dearer.append([*(part for part in best if part not in pair), both])
+        if dearer:
+            yield from self._beside(min(dearer, key=lambda parts: sum(map(self._nats, parts))))
+        yield from self._beside(best)
 
     def _all_joined(self, parts: list[Part], anchors: _Anchors, start: _Pair) -> list[Part]:
         """Join maps: first the pair `start`, then pairs with the best anchor (way to lay them)."""
         pair = start
         while anchors:
             ways = anchors.pop(pair)
-            if (joined := self._joined(*pair, ways)) is not None:
+            if (joined := self._joined(*pair, ways, sum(map(self._nats, pair)))) is not None:
                 parts = [part for part in parts if part not in pair]
                 anchors = {two: ways for two, ways in anchors.items() if not {*two} & {*pair}}
                 anchors |= {(joined, part): self._anchors(joined, part) for part in parts}
@@ -139,6 +152,8 @@ class Joining:
         beam = Beam(problem, Log(trace, theory, problem.pairs), ALONE)
         if next(beam.maps(), None) is None or beam.best is None:
             return None
+        if beam.refuses:
+            self.broken += beam.best.nats - beam.nats_without_axioms()
         return Part.of(beam.best, drive.first, self._log, self.sights)
 
     def _anchors(self, first: Part, second: Part) -> list[_Anchor]:
@@ -204,10 +219,14 @@ class Joining:
         least = 1 if same.sum() == 1 else 2
         return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
 
-    def _joined(self, first: Part, second: Part, ways: Sequence[_Anchor]) -> Part | None:
-        """Join two maps in the cheapest way that breaks no axiom; None if no join is cheaper."""
+    def _joined(
+        self, first: Part, second: Part, ways: Sequence[_Anchor], most: float
+    ) -> Part | None:
+        """Join two maps in the cheapest way that breaks no axiom and costs less than `most` nats.
+
+        None if there is no such way.
+        """
         found: list[Part] = []
-        most = self._nats(first) + self._nats(second)
         overlay = Overlay(first, second, self._problem, self.sights)
         for way in ways:
             look_at_clock()

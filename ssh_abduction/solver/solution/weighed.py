@@ -69,7 +69,9 @@ class Weighed:
         rivals: The maps that cost little more than the best one, the best one first. Estimated
             maps come last.
         searched: Whether a broad beam of hypotheses ended with the best map, and its misfit is not
-            improbable. Such a map is seldom false, even if it is not proven to be the best.
+            improbable. For several drives it is enough that broad beams mapped each drive, and that
+            the best map is the cheapest way to join their maps. Such a map is seldom false, even if
+            it is not proven to be the best.
         broken: How many nats the best map that breaks axioms costs less than the best map; 0 if it
             does not cost less, -inf if no such map was sought.
         excess: The misfit of the best map, divided by the misfit that the standard deviations
