@@ -14,10 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories
 from test_together import joint_traces
+from truth import NOISE, Noise, random_walk
 
 from ssh_abduction import Solution, SSHMap, Theory, Trace, check, solve
 from ssh_abduction.cli import main
-from ssh_abduction.data import Corrections
+from ssh_abduction.data import Corrections, Odometry
 from ssh_abduction.data.drives import starts_of, together
 from ssh_abduction.data.errors import SolverError, TraceError
 from ssh_abduction.solver import Status, choosing
@@ -220,3 +221,18 @@ def test_onto_counts_the_time_of_all_searches() -> None:
     with patch.object(Watch, "elapsed", lambda watch: 7.0):
         added = solve(Trace.from_steps("ab", ["travel"], name="tuesday"), onto=solution)
     assert added.seconds.total == 7.0
+
+
+def test_onto_gives_a_long_drive_with_displacements_a_probability() -> None:
+    """The drive is laid on the map without a search of all steps."""
+    noise = Noise(Odometry(**NOISE))
+    walks = [random_walk(3, 45, 33, noise, drive).trace for drive in (0, 1)]
+    standing = solve(walks[0], max_maps=1, time_limit=5)
+    solution = solve(walks[1], onto=standing, max_maps=1)
+    assert solution.stopped == "no proof"
+    assert solution.weighed is not None
+    assert solution.weighed.searched
+    assert 0.5 < solution.confidence < 1
+    assert len(solution.weighed.rivals) > 1
+    old = standing.maps[0].dstate_at
+    assert all(rival.dstates[: len(old)] == old for rival in solution.weighed.rivals)

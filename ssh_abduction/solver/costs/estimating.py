@@ -34,24 +34,32 @@ CostOf: TypeAlias = Callable[[Sequence[int], Sequence[int]], float]
 # Leave out rivals that cost CERTAIN nats more than the best map. Even a million of them together
 # have a probability of only 0.005.
 CERTAIN = 19.0
+# Estimating rivals takes at most this many seconds.
+ESTIMATING = 0.5
 
 
-def rivals_of(problem: Problem, misfit: Misfit, best: SSHMap, seconds: float) -> Iterator[Rival]:
+def rivals_of(
+    problem: Problem, misfit: Misfit, best: SSHMap, seconds: float, kept_steps: int = 0
+) -> Iterator[Rival]:
     """Yield estimated rivals that cost little more than the best map, each once.
 
-    `seconds` is the time that this may take. `estimated` says what the rivals are. Drives that
-    closures connect to others do not overlap by chance. They stay connected.
+    `seconds` is the time that this may take. The first `kept_steps` steps keep their dstates and
+    places. `estimated` says what the rivals are. Drives that closures connect to others do not
+    overlap by chance. They stay connected.
     """
     dstate, place, _ = problem.theory.prices
+    rival = rival_of(best, misfit.nats_of(best))
+    kept_labels = rival.dstates[:kept_steps], rival.places[:kept_steps]
     kept = nats_of(replace(Cost.of(best), dstates=0, places=0), problem.theory)
     drives = drives_of(problem.trace)
     free = [drive for i, drive in enumerate(drives) if not problem.overlap.is_tied(i)]
 
     def cost_of(dstates: Sequence[int], places: Sequence[int]) -> float:
+        if (dstates[:kept_steps], places[:kept_steps]) != kept_labels:
+            return math.inf
         nats: float = kept + misfit.nats_of_course(dstates, places or dstates, jumped(best))
         return nats + dstate * len(set(dstates)) + place * len(set(places))
 
-    rival = rival_of(best, misfit.nats_of(best))
     return estimated(rival, misfit.visit, free, cost_of, seconds)
 
 

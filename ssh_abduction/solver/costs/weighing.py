@@ -45,6 +45,7 @@ from ssh_abduction.solver.costs import repeats
 from ssh_abduction.solver.costs.beams import Beams
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
+    ESTIMATING,
     Course,
     doubt_of,
     dstates_and_places,
@@ -66,9 +67,11 @@ from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.solution.weighed import (
     CHANCE,
     EQUAL,
+    IMPROBABLE,
     Rival,
     Weighed,
     groups_of_drives,
+    may_join_more,
 )
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Status
@@ -85,8 +88,6 @@ _log = log_of(__name__)
 WITHIN = math.log(100)
 # Keep at most this many maps. If there are more, use fewer nats instead of WITHIN.
 RIVALS = 50
-# A misfit is improbable if the true map has a larger one with less than this probability.
-IMPROBABLE = 0.01
 # If the robot may be off the poses of its dstates, by errors with heavy tails, a misfit may be this
 # many times as large as expected. Then standard deviations are 1.5 times too small.
 EXCESS = 2.25
@@ -94,8 +95,8 @@ EXCESS = 2.25
 PATIENCE, MORE = 10.0, 5.0
 # Finding joins that all cheap maps have takes at most this share of the time, and PATIENCE seconds.
 FORCING = 0.4
-# Estimating rivals may end OVERTIME seconds late. It gets LEAST_ESTIMATING to ESTIMATING seconds.
-OVERTIME, LEAST_ESTIMATING, ESTIMATING = 0.7, 0.1, 0.5
+# Estimating rivals may end OVERTIME seconds late. It gets at least LEAST_ESTIMATING seconds.
+OVERTIME, LEAST_ESTIMATING = 0.7, 0.1
 
 # Lists the minimal maps of a trace and a theory within some seconds, and says whether they are
 # proven.
@@ -373,15 +374,17 @@ class Weighing:
             rival = rival_of(candidate.map, candidate.nats)
             rivals.setdefault((rival.dstates, rival.places), rival)
         found, excess = list(rivals.values()), self._excess()
+        drives = drives_of(self._parts.task.trace)
+        is_likely = excess < math.inf and not may_join_more(found, drives)
         return Weighed(
             bound=self.bound,
             within=self._within if self.proven else 0.0,
             rivals=(*found, *self._estimated(found[0], set(rivals))),
-            searched=self._beams.found(self.candidates[0].nats) and excess < math.inf,
+            searched=is_likely and self._beams.found(self.candidates[0].nats),
             broken=self._beams.broken,
             excess=excess if excess < math.inf else 1.0,
             doubt=doubt_of(self._parts.task.problem, self.candidates[0].map),
-            drives=drives_of(self._parts.task.trace),
+            drives=drives,
         )
 
     def _excess(self) -> float:

@@ -10,13 +10,13 @@ import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from ssh_abduction.data.drives import drives_of, starts_of, together
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.costs.estimating import doubt_of, rival_of
+from ssh_abduction.solver.costs.estimating import ESTIMATING, doubt_of, rival_of, rivals_of
 from ssh_abduction.solver.drives.digest import Digest
 from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning
 from ssh_abduction.solver.guesses.completing import completed
@@ -24,11 +24,14 @@ from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.regions import Deriving
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
-from ssh_abduction.solver.solution.weighed import Weighed
+from ssh_abduction.solver.solution.weighed import IMPROBABLE, Weighed, may_join_more
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Bound, Cost, Effort, Seconds, Status, nats_of
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
+
+if TYPE_CHECKING:
+    from ssh_abduction.solver.guesses.existing import ExistingMap
 
 
 def can_lay(theory: Theory) -> bool:
@@ -47,9 +50,12 @@ def laid(
     they are pieces of their own. None if neither satisfies the axioms. The displacements of the
     first `since` steps are known to agree with the map.
     """
+    from ssh_abduction.solver.costs.misfit import Misfit  # loads numpy
+    from ssh_abduction.solver.guesses.existing import ExistingMap
+
     joint, theory = problem.trace, problem.theory
-    ranking, judging = Ranking(joint), Judging(problem)
-    fitted = map(ranking.fitted, _joint_maps(old, ssh_map, trace, problem))
+    ranking, judging, existing = Ranking(joint), Judging(problem), ExistingMap(old, ssh_map)
+    fitted = map(ranking.fitted, _joint_maps(existing, old, ssh_map, trace, problem))
     found = sorted(fitted, key=lambda m: _nats(m, problem))
     while found and not judging.accepts_grown(found[0], since):
         del found[0]
@@ -58,12 +64,15 @@ def laid(
     best = Deriving(joint, theory).mapped(found[0])
     kept = (ssh_map if ssh_map.fit else Ranking(old).fitted(ssh_map)).fit
     assert kept is not None
+    assert best.fit is not None
+    known = [rival_of(m, _nats(m, problem)) for m in found]
+    moved = rivals_of(problem, Misfit(problem), best, ESTIMATING, len(old))
     weighed = Weighed(
         bound=nats_of(replace(Cost.of(ssh_map), paths=0), theory) + kept.chi2 / 2,
         within=0.0,
-        rivals=tuple(
-            replace(rival_of(m, _nats(m, problem)), estimated=i > 0) for i, m in enumerate(found)
-        ),
+        rivals=(known[0], *(replace(rival, estimated=True) for rival in known[1:]), *moved),
+        searched=best.fit.p >= IMPROBABLE and not may_join_more(known, drives_of(joint)),
+        broken=existing.broken,
         doubt=doubt_of(problem, best),
         drives=drives_of(joint),
     )
@@ -113,11 +122,11 @@ def _nats(ssh_map: SSHMap, problem: Problem) -> float:
     return nats + ssh_map.fit.chi2 / 2
 
 
-def _joint_maps(old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem) -> Iterator[SSHMap]:
+def _joint_maps(
+    existing: ExistingMap, old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem
+) -> Iterator[SSHMap]:
     """Yield joint maps that keep the map of the old drives. The caller has to check them."""
-    from ssh_abduction.solver.guesses.existing import ExistingMap  # loads numpy
-
-    existing, digest = ExistingMap(old, ssh_map), Digest.of(old, ssh_map, short=True)
+    digest = Digest.of(old, ssh_map, short=True)
     short = existing.with_displacements(digest.trace, digest.labels)
     with warnings.catch_warnings():  # ignore that a digest may equal the new drives
         warnings.simplefilter("ignore")

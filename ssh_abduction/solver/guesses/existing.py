@@ -28,10 +28,16 @@ from ssh_abduction.theory.settle import Problem
 
 
 class ExistingMap:
-    """The map of old drives, with the poses of its dstates and places."""
+    """The map of old drives, with the poses of its dstates and places.
+
+    Attributes:
+        broken: How many nats the new drives cost less if each is mapped alone, without axioms. It
+            is known after `maps`.
+    """
 
     def __init__(self, old: Trace, ssh_map: SSHMap) -> None:
         """Fit the poses to the old drives and their map."""
+        self.broken = 0.0
         with threadpool_limits(1, user_api="blas"):
             self._piece, self._mean, self._covariance = Poses.of_map(old, ssh_map).gaussian()
         self._places = numbered(-1 - s.id if s.place is None else s.place for s in ssh_map.dstates)
@@ -60,6 +66,7 @@ class ExistingMap:
         joining = Joining(problem, log)
         pieces = dict.fromkeys(self._piece)
         yield from joining.maps([self._part(i, labels, log, joining.sights) for i in pieces])
+        self.broken = joining.broken
 
     def _part(self, piece: int, labels: Sequence[int], log: Log, sights: Sights) -> Part:
         """Make the `Part` for a piece of the map. Its cost is 0, as the map must be kept."""

@@ -30,6 +30,8 @@ DOUBTED = 0.05
 # Drives look alike by chance more often than costs say. So the gain from laying drives on each
 # other is divided by this before it becomes a probability (docs/measurements/truth.md).
 CHANCE = 10.0
+# A misfit is improbable if the true map has a larger one with less than this probability.
+IMPROBABLE = 0.01
 MOST = 700.0  # exp of more nats overflows
 
 
@@ -70,8 +72,8 @@ class Weighed:
             maps come last.
         searched: Whether a broad beam of hypotheses ended with the best map, and its misfit is not
             improbable. For several drives it is enough that broad beams mapped each drive, and that
-            the best map is the cheapest way to join their maps. Such a map is seldom false, even if
-            it is not proven to be the best.
+            the best map is the cheapest way to join their maps. If it keeps drives apart, a rival
+            must join them. Such a map is seldom false, even if it is not proven to be the best.
         broken: How many nats the best map that breaks axioms costs less than the best map; 0 if it
             does not cost less, -inf if no such map was sought.
         excess: The misfit of the best map, divided by the misfit that the standard deviations
@@ -293,6 +295,12 @@ def probability_in_words(probability: float) -> str:
     if probability < 0.005:
         return "below 0.01"
     return "above 0.99" if probability >= 0.995 else f"{probability:.2f}"
+
+
+def may_join_more(rivals: Sequence[Rival], drives: Sequence[Drive]) -> bool:
+    """Whether the first rival keeps drives apart, and no other one joins more of them."""
+    groups = [groups_of_drives(rival.places or rival.dstates, drives) for rival in rivals]
+    return groups[0] > 1 and groups[0] == min(groups)
 
 
 def groups_of_drives(at: Sequence[int], drives: Sequence[Drive]) -> int:
