@@ -30,8 +30,6 @@ from bench import machine, packages, run, store
 from suite import BARE, INSTANCES
 from table import OURS, WITHOUT
 
-from ssh_abduction.theory.speedups import REMOVED, SPEEDUPS
-
 ROOT = Path(__file__).parent.parent
 GAIN = 1.5  # A speed-up stays if the ratio without to with it is at least this
 STAYING = 2  # on this many families of instances.
@@ -63,11 +61,9 @@ class Trial:
     clock: str = "cpu"
 
 
-QUICK_MAZE, MAZE, CORRIDORS, MACHINE, MACHINE_16 = (
+QUICK_MAZE, CORRIDORS, MACHINE_16 = (
     "maze 3x3 n=1600",
-    "maze 4x4 n=1600",
     "maze 5x5 n=1600, corridors followed",
-    "moore 20/2 n=800",
     "moore 16/2 n=1600",
 )
 BLOCK, SMALL_BLOCK, LARGE_BLOCK = (
@@ -75,9 +71,8 @@ BLOCK, SMALL_BLOCK, LARGE_BLOCK = (
     "full circuits 5x3, 50 rounds",
     "full circuits 6x4, 20 rounds",
 )
-STARS, STAR_CORRIDORS, FEW_SEEN, TAYLOR = (
+STARS, FEW_SEEN, TAYLOR = (
     "full maze 4x4 n=800",
-    "full maze 5x5 n=600, corridors followed",
     "full maze 8x8 n=150",
     "full taylor-hall",
 )
@@ -97,11 +92,6 @@ def _ended(switch: str, *families: str, limit: float = LIMIT, clock: str = "cpu"
 
 
 TRIALS = (
-    *_timed("small_cores", STARS, STAR_CORRIDORS, FEW_SEEN, "full maze 10x10 n=200", limit=LONGER),
-    *_timed("one_by_one", MAZE, CORRIDORS, MACHINE, BARE.name, *LONG[:2], limit=LONGER),
-    *_timed("from_below", SMALL_BLOCK, LARGE_BLOCK, PATTERNS, BARE_CORRIDORS, limit=LONGER),
-    *_timed("watched", MAZE, CORRIDORS, MACHINE, STAR_CORRIDORS, *LONG, limit=LONGER),
-    *_timed("apart", MAZE, CORRIDORS, MACHINE, BLOCK, MACHINE_16, LONG[2], BARE.name, limit=LONGER),
     *_timed("following", *LONG, limit=LONGER),
     *_ended("following", "maze 6x6 n=10000", "maze 5x5 n=10000", limit=LONGER),
     *_ended("following", "maze 8x8 n=10000", limit=2 * LONGER),
@@ -132,13 +122,8 @@ TRIALS = (
     *_timed("annealed", "full maze 5x5 n=1600", limit=LONGER),
     *_timed("greedy", QUICK_MAZE),
     *_ended("greedy", "maze 6x6 n=10000", "full maze 10x10 n=4000", limit=SHORT),
-    *_timed("threads", QUICK_MAZE, FEW_SEEN, MACHINE, clock="wall"),
-    *_timed("threads", "full maze 10x10 n=200", "full maze 5x5 n=1600", CORRIDORS, limit=LONGER),
 )
-# The speed-ups that can be measured. Removed ones keep their trials above, for the stored results.
-SWITCHES = tuple(
-    dict.fromkeys(trial.switch for trial in TRIALS if trial.switch in (*SPEEDUPS, "following"))
-)
+SWITCHES = tuple(dict.fromkeys(trial.switch for trial in TRIALS))  # what can be measured
 
 
 def ratio(measure: str, limit: float, base: dict[str, Any], without: dict[str, Any]) -> float:
@@ -192,15 +177,13 @@ def verdict(of_switch: Collection[list[float]]) -> str:
 
 
 def table(results: dict[str, Any]) -> str:
-    """Make a table in Markdown, with a row for each speed-up that the program still has."""
+    """Make a table in Markdown, with a row for each speed-up."""
     rows = [
         "| speed-up | families with a gain: median ratio (least to most) | other families: "
         "medians | verdict |",
         "| -- | -- | -- | -- |",
     ]
     for switch, trials in ratios(results).items():
-        if switch in REMOVED:
-            continue
         gains, others = [], []
         for trial, found in trials.items():
             median = statistics.median(found)
