@@ -22,6 +22,7 @@ from simulator.world import World
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.data.trace import Trace
 
 Scans = Sequence[Scan]
 
@@ -258,3 +259,19 @@ def test_warning_names_missing_scans(scans: Scans, missing: int) -> None:
     notes = notes_of([*scans[:100], *scans[100 + missing : 160 + missing]])
     assert ("The odometry alone connects the parts" in notes) == (missing > 0)
     assert ("before scan 100 " in notes) == (missing > 0)
+
+
+@pytest.mark.parametrize("most", [3, 20])
+def test_long_logs_have_a_limited_number_of_views(
+    most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sixty images look like five rooms."""
+    monkeypatch.setattr(importing, "MOST_VIEWS", most)
+    rng = np.random.default_rng(0)
+    rooms = rng.uniform(0.5, 5, (5, 30))
+    images = [rooms[i % 5] + rng.normal(0, 0.01, 30) for i in range(60)]
+    trace = Trace.from_steps(views=[None] * 60, actions=["travel"] * 59)
+    steps = zip(trace.steps, images, strict=True)
+    trace = replace(trace, steps=tuple(replace(step, image=image) for step, image in steps))
+    found = len(set(importing.with_views(trace).views))
+    assert found == 5 if most > 5 else found <= most

@@ -53,8 +53,9 @@ from ssh_abduction.runtime.loggers import log_of
 _log = log_of("ssh_abduction.perception.places")
 
 # Each view is seen at least this many times on average. With few images of many places, most views
-# would otherwise be seen once and would carry no information.
-SEEN = 12
+# would otherwise be seen once and would carry no information. At most MOST_VIEWS are tried, so that
+# the time grows no faster than the log.
+SEEN, MOST_VIEWS = 12, 20
 # Largest share of scans before which a track may be broken.
 MOST_BREAKS = 0.1
 # Standard deviations of the error of a closure, in metres and radians (docs/measurements/logs.md).
@@ -292,7 +293,7 @@ def with_views(trace: Trace) -> Trace:
     images = ReciprocalTransformer(floor=0.3).fit_transform(
         np.array([step.image for step in trace.steps])
     )
-    most = max(2, len(images) // SEEN)
+    most = min(max(2, len(images) // SEEN), MOST_VIEWS)
     if len(images) <= most or (images == images[0]).all():
         views, sure = np.zeros(len(images), int), np.ones(len(images))
     else:
