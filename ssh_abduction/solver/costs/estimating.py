@@ -68,12 +68,14 @@ def doubt_of(problem: Problem, best: SSHMap) -> str | None:
 
     Two places cannot be at one position. If two drives have such places, they overlap by chance.
     """
-    if not problem.overlap.near:
+    overlap = problem.overlap
+    if not overlap.near or not overlap.of_map(best):
         return None
-    from ssh_abduction.solver.geometry.ranking import Ranking  # loads numpy
+    from ssh_abduction.solver.geometry.fit import Poses  # loads scipy
 
-    fitted = best if best.fit else Ranking(problem.trace).fitted(best)
-    for *steps, _ in problem.overlap.crowded_in(fitted):
+    places = [dstate.place for dstate in best.dstates]
+    at = Poses.of_map(problem.trace, best).placed()[1].tolist()
+    for *steps, _ in overlap.crowded(dict(enumerate(best.dstate_at)), places, at):
         names = (step_name(drives_of(problem.trace), step) for step in steps)
         return f"{' and '.join(names)} are at one position, but at two places"
     return None
