@@ -13,21 +13,33 @@ has many such blocks. With many dstates only long blocks need a fault, but the d
 much.
 
 A block needs a fault if it would otherwise contain a clique of more than N steps. A clique is a set
-of steps that are pairwise different dstates (`steps/apart.py`).
+of steps that are pairwise different dstates (`steps/apart.py`). Several faults of the known map
+may be too close for a block each. Then clingo is asked whether a block around all of them has a
+cheaper map with at most N dstates.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from ssh_abduction.solver.asp.control import Asker, new_control
+from ssh_abduction.solver.asp.facts import faulty_lp
+from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.steps.apart import Continuations
+from ssh_abduction.theory.evidence import Pairs
 
+# A block for clingo extends beyond its faults by up to this many steps for each dstate of the map.
+MARGIN = 3
 # A block may be one step longer than the shortest one, and one more step longer for each COARSE
 # dstates that it has beyond those of the known map.
 COARSE = 5
+# Ask clingo only about blocks up to this length, with at most this many names for dstates.
+MOST_STEPS = 200
+MOST_NAMES = 80
+CONFLICTS = 20_000  # give up a question to clingo after this many conflicts
 
 
 @dataclass
@@ -50,12 +62,14 @@ class Blocks:
     faults: Mapping[str, Sequence[int]]
     dstates: int
     watch: Watch
+    # For each block (begin, end) that clingo refuted: limits on dstates, and on the cost of faults
+    # in tenths, within which the block has no map.
+    _proven: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
 
     @property
     def cost(self) -> int:
         """The cost of the known map, in tenths of dstates."""
-        faults = ((kind, t) for kind, found in self.faults.items() for t in found)
-        return 10 * self.dstates + sum(self.price[kind][t] for kind, t in faults)
+        return 10 * self.dstates + self._known_cost(0, len(self.seen))
 
     def bound(self) -> int:
         """Return a lower bound on the cost of all maps, in tenths; at most the known map's cost."""
@@ -90,9 +104,14 @@ class Blocks:
             if end is None:
                 return total
             reach = end - following
-            total += min(
-                min(price[begin : end - (kind == "slipped")]) for kind, price in self.price.items()
-            )
+            if most >= self.dstates and (wider := self._wider(begin, end, places, most)):
+                end, least = wider
+            else:
+                least = min(
+                    min(price[begin : end - (kind == "slipped")])
+                    for kind, price in self.price.items()
+                )
+            total += least
             begin = end
         return total
 
@@ -129,3 +148,84 @@ class Blocks:
             and len(Continuations(self.seen[begin:end], self.actions[begin : end - 1]).clique())
             > most
         )
+
+    def _wider(
+        self, begin: int, end: int, places: Sequence[int], most: int
+    ) -> tuple[int, int] | None:
+        """Widen a block to include the next faults of the known map, if they are close together.
+
+        Returns the end of the wider block and the cost of these faults in tenths; None if there are
+        no such faults, or no proof that this cost is the least.
+        """
+        first = behind = bisect_left(places, begin)
+        while behind < len(places) and places[behind] < max(
+            end, places[behind - 1] + most + 1 if behind > first else 0
+        ):
+            behind += 1
+        if behind - first < 2:
+            return None
+        after = places[behind] if behind < len(places) else len(self.seen)
+        end = max(
+            end, min((places[behind - 1] + after + 1) // 2, places[behind - 1] + MARGIN * most)
+        )
+        begin = max(begin, places[first] - MARGIN * most)
+        known = self._known_cost(begin, end)
+        if (
+            end - begin > MOST_STEPS
+            or most * len(set(self.seen[begin:end])) > MOST_NAMES
+            or not self._refuted(begin, end, most, known - 1)
+        ):
+            return None
+        return end, known
+
+    def _refuted(self, begin: int, end: int, most: int, tenths: int) -> bool:
+        """Whether clingo proves that a block has no map within two limits.
+
+        The limits are `most` dstates, and faults that cost `tenths`.
+        """
+        proven = self._proven.get((begin, end))
+        if proven is None or proven[0] < most or proven[1] < tenths:
+            seen, actions = self.seen[begin:end], self.actions[begin : end - 1]
+            price = {kind: found[begin:end] for kind, found in self.price.items()}
+            full = {
+                t + near - begin
+                for found in self.faults.values()
+                for t in found
+                for near in (-1, 0, 1)
+            }
+            batch = faulty_lp.faulty_batch(
+                0, seen, actions, range(len(seen)), (), Pairs(), price, full
+            )
+            base = faulty_lp.faulty_base(
+                actions, dict.fromkeys(sorted(set(seen)), most), self.price
+            )
+            limits = faulty_lp.dstates_and_faults_up_to(most, tenths)
+            asker = Asker(self.watch)
+            asker.control = new_control(
+                "faulty", "\n".join([base, batch, limits]), check=self.watch.check
+            )
+            asker.control.ground([("more", number_symbols(0))])
+            if not _has_no_answer(asker):
+                return False
+            self._proven[begin, end] = most, tenths
+        return True
+
+    def _known_cost(self, begin: int, end: int) -> int:
+        """Add up the cost of the known map's faults in a block, in tenths of dstates."""
+        last = {"misread": end, "slipped": end - 1}
+        return sum(
+            sum(
+                self.price[kind][t]
+                for t in found[bisect_left(found, begin) : bisect_right(found, last[kind] - 1)]
+            )
+            for kind, found in self.faults.items()
+        )
+
+
+def _has_no_answer(asker: Asker) -> bool:
+    """Whether clingo proves within CONFLICTS conflicts that a control has no answer."""
+    answers = asker.answers(lambda _: True, "ignore", 1, conflicts=CONFLICTS)
+    try:
+        return not next(answers)
+    except StopIteration as end:
+        return bool(end.value)

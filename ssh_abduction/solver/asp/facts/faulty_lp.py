@@ -41,6 +41,17 @@ def at_most_faults(most: int) -> str:
     return f":- #count {{ T,misread : misreads(T); T,slipped : slips(T) }} > {most}."
 
 
+def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
+    """Return rules that limit the number of dstates, and the cost of all faults in tenths."""
+    faults = (
+        "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
+    )
+    return (
+        f"#program more(b).\n:- #sum {{ {faults} }} > {tenths}.\n"
+        f":- #count {{ S : used(S) }} > {dstates}."
+    )
+
+
 def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
     """Return the facts for the names of each view, the actions and the allowed kinds of faults."""
     found = [f"action({action})." for action in sorted(set(actions))]
