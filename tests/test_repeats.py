@@ -54,7 +54,7 @@ def test_shares_bound_all_clusterings_into_cliques_from_below(n: int, seed: int)
     weights = draw.choice([1.0, 2.0, 0.0], (n, 3)) * [1, 1, 100]
     moves = RepeatedMoves(draw.choice([-1, 0, 1], n), moved, weights)
     weights[moves.kind < 0] = 0.0
-    shares = SharedPart(moves, together, PRICE).shares(np.arange(n))
+    shares = SharedPart(moves, together, PRICE).shares(np.arange(n), 40)
     least = least_by_trying(moves, together)
     assert 0.6 * least <= shares.sum() <= least + EQUAL
 

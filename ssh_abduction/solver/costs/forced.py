@@ -400,9 +400,11 @@ class Forcing:
             )
         )
         visit, apart = self._misfit.visit, classes.apart_steps()
+        gains = defaultdict[int, float](float)  # by the first step of a part
         for some, shares in shares_of(problem.trace, visit, apart, np.array(labels), dstate):
-            low += max(float(shares.sum()) - dstate * classes.dstates_of(some), 0.0)
-            yield low
+            gain = float(shares.sum()) - dstate * classes.dstates_of(some)
+            gains[int(some[0])] = max(gain, gains[int(some[0])])
+            yield low + sum(gains.values())
 
     def _units(self) -> Ints:
         """Return the group of drives of each visit. Closures tie the drives of a group."""

@@ -44,9 +44,10 @@ Flags = NDArray[np.bool_]
 # A part of the graph has at most CLIQUES maximal cliques. While it has more, drop the share DROPPED
 # of its steps.
 CLIQUES, DROPPED = 250, 0.04
-# The shares of a part are improved at most ROUNDS times, until they could grow by the share ENOUGH.
+# The shares of a part are improved at most so many times in each pass over all parts, until they
+# could grow by the share ENOUGH.
 # They are tried this share INWARD of the way from shares that hold to shares that may not.
-ROUNDS, ENOUGH, INWARD = 40, 0.01, 0.3
+ROUNDS, ENOUGH, INWARD = (10, 40), 0.01, 0.3
 # Each clique is searched from the best STARTS means of each action, in STEPS steps.
 STARTS, STEPS = 3, 8
 # Boxes of means are halved until what may be saved is known to TOLERANCE nats. For an action, at
@@ -208,8 +209,11 @@ class SharedPart:
         kinds = [np.flatnonzero(moves.kind == kind) for kind in np.unique(moves.kind)]
         self._kinds = [(some, moves.only(some).compared()) for some in kinds]
 
-    def shares(self, labels: Ints) -> Array:
-        """Compute shares of the steps, (n,). `labels` are their dstates in a known map."""
+    def shares(self, labels: Ints, rounds: int) -> Array:
+        """Compute shares of the steps, (n,), in at most so many rounds.
+
+        `labels` are their dstates in a known map.
+        """
         in_some = self.cliques.any(1)
         program = Program(self._price, np.where(in_some, self._price, 0.0))
         known = (labels == np.unique(labels[in_some])[:, None]) & in_some
@@ -217,7 +221,7 @@ class SharedPart:
         # Begin with equal shares of the steps of each dstate of the map.
         shares = (self._price + self._paid(known)) / known.sum(1) @ known
         best = np.zeros(len(shares))
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             look_at_clock()
             saved, members = self._saved(shares)
             scaled = self._scaled(shares, saved.sum(0))
@@ -288,7 +292,9 @@ class SharedPart:
 def shares_of(
     trace: Trace, visit: Sequence[int], apart: Flags, labels: Ints, price: float
 ) -> Iterator[tuple[Ints, Array]]:
-    """Yield steps and their shares of the prices of dstates, part by part, small parts first.
+    """Yield the steps of each part and their shares of the prices of dstates, small parts first.
+
+    Then yield the same again with greater shares.
 
     Args:
         trace: The trace.
@@ -299,10 +305,12 @@ def shares_of(
     """
     moves = RepeatedMoves.of(trace, visit, price)
     part = connected_components(csr_array(~apart), directed=False)[1]
-    for number in np.argsort(np.bincount(part), kind="stable"):
-        some = np.flatnonzero(part == number)
-        found = SharedPart(moves.only(some), ~apart[np.ix_(some, some)], price)
-        yield some, found.shares(labels[some])
+    order = np.argsort(np.bincount(part), kind="stable")
+    parts = [np.flatnonzero(part == number) for number in order]
+    for rounds in ROUNDS:
+        for some in parts:
+            found = SharedPart(moves.only(some), ~apart[np.ix_(some, some)], price)
+            yield some, found.shares(labels[some], rounds)
 
 
 def _cliques(together: Flags) -> Flags:
