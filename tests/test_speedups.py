@@ -268,7 +268,9 @@ def test_removed_speedup_is_ignored_with_a_warning(capsys: pytest.CaptureFixture
 @given(traces(max_steps=12))
 def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     """Merging also makes a map if it begins with one dstate for each step."""
-    theory = settle(trace, Theory.causal().replace(joint=1)).theory  # merging knows only pairs
+    theory = settle(
+        trace, Theory.causal().replace(joint=1, weigh="count")
+    ).theory  # merging knows only pairs
     log = Log(trace, theory)
     chart = Chart.of_steps(log, len(trace))
     fewest = solve(trace, theory).cost

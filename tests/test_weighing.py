@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations, pairwise, product
 from pathlib import Path
@@ -554,3 +555,14 @@ def test_maps_of_equal_cost_are_all_minimal(tmp_path: Path) -> None:
     wider = solve([first, other], within=20)
     assert wider.minimal_maps == solution.maps
     assert wider.count > solution.count
+
+
+@pytest.mark.parametrize("preset", [Theory.causal, Theory.topological])
+def test_presets_weigh_traces_with_displacements(preset: Callable[[], Theory]) -> None:
+    with_way = Trace.from_steps("aba", ["travel"] * 2, displacements=[(4, 0, 0)] * 2)
+    solution = solve(with_way, preset())
+    assert solution.theory.weigh == "cost"
+    assert solution.weighed is not None
+    assert len(solution.maps[0].dstates) == 3  # one pose would cost more than one dstate
+    counted = solve(with_way.without_displacements(), preset())
+    assert counted.theory.weigh == "count"

@@ -149,11 +149,12 @@ class Theory:
 
     @classmethod
     def causal(cls) -> Theory:
-        """Return the preset with the causal axioms only and the fewest dstates.
+        """Return the preset with the causal axioms only.
 
-        Its maps are the smallest Moore machines that explain the trace.
+        Its maps are the smallest Moore machines that explain the trace; with displacements, those
+        of least cost.
         """
-        return cls(level="causal", boundary="none", star="none", prefer=("dstates",))
+        return cls(level="causal", boundary="none", star="none")
 
     @classmethod
     def topological(cls) -> Theory:
