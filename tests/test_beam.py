@@ -108,7 +108,7 @@ def test_narrow_beam_tells_dstates_at_one_place_apart() -> None:
 def test_beam_keeps_hypotheses_with_other_places() -> None:
     """Beside the cheapest hypotheses there are others, which differ in places from all these."""
     (known,) = truth.mazes(3, 40, [700], DRIFTING)
-    problem, width, others = settle(known.trace, Theory(star="none")), 4, 0
+    problem, width, others = settle(known.trace, Theory(star="none")), 8, 0
     beam = Beam(problem, Log(known.trace, problem.theory, problem.pairs), width)
     kept = [beam._first()]
     for t in range(1, len(known.trace)):

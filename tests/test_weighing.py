@@ -379,10 +379,10 @@ def test_wider_beams_follow_while_they_find_better_maps(
     candidates = SimpleNamespace(sketch=Mock(), beam=beam, maps_of=maps_of)
     task = SimpleNamespace(theory=Theory())
     parts = Mock(watch=watch, candidates=candidates, task=task)
-    found = beams.Beams(parts, Mock(), {1: 5.0, **costs}.__getitem__, Mock())
+    found = beams.Beams(parts, Mock(), {1: 5.0, 4: 5.0, **costs}.__getitem__, Mock())
     with patch.object(beams, "with_merged_places", lambda best, *_: best):
         assert found.search(lambda: False)
-    assert widths == [1, *asked]
+    assert widths == [1, 4, *asked]
     assert found.found(min(costs.values()))
 
 

@@ -119,8 +119,9 @@ class Beams:
             began = watch.elapsed()
             # A beam of width n takes about n times as long as the first one.
             last, first = widths[-1], self._took[0] if self._took else math.inf
-            if width < last and began + last * first < time.end(shares[last]):
-                continue  # there is time for the last one, so leave this one out
+            slack = time.end(shares[last]) - began - last * first
+            if width < last and 0 < slack < width * first:
+                continue  # there is time for the last one, but not for both
             watch.stage_ends = time.end(shares[width])
             if (beam := parts.candidates.beam(width)) is None:
                 break

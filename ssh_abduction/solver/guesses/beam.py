@@ -51,9 +51,10 @@ from ssh_abduction.theory.theory import Theory
 CHECKED_EVERY = 8
 # If no hypothesis is left, search again with a beam that is this many times as wide.
 WIDER = 2
-# Most hypotheses of a beam differ only in dstates at the same places. So a beam also keeps the
-# cheapest ones with other places, as many as this share of its width.
-OTHERS = 0.25
+# Most hypotheses of a beam differ only in dstates at the same places. So a beam wider than NARROW
+# also keeps the cheapest ones with other places, as many as the share OTHERS of its width. These
+# may crowd out others later, so each kind of beam finds maps that the other one drops.
+OTHERS, NARROW = 0.25, 4
 # With several drives or floors, it is open how they are joined. So keep up to LOST * ALIKE
 # hypotheses, of which at most ALIKE join them in the same way. Check the beam at once if it has
 # more than CROWDED times its width, so that false joins do not crowd out true ones.
@@ -189,7 +190,7 @@ class Beam:
         `options` are ways to extend the beam by step t, sorted by cost. If `checked`, drop what the
         checker refuses.
         """
-        most, several = width + int(OTHERS * width), bool(self._frames)
+        most, several = width + int(OTHERS * width * (width > NARROW)), bool(self._frames)
         if several:
             width, most = min(width, ALIKE), LOST * min(width, ALIKE)
         count: Counter[tuple[object, ...]] = Counter()
