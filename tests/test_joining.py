@@ -48,7 +48,7 @@ def along(*drives: str) -> Trace:
 
 
 @pytest.mark.parametrize("stars", [True, False], ids=["stars", "no stars"])
-@pytest.mark.parametrize("known", MAZES, ids=[known.name for known in MAZES])
+@pytest.mark.parametrize("known", [MAZES[0], pytest.param(MAZES[1], marks=pytest.mark.slow)])
 def test_joined_map_costs_at_most_as_much_as_the_true_one(known: truth.Known, stars: bool) -> None:
     problem = settle(known.trace, Theory(star="auto" if stars else "none"))
     misfit = Misfit(problem)

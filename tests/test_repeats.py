@@ -60,7 +60,9 @@ def test_shares_bound_all_clusterings_into_cliques_from_below(n: int, seed: int)
 
 
 @pytest.mark.filterwarnings("ignore:views")
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 @pytest.mark.parametrize("kind", THEORIES)
 def test_bound_from_repeats_is_at_most_the_least_cost(kind: str, seed: int) -> None:
     trace, theory, solution, weighed = case_of(kind, seed, [STRAIGHT])

@@ -106,7 +106,9 @@ def unsure(seed: int) -> Trace:
     )
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 @pytest.mark.parametrize(
     ("drawn", "misread"), [(off_its_places, 0.0), (in_pieces, 0.0), (unsure, 0.4), (unsure, 1.5)]
 )
