@@ -196,7 +196,7 @@ class RepeatedMoves:
 
 
 class SharedPart:
-    """Steps of which each two are connected by pairs that are not apart, and their shares.
+    """A group of steps that is connected by pairs that are not apart, and the shares of the steps.
 
     Attributes:
         cliques: Which steps are in each maximal clique, (n, k). A step in none gets no share.
