@@ -170,7 +170,12 @@ def test_displacements_tell_corners_of_polygons_apart(corners: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("scale", "bend"), [(0.1, 0.0), (0.0, math.radians(0.2)), (-0.1, -math.radians(0.2))]
+    ("scale", "bend"),
+    [
+        (-0.1, -math.radians(0.2)),
+        pytest.param(0.1, 0.0, marks=pytest.mark.slow),
+        pytest.param(0.0, math.radians(0.2), marks=pytest.mark.slow),
+    ],
 )
 def test_fit_estimates_scale_and_drift(scale: float, bend: float) -> None:
     trace = circuit(5, 16, 1.0, 1, Odometry(heading=0.001, turning=0.01, angle=0.005), scale, bend)

@@ -223,6 +223,7 @@ def test_onto_counts_the_time_of_all_searches() -> None:
     assert added.seconds.total == 7.0
 
 
+@pytest.mark.slow
 def test_onto_gives_a_long_drive_with_displacements_a_probability() -> None:
     """The drive is laid on the map without a search of all steps."""
     noise = Noise(Odometry(**NOISE))
