@@ -63,7 +63,8 @@ class Beams:
     ) -> None:
         """Prepare the beam searches.
 
-        `misfit` computes the cost of a map in nats, and `add` keeps the map if it is small.
+        `add` returns the cost of a map in nats, and keeps the map if this cost is small. `misfit`
+        computes the cost of a map without keeping the map.
         `keep_best` makes the cheapest known map the best map of the search.
         """
         self._parts, self._misfit, self._add, self._keep_best = parts, misfit, add, keep_best

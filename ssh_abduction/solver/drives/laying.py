@@ -46,9 +46,9 @@ def laid(
     """Find a joint map of little cost that keeps the map of the old drives.
 
     `trace` has the new drives, and the problem all drives, under a theory that `can_lay`. The
-    solution has the cheaper of two maps: one joins the new drives to the old ones, and in the other
-    they are pieces of their own. None if neither satisfies the axioms. The displacements of the
-    first `since` steps are known to agree with the map.
+    solution has the cheapest of up to three maps: in one the new drives are pieces of their own,
+    and in the others they are joined to the old ones. None if no such map satisfies the axioms. The
+    displacements of the first `since` steps are known to agree with the map.
     """
     from ssh_abduction.solver.costs.misfit import Misfit  # loads numpy
     from ssh_abduction.solver.guesses.existing import ExistingMap
@@ -56,16 +56,17 @@ def laid(
     joint, theory = problem.trace, problem.theory
     ranking, judging, existing = Ranking(joint), Judging(problem), ExistingMap(old, ssh_map)
     fitted = map(ranking.fitted, _joint_maps(existing, old, ssh_map, trace, problem))
-    found = sorted(fitted, key=lambda m: _nats(m, problem))
-    while found and not judging.accepts_grown(found[0], since):
+    priced = ((_nats(m, problem), m) for m in fitted)
+    found = sorted(priced, key=lambda pair: pair[0])
+    while found and not judging.accepts_grown(found[0][1], since):
         del found[0]
     if not found:
         return None
-    best = Deriving(joint, theory).mapped(found[0])
+    best = Deriving(joint, theory).mapped(found[0][1])
     kept = (ssh_map if ssh_map.fit else Ranking(old).fitted(ssh_map)).fit
     assert kept is not None
     assert best.fit is not None
-    known = [rival_of(m, _nats(m, problem)) for m in found]
+    known = [rival_of(m, nats) for nats, m in found]
     moved = rivals_of(problem, Misfit(problem), best, ESTIMATING, len(old))
     weighed = Weighed(
         bound=nats_of(replace(Cost.of(ssh_map), paths=0), theory) + kept.chi2 / 2,
