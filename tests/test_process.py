@@ -13,7 +13,7 @@ from unittest.mock import patch
 
 import pytest
 
-from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
+from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch, peak_memory
 from ssh_abduction.solver.asp.workers import in_process
 
 
@@ -95,6 +95,35 @@ def test_interrupt_ends_the_process(tmp_path: Path) -> None:
         in_process(write_again_and_again, path, watch=watch)
     waiting.join()
     assert not is_written(path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.timeout(60)
+def test_slow_signal_handler_does_not_stop_the_waiting_for_a_process(
+    tmp_path: Path,
+) -> None:
+    """The handler takes longer than one look at the answers, which must then go on."""
+    path = tmp_path / "written"
+    watch = Watch()
+
+    def handle(*_: object) -> None:
+        time.sleep(2 * POLL)
+        watch.interrupted = True
+
+    def send() -> None:
+        while not path.exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGUSR1)
+
+    before = signal.signal(signal.SIGUSR1, handle)
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        with pytest.raises(LimitError, match="interrupted"):
+            in_process(write_again_and_again, path, watch=watch)
+    finally:
+        sender.join()
+        signal.signal(signal.SIGUSR1, before)
 
 
 def test_process_ends_with_its_parent(tmp_path: Path) -> None:

@@ -143,7 +143,9 @@ def answers(
     waiting = queue.SimpleQueue[tuple[Any, ...]]()
     for task in tasks:
         waiting.put(task)
-    ready = queue.SimpleQueue[Any]()  # answers, and None for each thread that ends
+    # Answers, and None for each thread that ends. A SimpleQueue would wait forever if the handler of
+    # a signal took longer than the rest of POLL.
+    ready = queue.Queue[Any]()
     workers: list[Worker | None] = [None] * processes
     over = threading.Event()  # set when the caller wants no more answers
     folder = tempfile.TemporaryDirectory(prefix="ssh-abduction-", ignore_cleanup_errors=True)
