@@ -19,7 +19,7 @@ from simulator.errors import SimulatorError
 from simulator.occupancy import FARTHEST, read_occupancy
 from ssh_abduction.data.checks import a_text
 from ssh_abduction.data.errors import is_finite, printable
-from ssh_abduction.data.fields import FieldReader
+from ssh_abduction.data.json_fields import FieldReader
 
 Array = NDArray[np.float64]
 Angles: TypeAlias = Literal["right", "any"]

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from strategies import traces
 
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.checker.misfit import SHARE, misfit
+from ssh_abduction.checker.cost_claims import SHARE, misfit
 from ssh_abduction.data import Closure, TraceError, together
 from ssh_abduction.data.odometry import (
     Covariance,

@@ -18,7 +18,7 @@ from ssh_abduction.data import MapError, TraceError
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.derivation import Derivation
 from ssh_abduction.explain.mend import explain_trace
-from ssh_abduction.explain.pairs import explain_pair
+from ssh_abduction.explain.pair_reasons import explain_pair
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.rivals import Listing
@@ -465,7 +465,7 @@ def test_interrupted_explanation_says_so(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("ssh_abduction.explain.pairs.derive", interrupted)
+    monkeypatch.setattr("ssh_abduction.explain.pair_reasons.derive", interrupted)
     RECTANGLE.prefix(5).save(tmp_path / "rectangle.jsonl")
     assert main(["explain", str(tmp_path / "rectangle.jsonl"), "0", "4"]) == 130
     assert capsys.readouterr().out.endswith(

@@ -32,7 +32,7 @@ from ssh_abduction.solver.engines import (
 from ssh_abduction.solver.engines import visit_labels as same
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.framed_paths import FramedPaths
-from ssh_abduction.solver.engines.sides import FramedSides
+from ssh_abduction.solver.engines.framed_sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
 from ssh_abduction.solver.engines.visit_program import VisitProgram
 from ssh_abduction.solver.guesses import annealing, sampling

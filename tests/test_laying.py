@@ -14,7 +14,7 @@ from onto import walks
 from ssh_abduction import Solution, Trace, check, solve
 from ssh_abduction.cli import main
 from ssh_abduction.solver import Status
-from ssh_abduction.solver.drives import onto
+from ssh_abduction.solver.drives import added_drives
 
 
 @pytest.mark.slow
@@ -87,7 +87,7 @@ def test_onto_costs_as_much_as_solving_all_drives(
     assert all_together.weighed is not None
     labels = all_together[0].dstate_at[: len(old)]
     assume(all_together.weighed.proven and labels == existing[0].dstate_at)
-    with patch.object(onto, "READABLE", 0):
+    with patch.object(added_drives, "READABLE", 0):
         laid = solve(new, onto=existing)
     assert laid.weighed is not None
     assert laid.stopped == "no proof"
@@ -101,7 +101,7 @@ def test_interrupted_onto_gives_the_new_drive_its_own_dstates(tmp_path: Path) ->
         for corners, name in ((4, "monday"), (30, "tuesday"))
     )
     before = solve(monday)
-    with patch.object(onto, "laid", side_effect=KeyboardInterrupt):
+    with patch.object(added_drives, "laid", side_effect=KeyboardInterrupt):
         solution = solve(tuesday, onto=before)
     solution.save(tmp_path / "maps.json")
     assert main(["check", str(tmp_path / "maps.json")]) == 0  # with the claims of the file

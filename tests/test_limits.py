@@ -34,7 +34,7 @@ from ssh_abduction.solver import Search, Status, check_rules, find_backbone
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
-from ssh_abduction.solver.asp.rules import EXAMPLE
+from ssh_abduction.solver.asp.rule_checks import EXAMPLE
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.steps import certificate
 from ssh_abduction.solver.steps.noise import noise_in

@@ -28,7 +28,7 @@ from ssh_abduction.cli.parsing import Parser
 from ssh_abduction.data import Action, DState, MapError, Step, TraceError, together
 from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
-from ssh_abduction.explain.pairs import explain_pair
+from ssh_abduction.explain.pair_reasons import explain_pair
 from ssh_abduction.page import html
 from ssh_abduction.page.assumed import assumptions
 from ssh_abduction.page.content import DRAWN, content_of

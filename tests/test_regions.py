@@ -20,7 +20,7 @@ from ssh_abduction.data import Action, MapError
 from ssh_abduction.data.regions import Region, right_of
 from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solver import find_regions, with_regions
-from ssh_abduction.solver.regions import UNITS, axioms_for_regions, derived
+from ssh_abduction.solver.derived_regions import UNITS, axioms_for_regions, derived
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle
 
@@ -323,6 +323,6 @@ def test_causal_map_has_no_regions() -> None:
 def test_time_for_regions_is_shared_among_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     trace = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
     assert all(m.regions for m in solve(trace))
-    monkeypatch.setattr("ssh_abduction.solver.regions.UNITS", UNITS // 20)
+    monkeypatch.setattr("ssh_abduction.solver.derived_regions.UNITS", UNITS // 20)
     have = [m.regions is not None for m in solve(trace)]
     assert 0 < sum(have) < len(have) == 4

@@ -30,7 +30,7 @@ from ssh_abduction import (
     solve,
 )
 from ssh_abduction.checker.checker import check
-from ssh_abduction.checker.misfit import misfit
+from ssh_abduction.checker.cost_claims import misfit
 from ssh_abduction.cli import main
 from ssh_abduction.cli.text import by_displacements
 from ssh_abduction.data import (

@@ -21,11 +21,11 @@ from strategies import TOYS, theories, traces
 
 from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.checker.misfit import false_costs, misfit
+from ssh_abduction.checker.cost_claims import false_costs, misfit
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, Odometry, SolverError, TheoryError, together
 from ssh_abduction.data.drives import Drive
-from ssh_abduction.data.fields import FieldReader
+from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.costs import beams, weighing
 from ssh_abduction.solver.costs.estimating import estimated

@@ -15,13 +15,13 @@
 The checker shares nothing with the encodings or the solver, so it catches their mistakes. The
 axioms are those of docs/explanation/theory.md, after Kuipers & Beeson (AAAI 2002) and Remolina &
 Kuipers (AIJ 2004). `AXIOMS` maps the name of each axiom to its check. The checks are in
-`topological`, `sides`, `stars`, `clashes` and `evidence`; `coherence` checks that the map
-fits the trace. `regions` checks the regions of a map that lists them.
+`topological`, `side_axioms`, `stars`, `clashes` and `evidence`; `coherence` checks that the map
+fits the trace. `region_axioms` checks the regions of a map that lists them.
 
 A map lists one place, one course (path and direction) and one heading for each dstate, even if the
 theory leaves out the axiom that forbids several. The other axioms are checked on the listed ones.
 A map also lists the order of the places along each path. It lists no sides of paths, and no travels
-that lead around a ring of places. The module `sides` describes how the axioms about sides are
+that lead around a ring of places. The module `side_axioms` describes how the axioms about sides are
 checked, and `reading.Order` how those about orders are.
 """
 
@@ -30,7 +30,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from ssh_abduction.checker import clashes, coherence, evidence, regions, sides, stars, topological
+from ssh_abduction.checker import (
+    clashes,
+    coherence,
+    evidence,
+    region_axioms,
+    side_axioms,
+    stars,
+    topological,
+)
 from ssh_abduction.checker.reading import Check, Reading
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
@@ -42,7 +50,7 @@ COHERENCE = "map_explains_trace"
 
 AXIOMS: dict[str, Check] = {
     **topological.AXIOMS,
-    **sides.AXIOMS,
+    **side_axioms.AXIOMS,
     **stars.AXIOMS,
     **clashes.AXIOMS,
     **evidence.AXIOMS,
@@ -105,7 +113,7 @@ def violations(
         (name, AXIOMS[name]) for name in theory.axioms if name in AXIOMS
     ]
     # Regions follow from a map and decide nothing. They are checked if the map lists them.
-    checks += [*regions.AXIOMS.items()] if ssh_map.regions is not None else []
+    checks += [*region_axioms.AXIOMS.items()] if ssh_map.regions is not None else []
     for name, test in checks:
         look_at_clock()
         for steps, message in test(reading):

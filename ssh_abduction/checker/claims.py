@@ -159,7 +159,7 @@ class _Claims:
         if self.theory.without:
             return  # if axioms are left out, clingo may count more than the maps show
         if self.theory.weigh == "cost":
-            return  # maps of one cost in nats may have different counts (checker/misfit.py)
+            return  # maps of one cost in nats may have different counts (checker/cost_claims.py)
         if "within" in self.answer:
             yield from self._costs_within(self.answer["within"])
             return

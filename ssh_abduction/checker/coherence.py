@@ -9,7 +9,7 @@ from ssh_abduction.checker import clashes
 from ssh_abduction.checker.evidence import floors_are_listed
 from ssh_abduction.checker.moves import course_of, heading_of
 from ssh_abduction.checker.reading import Check, Found, Reading
-from ssh_abduction.checker.sides import is_pair
+from ssh_abduction.checker.side_axioms import is_pair
 from ssh_abduction.checker.stars import slot_changes
 from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import Fault

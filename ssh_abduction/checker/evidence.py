@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from ssh_abduction.checker.crossings import Edges
 from ssh_abduction.checker.moves import MapLink, heading_of
-from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.stars import stars_of
 from ssh_abduction.data.closure import Closure, match_in_words

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
+from ssh_abduction.checker.crossings import QUARTERS
 from ssh_abduction.checker.moves import Course, along, course_of, heading_of, opposite
-from ssh_abduction.checker.planarity import QUARTERS
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.data.drives import ALONE
 from ssh_abduction.data.maps import DState

@@ -11,7 +11,7 @@ from typing import Any
 from ssh_abduction.checker.checker import Violation, check, unchecked
 from ssh_abduction.checker.claims import false_claims
 from ssh_abduction.checker.proof import check_bound
-from ssh_abduction.cli.obeying import as_corrected
+from ssh_abduction.cli.obeyed_corrections import as_corrected
 from ssh_abduction.cli.options import (
     add_maps,
     add_theory,
@@ -181,7 +181,7 @@ def _costs_hold(
     said: list[str],
 ) -> bool:
     """Recompute the costs of maps in nats. Append the result to `said`; return if all hold."""
-    from ssh_abduction.checker.misfit import LONGEST, false_costs  # loads numpy
+    from ssh_abduction.checker.cost_claims import LONGEST, false_costs  # loads numpy
 
     weighed = Solution.from_dict(data, where, trace).weighed  # the fields have the right form
     false = list(false_costs(trace, data, maps, theory))

@@ -54,8 +54,8 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.comparison import compare  # loads numpy
     from ssh_abduction.rivals.differences import difference
     from ssh_abduction.rivals.drive_joins import joins_of_drives
+    from ssh_abduction.rivals.known_sides import shared_sides
     from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.rivals.sides import shared_sides
 
     maps = maps_path(options.maps)
     others = None if options.other is None else maps_path(options.other)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.obeying import as_corrected
+from ssh_abduction.cli.obeyed_corrections import as_corrected
 from ssh_abduction.cli.options import (
     add_limits,
     add_theory,
@@ -34,8 +34,8 @@ from ssh_abduction.data.map_parts import thing_named
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
 from ssh_abduction.explain.mend import TraceExplanation, TraceQuestion
-from ssh_abduction.explain.pairs import PairQuestion
-from ssh_abduction.explain.sides import PlaceExplanation, PlaceQuestion
+from ssh_abduction.explain.pair_reasons import PairQuestion
+from ssh_abduction.explain.place_reasons import PlaceExplanation, PlaceQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop

@@ -29,7 +29,7 @@ from ssh_abduction.cli.jobs import (
     final_code,
     in_a_line,
 )
-from ssh_abduction.cli.obeying import say_obeyed
+from ssh_abduction.cli.obeyed_corrections import say_obeyed
 from ssh_abduction.cli.options import check_jobs, choices_of, theory_of
 from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
 from ssh_abduction.cli.run_folders import (

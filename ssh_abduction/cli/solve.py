@@ -14,7 +14,7 @@ from itertools import chain
 from typing import Any
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.obeying import Obeying
+from ssh_abduction.cli.obeyed_corrections import Obeying
 from ssh_abduction.cli.options import (
     add_limits,
     add_theory,
@@ -153,13 +153,13 @@ def run(options: argparse.Namespace) -> int:
     if options.output is not None:
         check_output(options.output, "the solution")
     if options.onto is not None:
-        from ssh_abduction.cli import onto
+        from ssh_abduction.cli import solve_onto
 
-        return onto.run(options)
+        return solve_onto.run(options)
     if options.front is not None:
-        from ssh_abduction.cli import front
+        from ssh_abduction.cli import solve_front
 
-        return front.run(options)
+        return solve_front.run(options)
     many = options.jobs is not None or options.scheduler is not None
     if options.together and many:
         raise AbductionError(

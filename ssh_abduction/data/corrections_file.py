@@ -27,8 +27,8 @@ from ssh_abduction.data.corrections import (
 )
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, named
-from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line, read_at_most, save_file
+from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.map_parts import NAMED
 from ssh_abduction.data.maps import SSHMap
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from ssh_abduction.data.checks import a_path
 from ssh_abduction.data.errors import MapError, brief, is_writable, named
-from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import HalfCharacter, NotFinite, parse_json, save_file
+from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
 from ssh_abduction.data.regions import Region
 

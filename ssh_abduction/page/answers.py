@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain.pairs import explain_pair
+from ssh_abduction.explain.pair_reasons import explain_pair
 from ssh_abduction.explain.verdict import PairExplanation
 from ssh_abduction.solver import Search, Solution, Start, Watch
 from ssh_abduction.theory.theory import Theory

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Axioms, Interrupted
-from ssh_abduction.explain.pairs import SMALL, UNCUT
+from ssh_abduction.explain.pair_reasons import SMALL, UNCUT
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.rivals.listing import Listing

@@ -26,7 +26,7 @@ from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
 from ssh_abduction.data.words import attributes_of
-from ssh_abduction.rivals.sides import Beside, only_in
+from ssh_abduction.rivals.known_sides import Beside, only_in
 from ssh_abduction.rivals.table import NONE, Table
 from ssh_abduction.solver import Sort, stretches
 

@@ -19,11 +19,13 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp.limits import Watch as Watch
     from ssh_abduction.solver.asp.limits import check_limit as check_limit
     from ssh_abduction.solver.asp.limits import resident_memory as resident_memory
-    from ssh_abduction.solver.asp.rules import check_rules as check_rules
+    from ssh_abduction.solver.asp.rule_checks import check_rules as check_rules
     from ssh_abduction.solver.asp.workers import end_all as end_all
     from ssh_abduction.solver.asp.workers import in_process as in_process
     from ssh_abduction.solver.costs.estimating import maps_apart as maps_apart
     from ssh_abduction.solver.costs.misfit import Misfit as Misfit
+    from ssh_abduction.solver.derived_regions import find_regions as find_regions
+    from ssh_abduction.solver.derived_regions import with_regions as with_regions
     from ssh_abduction.solver.entry import find_backbone as find_backbone
     from ssh_abduction.solver.entry import solve as solve
     from ssh_abduction.solver.front import Front as Front
@@ -39,8 +41,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.obeying import obeyed as obeyed
     from ssh_abduction.solver.obeying import with_kept_apart as with_kept_apart
     from ssh_abduction.solver.obeying import with_names as with_names
-    from ssh_abduction.solver.regions import find_regions as find_regions
-    from ssh_abduction.solver.regions import with_regions as with_regions
     from ssh_abduction.solver.search import Search as Search
     from ssh_abduction.solver.solution.recorded import drives_in as drives_in
     from ssh_abduction.solver.solution.recorded import joins_in as joins_in

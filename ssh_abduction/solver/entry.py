@@ -25,7 +25,7 @@ from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.backbone import prove_backbone
 from ssh_abduction.solver.choosing import READABLE, labelling_engine, may_name
-from ssh_abduction.solver.drives.onto import Solving, solve_onto
+from ssh_abduction.solver.drives.added_drives import Solving, solve_onto
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging

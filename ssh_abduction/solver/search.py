@@ -34,7 +34,7 @@ from ssh_abduction.solver.asp.limits import (
     Watch,
     now,
 )
-from ssh_abduction.solver.asp.rules import check_rules
+from ssh_abduction.solver.asp.rule_checks import check_rules
 from ssh_abduction.solver.fallback import (
     CLASHING,
     OVERTIME,
@@ -240,7 +240,9 @@ class Search:
         return self._parts.engine.asker.grounding
 
     def __iter__(self) -> Iterator[SSHMap]:
-        from ssh_abduction.solver.regions import Deriving  # after the search, which needs none
+        from ssh_abduction.solver.derived_regions import (
+            Deriving,  # after the search, which needs none
+        )
 
         ranking = Ranking(self.trace) if self.theory.displacement == "use" else None
         return map(Deriving(self.trace, self.theory).mapped, self._given(ranking))

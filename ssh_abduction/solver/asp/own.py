@@ -27,7 +27,7 @@ from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts import readable
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import POLL
-from ssh_abduction.solver.asp.rules import read_by
+from ssh_abduction.solver.asp.rule_checks import read_by
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 

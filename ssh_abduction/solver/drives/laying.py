@@ -17,11 +17,11 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.costs.estimating import ESTIMATING, doubt_of, rival_of, rivals_of
+from ssh_abduction.solver.derived_regions import Deriving
 from ssh_abduction.solver.drives.digest import Digest
 from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.regions import Deriving
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.weighed import IMPROBABLE, Weighed, may_join_more

@@ -39,8 +39,8 @@ from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import Found, Task, listing, next_charted_size
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, NodeLabels
+from ssh_abduction.solver.engines.framed_sides import FramedSides
 from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted
-from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality

@@ -35,7 +35,7 @@ from itertools import combinations
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.sides import FramedSides
+from ssh_abduction.solver.engines.framed_sides import FramedSides
 from ssh_abduction.solver.engines.transitive import Pair
 from ssh_abduction.solver.engines.visit_program import VisitProgram, fits_in_time
 from ssh_abduction.solver.steps.apart import clique

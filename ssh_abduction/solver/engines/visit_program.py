@@ -16,7 +16,7 @@ from ssh_abduction.solver.asp.facts import sides_lp, visits_lp
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.sides import FramedSides
+from ssh_abduction.solver.engines.framed_sides import FramedSides
 from ssh_abduction.solver.engines.transitive import Pair, PairOf, Three, intransitive
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
 from ssh_abduction.solver.steps.localising import Located, State, faced, located

@@ -14,7 +14,7 @@ from typing import Any
 from ssh_abduction.checker.joins import Join
 from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.errors import MapError, TheoryError
-from ssh_abduction.data.fields import FieldReader
+from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.trace_file import read_trace
 from ssh_abduction.solver.solution.weighed import Weighed

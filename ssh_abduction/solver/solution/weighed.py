@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import Any
 
 from ssh_abduction.data.drives import Drive, named_steps
-from ssh_abduction.data.fields import FieldReader
+from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.map_parts import FAULTS
 from ssh_abduction.theory.overlap import groups_of
 

@@ -18,8 +18,8 @@ from typing import Any, TypeAlias
 
 from ssh_abduction.checker.moves import Course
 from ssh_abduction.checker.reading import Reading
-from ssh_abduction.checker.regions import known_sides
-from ssh_abduction.checker.sides import RightBranch
+from ssh_abduction.checker.region_axioms import known_sides
+from ssh_abduction.checker.side_axioms import RightBranch
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap

@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 from ssh_abduction.checker.moves import Course, along, course_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
-from ssh_abduction.checker.sides import RightBranch, branches_right_of
+from ssh_abduction.checker.side_axioms import RightBranch, branches_right_of
 from ssh_abduction.data.groups import reached
 from ssh_abduction.data.regions import Region, list_in_words
 

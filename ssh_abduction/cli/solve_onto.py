@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.obeying import corrections_of
+from ssh_abduction.cli.obeyed_corrections import corrections_of
 from ssh_abduction.cli.options import number_steps, theory_of
 from ssh_abduction.cli.outcome import exit_code, save_solution, warn
 from ssh_abduction.cli.text import describe, headline

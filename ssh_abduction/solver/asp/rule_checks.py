@@ -3,7 +3,7 @@
 Errors say how to write the rules.
 
 >>> from ssh_abduction import Theory
->>> from ssh_abduction.solver.asp.rules import check_rules
+>>> from ssh_abduction.solver.asp.rule_checks import check_rules
 >>> from ssh_abduction.theory.rules import Rules
 >>> rules = Rules("own.lp", "#program step(t). :- same(I,t), t > 9.")
 >>> check_rules(Theory.causal().replace(rules=[rules]))
