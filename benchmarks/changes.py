@@ -106,7 +106,7 @@ def _other(gateway: Gateway) -> Gateway:
 def case_of_plan(plan: Plan, steps: int, seed: int, changes: int, views: int) -> Case:
     """Make two drives through a plan. Some doors are closed on one of them.
 
-    The doors are those of rooms that the other drive saw, without which the plan is in one piece.
+    The closed doors belong to rooms that the other drive saw. The plan stays connected.
     """
     plan, chance = plan.told_apart(), random.Random(f"{plan.name}, {seed}, {changes}")
     looks: dict[str, str] = {}
@@ -128,7 +128,7 @@ def case_of_plan(plan: Plan, steps: int, seed: int, changes: int, views: int) ->
 
 
 def _closable(plan: Plan, seen: Collection[object], count: int, chance: random.Random) -> list[int]:
-    """Choose doors of rooms that were seen, without which the plan is still connected.
+    """Choose doors of rooms that were seen, such that the plan stays connected if they are closed.
 
     No path leads straight on through such a door: a robot that comes to a closed door ahead would
     not know how the path bends.

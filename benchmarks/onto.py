@@ -35,7 +35,7 @@ def walks(
         steps: Steps of a drive.
         drives: The number of drives.
         seed: Seed of the maze and of all walks.
-        looks: Each cell has one of so many looks, and there are no displacements. If None, there
+        looks: Each cell has one of this many looks, and there are no displacements. If None, there
             are displacements.
     """
     noise = Noise(Odometry(**NOISE))

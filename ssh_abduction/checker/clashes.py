@@ -3,7 +3,7 @@
 A star is the set of gateways seen at a step. A sight is a dstate and a star seen there. A frame is
 a numbering of the gateways of a place. A map does not list which gateways of two sights are the
 same. So if no frame fits all sights of a place, the check reports a minimal set of sights that no
-frame fits. The set violates each axiom without which a frame would fit.
+frame fits. If a frame would fit this set without an axiom, the set violates this axiom.
 """
 
 from __future__ import annotations

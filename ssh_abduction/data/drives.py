@@ -67,7 +67,7 @@ class Drive:
 
 
 class DriveStep(int):
-    """The number of a step in a joint trace. In words it is the step of its drive.
+    """The number of a step in a joint trace. Its text is the drive and the step of this drive.
 
     >>> step = DriveStep(14, "tuesday", 9)
     >>> f"step {step}", step + 1

@@ -189,7 +189,7 @@ class SSHMap:
 
         Args:
             kind: "place", "path" or "region".
-            number: Its number; None has no name.
+            number: Its number, or None, for which the result is None.
 
         Raises:
             MapError: `kind` is none of these.

@@ -282,7 +282,7 @@ class _PoseTruth:
 
 
 class _Related:
-    """The truth by relations. `known` flags the steps near related times, in an (n,) array."""
+    """The truth by relative poses. `known`, (n,), flags the steps at times with a relation."""
 
     name = "relations"
 

@@ -81,7 +81,7 @@ class _Line:
 class Argument:
     """The search for an argument about two steps.
 
-    Inside this class steps have their numbers in the piece. In words they have their numbers in the
+    Inside this class steps have their numbers in the piece. Sentences give their numbers in the
     whole trace. Parameters as in `derive`.
     """
 

@@ -246,7 +246,7 @@ class Axioms:
         return needed
 
     def _of_last_core(self, assumed: Sequence[Assumption]) -> list[Assumption]:
-        """List the assumptions, among these, that are in the last unsat core."""
+        """List those of the given assumptions that are in the last unsat core."""
         core = set(self._last_core)
         literals = [
             (assumption, self._control.symbolic_atoms[assumption[0]]) for assumption in assumed

@@ -20,7 +20,7 @@ BRIEF = 3
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """An axiom at one step, without which an argument fails.
+    """An axiom at one step that an argument needs.
 
     Attributes:
         axiom: The name of the axiom.

@@ -144,7 +144,11 @@ class MapKeeper:
         return self._solution(began)
 
     def _ask(self) -> None:
-        """Search for minimal maps with clingo. Keep them, or the best map to extend it later."""
+        """Search for minimal maps with clingo and keep them.
+
+        If maps are replayed, maps without a proof do not replace the known ones. The best of them
+        becomes a draft, which later steps extend.
+        """
         known = self.minimal.maps[0].map() if self.minimal.status is Status.OPTIMAL else None
         found = self.solver.maps(self.trace, self.theory, known)
         said = self.solver.solution

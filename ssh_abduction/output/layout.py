@@ -254,8 +254,8 @@ class _Drawing:
     def layout(self) -> Layout:
         """Make four drawings, and choose the one with the fewest wrong turns and bent streets.
 
-        In two of them, whole paths are straight; in the other two, only segments. In each case, one
-        drawing takes `robust` headings, as `headings_by` does.
+        Two drawings keep whole paths straight, and the other two only segments. One drawing of each
+        pair has the headings that `headings_by` finds with `robust`.
         """
         if not self.map.places:
             return self._spread()

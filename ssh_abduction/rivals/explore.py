@@ -294,7 +294,7 @@ class Laboratory:
         return [*walk.way(best[1]), best[2]], parts
 
     def _untried(self, machines: Sequence[int], start: Row) -> Untried | None:
-        """Find the most informative action that some machine (map) has no link for; or None."""
+        """Find the most informative action for which some machine (map) has no link, if any."""
         walk = Walk(self._table, machines, start, self._watch)
         best: tuple[tuple[int, int], int, int, dict[Consequence, list[int]]] | None = None
         for layer in walk.layers():

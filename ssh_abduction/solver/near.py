@@ -67,5 +67,5 @@ class NearMinimal:
 
 
 def counted_first(theory: Theory) -> Count | None:
-    """Return the first count that a theory minimises, except excuses (see `Cost`); or None."""
+    """Return the first count but excuses that a theory minimises (see `Cost`), if there is one."""
     return next((name for name in theory.priorities if name != "excuses"), None)

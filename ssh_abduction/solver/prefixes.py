@@ -99,7 +99,7 @@ class Prefixes:
         self.start = len(task.trace) if self._at_once else FIRST_PREFIX
 
     def find_minimum(self) -> None:
-        """Extend the prefix until a minimal map of it predicts all later steps, or none exists."""
+        """Extend the prefix until it has no map, or a minimal map that predicts all later steps."""
         size, steps = min(len(self._task.trace), self.start), len(self._task.trace)
         while True:
             _log.debug("%s is given %d of %d steps", type(self.engine).__name__, size, steps)

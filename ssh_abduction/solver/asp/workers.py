@@ -143,8 +143,8 @@ def answers(
     waiting = queue.SimpleQueue[tuple[Any, ...]]()
     for task in tasks:
         waiting.put(task)
-    # Answers, and None for each thread that ends. A SimpleQueue would wait forever if the handler of
-    # a signal took longer than the rest of POLL.
+    # Answers, and None for each thread that ends. A SimpleQueue would wait forever if the handler
+    # of a signal took longer than the rest of POLL.
     ready = queue.Queue[Any]()
     workers: list[Worker | None] = [None] * processes
     over = threading.Event()  # set when the caller wants no more answers

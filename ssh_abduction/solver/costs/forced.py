@@ -359,8 +359,7 @@ class Forcing:
     def bounds(self, most: float, low: float = 0.0) -> Iterator[float]:
         """Yield rising lower bounds, above `low` and at most `most`, on the cost of all maps.
 
-        This leaves `joins` as it is. First try `most` itself. Branching takes much longer, so the
-        first bounds do without.
+        The first bounds come without branching, which takes much longer. `joins` does not change.
         """
         for branches, top in ((0, 2 * most), (1, most)):
             high = top

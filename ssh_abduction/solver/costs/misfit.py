@@ -126,9 +126,9 @@ class Misfit:
         return [] if suffices([]) else minimal_part(suffices, list(returns))
 
     def _of_groups(self, groups: _Groups) -> tuple[float, Array]:
-        """Return the misfit if steps share headings and positions, and where the headings are.
+        """Return the misfit if steps share headings and positions, and the poses of the headings.
 
-        Compute it only once.
+        Both are computed once and kept.
         """
         if groups not in self._known:
             headings, positions, wrong = groups

@@ -44,9 +44,9 @@ Flags = NDArray[np.bool_]
 # A part of the graph has at most CLIQUES maximal cliques. While it has more, drop the share DROPPED
 # of its steps.
 CLIQUES, DROPPED = 250, 0.04
-# The shares of a part are improved at most so many times in each pass over all parts, until they
-# could grow by the share ENOUGH.
-# They are tried this share INWARD of the way from shares that hold to shares that may not.
+# In each pass over all parts, the shares of a part are improved at most this many times, until
+# they could grow by the share ENOUGH. New shares lie at the share INWARD of the way from shares
+# that hold to shares that may not.
 ROUNDS, ENOUGH, INWARD = (10, 40), 0.01, 0.3
 # Each clique is searched from the best STARTS means of each action, in STEPS steps.
 STARTS, STEPS = 3, 8
@@ -210,7 +210,7 @@ class SharedPart:
         self._kinds = [(some, moves.only(some).compared()) for some in kinds]
 
     def shares(self, labels: Ints, rounds: int) -> Array:
-        """Compute shares of the steps, (n,), in at most so many rounds.
+        """Compute shares of the steps, (n,), in at most this many rounds.
 
         `labels` are their dstates in a known map.
         """

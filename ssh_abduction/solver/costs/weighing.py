@@ -313,10 +313,10 @@ class Weighing:
             self._of_groups[groups] = candidate
 
     def too_expensive(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """Add a map. Return equalities that exclude it, but no map worth finding.
+        """Add a map. Return equalities that exclude it; None if no map left is worth finding.
 
         The map has the fewest dstates, places and paths of all maps left. The equalities are
-        returns and believed displacements; None if no map left is worth finding.
+        returns and believed displacements. They exclude no map worth finding.
         """
         look_at_clock()
         watch = self._parts.watch
@@ -469,7 +469,7 @@ class _CostJudging(Judging):
         self._weighing = weighing
 
     def refusal(self, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
-        """Return the evidence, or "cost", that rejects a map, and equalities to forbid; or None."""
+        """Return what rejects a map (evidence, or "cost"), and equalities to forbid, if any."""
         if (found := super().refusal(ssh_map)) is not None:
             return found
         returns = self._weighing.too_expensive(ssh_map)

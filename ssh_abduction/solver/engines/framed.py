@@ -127,7 +127,7 @@ class FramedEngine:
         self._best = best.cost, namings
 
     def _first_with_paths(self) -> Fitted | None:
-        """Find a map of the first steps with the fewest dstates, and its labels; None if none."""
+        """Find a smallest map of the prefix, and its labels; None if the prefix has no map."""
         fitted: list[Fitted] = []
 
         def why_not(labels: list[int]) -> list[int] | None:

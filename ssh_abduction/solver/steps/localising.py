@@ -45,10 +45,10 @@ class Located:
 
 
 def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
-    """Localise all visits of a chart by the states of some of them, among them the first visit.
+    """Find the state of every visit of a chart from the given states of some visits.
 
-    The states must make a map: visits at one place do not contradict each other, and an action
-    leads from a state to one state.
+    The first visit must have a state. The states must make a map: visits at one place do not
+    contradict each other, and an action leads from a state to one state.
     """
     if len(states) == len(chart.stars):
         return Located(tuple(states[visit] for visit in range(len(states))))

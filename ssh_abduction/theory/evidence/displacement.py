@@ -101,8 +101,8 @@ class Displacement(Evidence):
     ) -> frozenset[Equality]:
         """Find the displacements in the loops of `returns` that a map does not treat as wrong.
 
-        Closures make further loops. So with closures, all displacements are in loops. The result is
-        empty if the theory allows no wrong displacement.
+        If the trace has closures, all its displacements count as in loops. The result is empty if
+        the theory allows no wrong displacement.
 
         Args:
             wrong: The steps whose displacements the map treats as wrong.

@@ -108,7 +108,7 @@ def faulty_batch(
 
 
 def not_all_one(equalities: Collection[Equality]) -> str:
-    """Return the rule that some equalities of steps (known to clingo) do not all hold."""
+    """Return the rule that forbids maps in which all of these equalities of steps hold."""
     body = (f"is({e.first},S{k}), is({e.second},S{k})" for k, e in enumerate(equalities))
     return f":- {', '.join(body)}."
 
