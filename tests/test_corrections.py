@@ -359,8 +359,8 @@ def test_warning_if_a_later_drive_contradicts_a_gateway_correction(
         return told
 
     told = warned("monday", "tuesday")
-    said = "open: right at monday:0, left at monday:3: it contradicts what tuesday saw at step"
-    assert f"{said} tuesday:0: without it, tuesday would share places with" in told
+    said = "open: right at monday:0, left at monday:3: it contradicts what tuesday saw at steps"
+    assert f"{said} tuesday:0, tuesday:3: without it, tuesday would share places with" in told
     assert told.count("it contradicts") == 1
     # Python gives the same warning.
     drives = [seeing(name, *stars) for name in ("monday", "tuesday")]
@@ -380,6 +380,103 @@ def test_warning_if_a_later_drive_contradicts_a_gateway_correction(
     strange = Trace.from_steps("ax", ["travel"], stars=[(1, 1, 1, 0), (0, 0, 1, 0)], name="strange")
     strange.save(folder / "strange.jsonl")
     assert "it contradicts" not in warned("monday", "strange")
+
+
+@pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
+@pytest.mark.parametrize("names", [("monday", "tuesday"), ("tuesday", "monday"), ()])
+def test_closed_gateway_of_a_place_holds_for_later_drives(
+    names: tuple[str, ...], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both drives see a gateway that is not there. Only the first is in the map at first.
+
+    Solved after Tuesday, the places of Monday have other numbers. Without names, Tuesday is added
+    to the map of Monday.
+    """
+    for name in ("monday", "tuesday"):
+        seeing(name, (1, 1, 0, 0), (0, 0, 1, 1)).save(folder / f"{name}.jsonl")
+    seeing("right", (1, 0, 0, 0), (0, 0, 1, 0)).save(folder / "right.jsonl")
+    maps = str(folder / "building" / "maps.json")
+    file = str(folder / "building" / "corrections.yaml")
+    assert main(solving(folder, "monday")) == 0
+    assert main(["correct", maps, "--closed", "p0 south"]) == 0
+
+    def added(*drives: str) -> str:
+        if names:
+            assert main(solving(folder, *drives)) == 0
+        else:
+            assert main(solving(folder, "monday")) == 0
+            onto = [str(folder / f"{drives[-1]}.jsonl"), "--onto", maps, "--corrections", file]
+            assert main(["solve", *onto, "-o", maps]) == 0
+        told = capsys.readouterr()
+        return told.out + told.err
+
+    # A drive that sees it closed agrees, so its steps get no correction of their own.
+    told = added("right", "monday") if names[:1] == ("tuesday",) else added("monday", "right")
+    assert "it contradicts" not in told
+    assert "share no place" not in told
+    # A drive that sees it open contradicts. The warning names the steps, and how to agree.
+    told = added(*(names or ("tuesday",)))
+    said = "it contradicts what tuesday saw at steps tuesday:0, tuesday:3: without it"
+    assert said in told
+    assert "(correct --closed 'tuesday:0 right'), or remove it" in told
+    assert main(["correct", maps, "--closed", "tuesday:0 right"]) == 0
+    told = added(*(names or ("tuesday",)))
+    assert "it contradicts" not in told
+    assert "the map joins all 2 drives" in told
+    assert {step.star for step in Solution.load(maps).trace or () if step.view == "a"} == {
+        (1, 0, 0, 0)
+    }
+
+
+def test_warning_if_a_corrected_gateway_keeps_a_drive_out_of_one_place_only() -> None:
+    """Both drives saw a gateway south of P. Tuesday shares another place with Monday."""
+    seen = (1, 1, 1, 1)
+    monday = Trace.from_steps(
+        ["A east", "P east", "B east"],
+        ["travel", "travel"],
+        stars=[(1, 0, 0, 0), seen, (0, 0, 1, 0)],
+        name="monday",
+    )
+    tuesday = Trace.from_steps(
+        ["C south", "P south", "P west", "A west", "A east"],
+        ["travel", "right", "travel", "around"],
+        stars=[(1, 0, 0, 0), seen, seen, (0, 0, 1, 0), (1, 0, 0, 0)],
+        name="tuesday",
+    )
+    said = Corrections.for_drives(monday).with_gateway(False, [("monday:1", 90.0)])
+    (warning,) = solve([monday, tuesday], corrections=said).warnings
+    assert "what tuesday saw at steps tuesday:1, tuesday:2: without it, tuesday would" in warning
+    elsewhere = replace(tuesday, steps=tuesday.steps[3:])
+    assert not solve([monday, elsewhere], corrections=said).warnings
+
+
+def test_drive_that_contradicts_a_correction_shares_the_place_without_stars() -> None:
+    stars = (1, 1, 0, 0), (0, 0, 1, 1)
+    drives = [seeing("monday", *stars), replace(seeing("tuesday", *stars)[:3], name="tuesday")]
+    said = Corrections.for_drives(drives[0]).with_gateway(
+        False, [("monday:0", 90.0), ("monday:3", 270.0)]
+    )
+    solution = solve(drives, Theory(star="none"), corrections=said)
+    assert len(solution[0].pieces) == 1
+    (warning,) = solution.warnings
+    assert "it contradicts what tuesday saw at step tuesday:0; say the same of" in warning
+    agreeing = replace(said, drives=fingerprints_of(together(drives)))
+    agreeing = agreeing.with_gateway(False, [("tuesday:0", 90.0)])
+    assert not solve(drives, Theory(star="none"), corrections=agreeing).warnings
+
+
+def test_correct_warns_if_the_map_uses_no_stars(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = str(folder / "building" / "maps.json")
+    for more, warns in (["--set", "star=none"], True), ([], False):
+        assert main([*solving(folder, "round"), *more]) == 0
+        capsys.readouterr()
+        assert main(["correct", maps, "--open", "round:1 ahead"]) == 0
+        (folder / "building" / "corrections.yaml").unlink()
+        assert (
+            "a gateway that is open or closed changes no map" in capsys.readouterr().err
+        ) is warns
 
 
 def test_verbs_apply_star_corrections_to_the_recorded_trace(

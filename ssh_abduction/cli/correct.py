@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 
 from ssh_abduction.cli.options import add_map, add_maps, at_comma, trace_beside
+from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.saved_map import SavedMap, sentences_of
 from ssh_abduction.data.corrections import PAIRS
@@ -65,6 +66,13 @@ def run(options: argparse.Namespace) -> int:
         print("\n".join(map(printable, sentences_of(said))) or "nothing was said")
         return 0
     file = saved.save(said)
+    if (options.open or options.closed) and saved.star == "none":
+        warn(
+            [
+                "this map was made without stars, so a gateway that is open or closed changes no "
+                "map; to use stars, set star=auto when you map or solve again"
+            ]
+        )
     sentences = counted(sum(1 for _ in sentences_of(said)), "corrections")
     print(printable(f"{named(file)}: {sentences}; {_how_to_obey(saved.file)}"))
     return 0

@@ -32,14 +32,14 @@ class SavedMap:
         drives: Its drives.
         file: The file of maps.
         corrections: What a person said about it.
-        in_quarters: Whether its stars have four directions.
+        star: How its theory uses stars; None if the file does not say.
     """
 
     map: SSHMap
     drives: tuple[Drive, ...]
     file: Path
     corrections: Corrections
-    in_quarters: bool
+    star: str | None
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], number: int | str = 1) -> SavedMap:
@@ -65,8 +65,13 @@ class SavedMap:
         ssh_map = listing.maps[listing.number(str(number))]
         if beside.is_file():
             ssh_map = said.named(ssh_map, listing.drives)
-        is_framed = isinstance(theory, dict) and theory.get("star") == "frame"
-        return cls(ssh_map, listing.drives, file, replace(said, drives=drives), is_framed)
+        star = theory.get("star") if isinstance(theory, dict) else None
+        return cls(ssh_map, listing.drives, file, replace(said, drives=drives), star)
+
+    @property
+    def in_quarters(self) -> bool:
+        """Whether stars have four directions."""
+        return self.star == "frame"
 
     def save(self, corrections: Corrections) -> Path:
         """Write the corrections beside the map, after a check. Returns their file.

@@ -357,9 +357,20 @@ def _warn_of_other_names(traces: Sequence[Trace]) -> None:
                 )
 
 
+def travels_of(trace: Trace) -> list[float]:
+    """The lengths of the displacements of all travels that moved the robot."""
+    moved = zip(trace.actions, trace.steps[1:], strict=True)
+    lengths = (
+        math.hypot(*step.displacement[:2])
+        for action, step in moved
+        if action.kind == "travel" and step.displacement is not None
+    )
+    return [length for length in lengths if length > 0]
+
+
 def _warn_of_other_units(traces: Sequence[Trace]) -> None:
     """Warn if the displacements of two traces are so different that their units must be."""
-    usual = {i: median(some) for i, trace in enumerate(traces) if (some := _travels(trace))}
+    usual = {i: median(some) for i, trace in enumerate(traces) if (some := travels_of(trace))}
     least, most = (pick(usual, key=usual.__getitem__, default=0) for pick in (min, max))
     if usual and usual[most] > UNITS * usual[least]:
         warnings.warn(
@@ -383,17 +394,6 @@ def _warn_of_other_views(traces: Sequence[Trace]) -> None:
             "views that are one",
             stacklevel=3,
         )
-
-
-def _travels(trace: Trace) -> list[float]:
-    """The lengths of the displacements of all travels that moved the robot."""
-    moved = zip(trace.actions, trace.steps[1:], strict=True)
-    lengths = (
-        math.hypot(*step.displacement[:2])
-        for action, step in moved
-        if action.kind == "travel" and step.displacement is not None
-    )
-    return [length for length in lengths if length > 0]
 
 
 def _check_alike(traces: Sequence[Trace], names: Sequence[str]) -> None:

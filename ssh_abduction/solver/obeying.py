@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from statistics import median
 
-from ssh_abduction.data.corrections import Corrections, Passage, checked_corrections
+from ssh_abduction.data.corrections import (
+    Corrections,
+    Passage,
+    checked_corrections,
+    direction_in_words,
+)
 from ssh_abduction.data.drives import (
     SEEN,
     Drive,
@@ -14,10 +21,12 @@ from ssh_abduction.data.drives import (
     joined_drives,
     step_name,
     step_of,
+    travels_of,
 )
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import parse_star, with_gateway
+from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.values import Status
@@ -66,56 +75,77 @@ def with_kept_apart(
     limit: float | None,
     find: Callable[[Trace, Theory, float], Solution],
 ) -> Solution:
-    """Add warnings about drives that share no place with others as a gateway was corrected.
+    """Add warnings about drives that contradict a corrected gateway.
 
     A correction changes only the stars of the steps that it names. If another drive saw the gateway
-    as it was before, its steps cannot be at the place any more.
+    as it was before, its steps cannot be at the place any more. Without stars, they can be there.
 
     Args:
         corrections: The corrections that the solution obeys.
         solution: The solution, with its trace.
         limit: The time limit of the search in seconds; None for none.
         find: Finds a map of a trace and a theory in some seconds. It is called once, without
-            corrections of gateways, if some drive is apart.
+            corrections of gateways, if the correction may keep a drive from the place.
     """
-    uses_stars = corrections.gateways and solution.theory.star != "none"
-    if not uses_stars or solution.stopped == "interrupted":
+    if not corrections.gateways or solution.stopped == "interrupted":
         return solution
     left = DOUBTING if limit is None else min(limit - solution.seconds.total, DOUBTING)
-    said = _drives_kept_apart(
+    said = _contradictions(
         corrections, solution, lambda trace, theory: find(trace, theory, max(left, SHORTEST))
     )
     return replace(solution, support=replace(solution.support, kept_apart=tuple(said)))
 
 
-def _drives_kept_apart(
+def _contradictions(
     corrections: Corrections, solution: Solution, find: Callable[[Trace, Theory], Solution]
 ) -> Iterator[str]:
     """Yield the warnings that `with_kept_apart` adds."""
     trace = solution.trace
     if trace is None or not solution.maps:
         return
-    drives = drives_of(trace)
-    said = corrections.known_in(drives)
-    apart = [(p, d) for p in said.gateways for d in _apart(p, drives, solution.maps[0])]
-    if not apart:
-        return
-    seen = _as_seen(trace)
-    found = find(*obeyed(replace(said, gateways=()), seen, solution.theory))
-    for passage, drive in apart:
+    drives, ssh_map = drives_of(trace), solution.maps[0]
+    said, found = corrections.known_in(drives), solution
+    unit = 90 if solution.theory.star == "frame" else 1
+    doubted = [(p, d) for p in said.gateways for d in drives]
+    if solution.theory.star != "none":
+        doubted = [(p, d) for p, d in doubted if _may_keep_out(p, d, trace, ssh_map)]
+        if not doubted:
+            return
+        found = find(*obeyed(replace(said, gateways=()), _as_seen(trace), solution.theory))
+    for passage, drive in doubted:
+        apart = drive in _apart(passage, drives, ssh_map)
         sentence = f"{named(said.source or 'corrections')}: {passage}: "
-        if found.maps and drive not in _apart(passage, drives, found.maps[0]):
-            if step := _seen_otherwise(passage, drive, seen, found.maps[0]):
-                yield (
-                    f"{sentence}it contradicts what {drive.name} saw at step {step}: without it, "
-                    f"{drive.name} would share places with the other drives; say the same of "
-                    f"{step} (correct), or remove it"
-                )
-        elif found.status is not Status.OPTIMAL:
+        steps = _seen_otherwise(passage, drive, trace, found, unit)
+        if steps:
+            shared = "places" if apart else "this place"
+            without = f": without it, {drive.name} would share {shared} with the other drives"
+            yield (
+                f"{sentence}it contradicts what {drive.name} saw at "
+                f"{'step' if len(steps) == 1 else 'steps'} {', '.join(steps)}"
+                f"{without if found is not solution else ''}; {_how_to_agree(passage, steps)}"
+            )
+        elif apart and _is_in_doubt(found, solution, passage, drive):
             yield (
                 f"{sentence}{drive.name} shares no place with the drives that it is about; if "
                 f"{drive.name} saw this gateway otherwise, say the same of its steps (correct)"
             )
+
+
+def _is_in_doubt(found: Solution, solution: Solution, passage: Passage, drive: Drive) -> bool:
+    """Whether an unproven map without a correction leaves a drive apart, as the solution does."""
+    if found is solution or found.status is Status.OPTIMAL:
+        return False
+    return not found.maps or drive in _apart(passage, found.drives, found.maps[0])
+
+
+def _how_to_agree(passage: Passage, steps: Mapping[str, float]) -> str:
+    """Say what to do about steps that saw a gateway otherwise, each with its direction."""
+    step, way = next(iter(steps.items()))
+    option = "--open" if passage.is_open else "--closed"
+    return (
+        f"say the same of {step} (correct {option} '{step} {direction_in_words(way)}'), or "
+        "remove it"
+    )
 
 
 def _apart(passage: Passage, drives: Sequence[Drive], ssh_map: SSHMap) -> list[Drive]:
@@ -142,14 +172,55 @@ def _as_seen(trace: Trace) -> Trace:
     return replace(trace, steps=tuple(steps))
 
 
-def _seen_otherwise(passage: Passage, drive: Drive, trace: Trace, ssh_map: SSHMap) -> str | None:
-    """Find the first step of a drive, at a corrected dstate, that saw the gateway otherwise."""
+def _may_keep_out(passage: Passage, drive: Drive, trace: Trace, ssh_map: SSHMap) -> bool:
+    """Whether a corrected gateway may keep a drive out of its place.
+
+    The drive shares no place with the drives of the correction; or it was not at the place, but saw
+    nearby as many gateways as the robot saw there before the correction.
+    """
     drives = drives_of(trace)
-    way_at = {ssh_map.dstate_at[step_of(drives, step)]: way for step, way in passage.seen}
-    for t in range(drive.first, drive.stop):
-        way, star = way_at.get(ssh_map.dstate_at[t]), trace.steps[t].star
-        if way is None or star is None:
-            continue
-        if with_gateway(star, way, is_open=passage.is_open) != star:
-            return step_name(drives, t)
-    return None
+    if drive in _apart(passage, drives, ssh_map):
+        return True
+    there = [step_of(drives, step) for step, _ in passage.seen]
+    places = {ssh_map.place_of(t) for t in there}
+    steps = range(drive.first, drive.stop)
+    if any(ssh_map.place_of(t) in places for t in steps):
+        return False
+    poses = ssh_map.fit.poses if ssh_map.fit else ()
+    near = median(travels_of(trace) or [0.0]) / 2
+    seen = [step.gateways and len(step.gateways.gateways) for step in _as_seen(trace).steps]
+
+    def is_near(t: int, u: int) -> bool:
+        here, other = (poses[ssh_map.dstate_at[step]] for step in (t, u))
+        return math.hypot(here.x - other.x, here.y - other.y) < near
+
+    return any(seen[t] == seen[u] and (not poses or is_near(t, u)) for t in steps for u in there)
+
+
+def _seen_otherwise(
+    passage: Passage, drive: Drive, trace: Trace, found: Solution, unit: int
+) -> dict[str, float]:
+    """Find the steps of a drive that saw a corrected gateway otherwise, by the best map found.
+
+    Each has the direction of the gateway. `unit` is the unit of the map's headings, in degrees.
+    """
+    if not found.maps:
+        return {}
+    drives, ssh_map = drives_of(trace), found.maps[0]
+    ways = {ssh_map.dstate_at[step_of(drives, step)]: way for step, way in passage.seen}
+    for label, way in [*ways.items()]:
+        here = ssh_map.dstates[label]
+        for s in ssh_map.dstates:
+            if s.place == here.place and s.heading is not None and here.heading is not None:
+                ways.setdefault(s.id, (way + unit * (here.heading - s.heading)) % 360)
+    return {
+        step_name(drives, t): ways[label]
+        for t, label in enumerate(ssh_map.dstate_at[: drive.stop])
+        if t >= drive.first and label in ways and _contradicts(passage, trace.steps[t], ways[label])
+    }
+
+
+def _contradicts(passage: Passage, step: Step, way: float) -> bool:
+    """Whether a step saw a gateway, in a direction, otherwise than a person says."""
+    star = step.star
+    return star is not None and with_gateway(star, way, is_open=passage.is_open) != star
