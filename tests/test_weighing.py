@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
 
 from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
+from ssh_abduction.checker import cost_claims
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.cost_claims import false_costs, misfit
 from ssh_abduction.cli import main
@@ -336,6 +337,33 @@ def test_check_finds_a_false_probability(
     weighed_route.trace.save(files[1])
     assert main(["check", *map(str, files)]) == 20
     assert said in capsys.readouterr().out
+
+
+def test_check_computes_the_costs_of_all_rivals_or_counts_the_others(
+    weighed_route: Solution,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert weighed_route.trace is not None
+    data = weighed_route.to_dict()
+    rivals = data["weighed"]["rivals"]
+    rivals += [dict(rivals[1]) for _ in range(3)]  # unlikely, so the confidence hardly changes
+    last = len(rivals) - 1
+    files = tmp_path / "maps.json", tmp_path / "trace.jsonl"
+    files[0].write_text(json.dumps(data))
+    weighed_route.trace.save(files[1])
+    assert main(["check", *map(str, files)]) == 0
+    assert f"costs in nats of map 1 and {last} rivals are right" in capsys.readouterr().out
+    rivals[last]["nats"] += 1.0
+    files[0].write_text(json.dumps(data))
+    assert main(["check", *map(str, files)]) == 20
+    assert f"weighed.rivals[{last}]: expected" in capsys.readouterr().out
+    monkeypatch.setattr(cost_claims, "WORK", 3 * len(weighed_route.trace) ** 3)
+    assert main(["check", *map(str, files)]) == 0
+    told = capsys.readouterr().out
+    assert "costs in nats of map 1 and 2 rivals are right" in told
+    assert f"the costs of {last - 2} more rivals are not checked, as that would take long" in told
 
 
 def test_stopped_search_is_not_sure(route: truth.Known) -> None:

@@ -23,6 +23,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.maps import SSHMap
@@ -35,8 +36,9 @@ Array: TypeAlias = NDArray[np.float64]
 Faults: TypeAlias = Sequence[tuple[str, int]]
 
 ROUNDS = 50
-# Stop when no unknown moves by more than this many standard deviations.
-STILL = 1e-9
+# Stop when no unknown moves by more than this many standard deviations. Near its least value, the
+# sum of squares then changes by less than rounding to the digits of an answer does.
+STILL = 1e-4
 # The standard deviation of a missing displacement, in metres and radians. It is so large that any
 # displacement is possible.
 MISSING = 1e4
@@ -45,10 +47,11 @@ EXACT, SHARE = 1e-3, 1e-3
 # If the robot may be off its dstates, the standard deviation is at least this, in metres and
 # radians.
 SMALLEST = 1e-3
-# The costs of this many rivals are checked.
-RIVALS = 5
 # The costs of traces with more steps are not checked, as the derivatives are a dense matrix.
 LONGEST = 400
+# The time for the cost of a map grows with the third power of the steps. Costs of rivals are
+# checked for at most the time of five in the longest trace.
+WORK = 5 * LONGEST**3
 # The direction from one place to another is too uncertain to use if they are closer than this many
 # metres.
 NEAR = 1.0
@@ -75,7 +78,16 @@ def _least(
     """Compute the misfit, and the position of the dstate of each step, in metres, (n, 2)."""
     wrong = [step for kind, step in faults if kind == "jumped"]
     errors = _Errors(trace.without_displacements_at(wrong), dstates, places)
-    return errors.least(), errors.position
+    with threadpool_limits(1, user_api="blas"):  # more threads only wait for each other
+        return errors.least(), errors.position
+
+
+def count_checked_rivals(steps: int, rivals: int, theory: Theory) -> int:
+    """Count the rivals whose costs `false_costs` checks: the first ones, as far as time permits.
+
+    It is 0 if paths have a price, as the paths of rivals are not listed.
+    """
+    return 0 if steps > LONGEST or theory.prices[2] else min(rivals, WORK // steps**3)
 
 
 def false_costs(
@@ -109,7 +121,9 @@ def false_costs(
     here = [p if p is not None else s for p, s in zip(places, maps[0].dstate_at, strict=True)]
     of_map: Faults = [(fault.kind, fault.step) for fault in maps[0].faults]
     courses = [("weighed.nats", nats, maps[0].dstate_at, here, len(maps[0].places), of_map)]
-    for i, rival in enumerate(rivals[:RIVALS] if isinstance(rivals, list) else ()):
+    rivals = rivals if isinstance(rivals, list) else []
+    for i in range(count_checked_rivals(len(trace), len(rivals), theory)):
+        rival = rivals[i]
         at = rival.get("places") or rival.get("dstates")
         there = len(set(at)) if rival.get("places") else 0
         of_rival = rival.get("faults", [])
@@ -124,8 +138,7 @@ def false_costs(
         true += theory.price_of_laying * _layings(trace, at)
         if theory.level == "topological" and not theory.lifts and not theory.jumped:
             true += theory.price_of_laying * _crowding(trace, dstates, at, position)
-        # The paths of a rival are not listed.
-        true += paths if name == "weighed.nats" or not theory.prices[2] else math.nan
+        true += paths if name == "weighed.nats" else 0.0
         if abs(true - claimed) > EXACT + SHARE * square:
             yield f"{name}: expected {true:.3f} nats, by the displacements, got {claimed}"
 
