@@ -24,6 +24,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from arguments import add_number, add_pattern
 from peers import PEERS
 from suite import SUITE, Instance
 from table import OURS, contradictions, grounding, times
@@ -34,31 +35,11 @@ TOOLS = (OURS, *PEERS)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "--limit", type=float, default=60, metavar="S", help="seconds per cell (default 60)"
-    )
-    parser.add_argument(
-        "--memory",
-        type=int,
-        default=4096,
-        metavar="MIB",
-        help="address space a cell has, in MiB (default 4096)",
-    )
-    parser.add_argument(
-        "--only",
-        default="",
-        metavar="PATTERN",
-        help="measure only instances that match this regular expression",
-    )
-    parser.add_argument(
-        "--tools",
-        default="",
-        metavar="PATTERN",
-        help="measure only tools that match this regular expression",
-    )
-    parser.add_argument(
-        "--seeds", type=int, default=1, metavar="N", help="random traces of each kind (default 1)"
-    )
+    add_number(parser, "--limit", "S", 60.0, "seconds per cell")
+    add_number(parser, "--memory", "MIB", 4096, "address space a cell has, in MiB")
+    add_pattern(parser, "--only", "instances")
+    add_pattern(parser, "--tools", "tools")
+    add_number(parser, "--seeds", "N", 1, "random traces of each kind")
     parser.add_argument(
         "--out",
         type=Path,

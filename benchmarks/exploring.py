@@ -40,6 +40,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from arguments import add_number
 from instances import HEADINGS, TURNS, doors_of
 from truth import Known, is_true, share_all
 
@@ -591,15 +592,9 @@ def plot(records: Sequence[Record], file: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--family", choices=("mazes", "plans"), default="mazes")
-    parser.add_argument(
-        "--cells", type=int, default=3, metavar="N", help="mazes of N x N cells (default 3)"
-    )
-    parser.add_argument(
-        "--seeds", type=int, default=1, metavar="N", help="worlds, or runs of each plan (default 1)"
-    )
-    parser.add_argument(
-        "--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)"
-    )
+    add_number(parser, "--cells", "N", 3, "mazes of N x N cells")
+    add_number(parser, "--seeds", "N", 1, "worlds, or runs of each plan")
+    add_number(parser, "--first", "SEED", 0, "the first seed")
     parser.add_argument(
         "--folder",
         type=Path,
@@ -626,13 +621,7 @@ def main() -> None:
         metavar="N",
         help="give up after this many steps (default 20000; explorer 2000)",
     )
-    parser.add_argument(
-        "--limit",
-        type=float,
-        default=3.0,
-        metavar="S",
-        help="approximate seconds for a solve (default 3)",
-    )
+    add_number(parser, "--limit", "S", 3.0, "approximate seconds for a solve")
     parser.add_argument(
         "--seconds",
         type=float,

@@ -35,6 +35,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from arguments import add_number, add_pattern
 from cell import cpu_seconds, end_after
 from fault_cases import FAMILIES, PRICE, Case, Explanation
 from fault_peers import PEERS
@@ -69,34 +70,12 @@ Record = dict[str, Any]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "--only",
-        default="",
-        metavar="PATTERN",
-        help="measure only families that match this regular expression",
-    )
-    parser.add_argument(
-        "--solvers",
-        default="",
-        metavar="PATTERN",
-        help="measure only solvers that match this regular expression",
-    )
-    parser.add_argument(
-        "--seeds", type=int, default=20, metavar="N", help="cases of each family (default 20)"
-    )
-    parser.add_argument(
-        "--first", type=int, default=500, metavar="SEED", help="the first seed (default 500)"
-    )
-    parser.add_argument(
-        "--limit", type=float, default=60, metavar="S", help="CPU seconds per cell (default 60)"
-    )
-    parser.add_argument(
-        "--memory",
-        type=int,
-        default=4096,
-        metavar="MIB",
-        help="address space a cell has, in MiB (default 4096)",
-    )
+    add_pattern(parser, "--only", "families")
+    add_pattern(parser, "--solvers", "solvers")
+    add_number(parser, "--seeds", "N", 20, "cases of each family")
+    add_number(parser, "--first", "SEED", 500, "the first seed")
+    add_number(parser, "--limit", "S", 60.0, "CPU seconds per cell")
+    add_number(parser, "--memory", "MIB", 4096, "address space a cell has, in MiB")
     parser.add_argument("--out", type=Path, metavar="RESULTS.jsonl", help="file for the results")
     parser.add_argument(
         "--show", type=Path, metavar="RESULTS.jsonl", help="print the table of stored runs"

@@ -15,6 +15,7 @@ import time
 
 import networkx as nx
 import planar
+from arguments import add_number
 
 from ssh_abduction import solve
 
@@ -42,12 +43,8 @@ def cases(seed: int) -> list[tuple[str, nx.Graph, int, float, set[object]]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "--seeds", type=int, default=3, metavar="N", help="tours of each world (default 3)"
-    )
-    parser.add_argument(
-        "--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)"
-    )
+    add_number(parser, "--seeds", "N", 3, "tours of each world")
+    add_number(parser, "--limit", "S", 60.0, "seconds for each")
     options = parser.parse_args()
     print(
         "| world | steps | seed | status | dstates, places | truth | right maps | "

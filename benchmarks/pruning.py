@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from arguments import add_number
 from bench import machine, packages, run, store
 from suite import BARE, INSTANCES
 from table import OURS, WITHOUT
@@ -268,9 +269,7 @@ def main() -> None:
         metavar="SWITCHES",
         help="speed-ups, separated by commas (default all)",
     )
-    parser.add_argument(
-        "--seeds", type=int, default=5, metavar="N", help="traces of each family (default 5)"
-    )
+    add_number(parser, "--seeds", "N", 5, "traces of each family")
     parser.add_argument(
         "--resume", action="store_true", help="keep stored runs, and run only the others"
     )

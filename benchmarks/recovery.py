@@ -31,6 +31,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from arguments import add_number, add_pattern
 from fault_cases import (
     CAUSAL,
     MARGIN,
@@ -115,25 +116,10 @@ FAMILIES: dict[str, tuple[Callable[[int], Case], Theory]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "--only",
-        default="",
-        metavar="PATTERN",
-        help="run only families that match this regular expression",
-    )
-    parser.add_argument(
-        "--seeds", type=int, default=20, metavar="N", help="runs of each family (default 20)"
-    )
-    parser.add_argument(
-        "--first", type=int, default=800, metavar="SEED", help="the first seed (default 800)"
-    )
-    parser.add_argument(
-        "--limit",
-        type=float,
-        default=0.5,
-        metavar="S",
-        help="seconds that a step may take (default 0.5)",
-    )
+    add_pattern(parser, "--only", "families")
+    add_number(parser, "--seeds", "N", 20, "runs of each family")
+    add_number(parser, "--first", "SEED", 800, "the first seed")
+    add_number(parser, "--limit", "S", 0.5, "seconds that a step may take")
     parser.add_argument(
         "--out", type=Path, metavar="RESULTS.jsonl", help="file for the result of each run"
     )

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from arguments import add_number
 from instances import Walk, maze
 
 from ssh_abduction import SSHMap, Theory
@@ -54,18 +55,10 @@ def is_refused(walk: Walk, reject: float) -> bool:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument(
-        "--routes", type=int, default=1000, metavar="N", help="routes (default 1000)"
-    )
-    parser.add_argument(
-        "--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)"
-    )
-    parser.add_argument(
-        "--cells", type=int, default=4, metavar="N", help="mazes of N x N cells (default 4)"
-    )
-    parser.add_argument(
-        "--steps", type=int, default=40, metavar="N", help="actions of the robot (default 40)"
-    )
+    add_number(parser, "--routes", "N", 1000, "routes")
+    add_number(parser, "--first", "SEED", 0, "the first seed")
+    add_number(parser, "--cells", "N", 4, "mazes of N x N cells")
+    add_number(parser, "--steps", "N", 40, "actions of the robot")
     options = parser.parse_args()
     refused = np.zeros((len(REJECTS), 2), dtype=int)
     for seed in range(options.first, options.first + options.routes):

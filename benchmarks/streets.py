@@ -21,6 +21,7 @@ from typing import Any
 
 import networkx as nx
 import planar
+from arguments import add_number
 
 from perception.images import images_of
 from perception.reciprocal import ReciprocalTransformer
@@ -294,19 +295,9 @@ def _worlds(reach: float) -> Iterator[World]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "--seeds", type=int, default=20, metavar="N", help="drives through each world (default 20)"
-    )
-    parser.add_argument(
-        "--tours", type=int, default=2, metavar="N", help="tours of each drive (default 2)"
-    )
-    parser.add_argument(
-        "--reach",
-        type=float,
-        default=0.8,
-        metavar="M",
-        help="half the width of the streets that are drawn (default 0.8)",
-    )
+    add_number(parser, "--seeds", "N", 20, "drives through each world")
+    add_number(parser, "--tours", "N", 2, "tours of each drive")
+    add_number(parser, "--reach", "M", 0.8, "half the width of the streets that are drawn")
     options = parser.parse_args()
     print(
         "| world | steps | driven | dstates and places right | and paths | the only "

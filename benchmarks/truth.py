@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
+from arguments import add_number
 from instances import displaced, maze
 
 from simulator.plan_tours import tour
@@ -401,18 +402,12 @@ def arguments() -> argparse.ArgumentParser:
         metavar="N",
         help="number of traces, for plans of each plan (default 10; plans 1, taylor-hall 20)",
     )
-    parser.add_argument(
-        "--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)"
-    )
-    parser.add_argument(
-        "--cells", type=int, default=4, metavar="N", help="mazes of N x N cells (default 4)"
-    )
+    add_number(parser, "--first", "SEED", 0, "the first seed")
+    add_number(parser, "--cells", "N", 4, "mazes of N x N cells")
     parser.add_argument(
         "--steps", type=int, metavar="N", help="actions of the robot (default: mazes 40, plans 100)"
     )
-    parser.add_argument(
-        "--tours", type=int, default=10, metavar="N", help="tours of Taylor Hall (default 10)"
-    )
+    add_number(parser, "--tours", "N", 10, "tours of Taylor Hall")
     parser.add_argument(
         "--folder",
         type=Path,
@@ -420,9 +415,7 @@ def arguments() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="folder of the plans, or of the traces of worlds",
     )
-    parser.add_argument(
-        "--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)"
-    )
+    add_number(parser, "--limit", "S", 60.0, "seconds for each")
     parser.add_argument("--stars", action="store_true", help="give the solver stars, too")
     parser.add_argument(
         "--causal", action="store_true", help="use the causal theory, and judge only dstates"
@@ -445,20 +438,8 @@ def arguments() -> argparse.ArgumentParser:
             metavar="X",
             help=f"the field of Odometry (default {NOISE[name]})",
         )
-    parser.add_argument(
-        "--scale-error",
-        type=float,
-        default=0.0,
-        metavar="SHARE",
-        help="report all ways longer by this share (default 0)",
-    )
-    parser.add_argument(
-        "--bend-error",
-        type=float,
-        default=0.0,
-        metavar="DEGREES",
-        help="drift of the heading per metre (default 0)",
-    )
+    add_number(parser, "--scale-error", "SHARE", 0.0, "report all ways longer by this share")
+    add_number(parser, "--bend-error", "DEGREES", 0.0, "drift of the heading per metre")
     return parser
 
 
