@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from arguments import seeds_from
-from doubts import DOUBTS, spoilt
+from doubts import DOUBTS, spoilt, with_images
 from numpy.typing import NDArray
 
 from perception.confidence import NOISE
@@ -82,12 +82,7 @@ def with_bad_images(trace: Trace, kind: str, seed: int) -> tuple[Trace, NDArray[
     images, bad = spoilt(
         images_of(trace), kind, round(SHARE * len(trace)), np.random.default_rng(seed)
     )
-    return replace(
-        trace,
-        steps=tuple(
-            replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)
-        ),
-    ), bad
+    return with_images(trace, images), bad
 
 
 @dataclass(frozen=True)

@@ -133,6 +133,13 @@ def spoilt(
     return images, which
 
 
+def with_images(trace: Trace, images: NDArray[np.float64]) -> Trace:
+    """Replace the images of a trace."""
+    seen = [tuple(image) for image in images.tolist()]
+    steps = (replace(s, image=image) for s, image in zip(trace.steps, seen, strict=True))
+    return replace(trace, steps=tuple(steps))
+
+
 def driven(case: Case, tours: int, seed: int) -> tuple[Trace, NDArray[np.intp]]:
     """Simulate a drive. Return its trace with images, and the indices of the bad images."""
     laser, rng = Laser(noise=case.noise), np.random.default_rng(seed)
@@ -141,12 +148,7 @@ def driven(case: Case, tours: int, seed: int) -> tuple[Trace, NDArray[np.intp]]:
     if case.single:
         images = laser.scan(case.world, np.array([step.truth["pose"] for step in trace.steps]), rng)
     images, bad = spoilt(images, *case.bad, rng)
-    return replace(
-        trace,
-        steps=tuple(
-            replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)
-        ),
-    ), bad
+    return with_images(trace, images), bad
 
 
 @dataclass(frozen=True)

@@ -782,6 +782,11 @@ def five_circuits() -> tuple[Trace, BootstrapLearner]:
     return trace, BootstrapLearner().fit(trace)
 
 
+def with_images(trace: Trace, images: np.ndarray[Any, Any]) -> Trace:
+    seen = zip(trace.steps, images.tolist(), strict=True)
+    return replace(trace, steps=tuple(replace(step, image=tuple(image)) for step, image in seen))
+
+
 @pytest.mark.slow
 def test_bad_images_become_faults_if_views_may_be_misread(
     five_circuits: tuple[Trace, BootstrapLearner],
@@ -790,12 +795,7 @@ def test_bad_images_become_faults_if_views_may_be_misread(
     images, bad = images_of(trace).copy(), [9, 30]  # one of twenty
     for i in bad:  # somebody stands before the laser
         images[i] = np.minimum(images[i], np.where(abs(np.arange(180) - 90) < 20, 0.4, np.inf))
-    spoilt = replace(
-        trace,
-        steps=tuple(
-            replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)
-        ),
-    )
+    spoilt = with_images(trace, images)
     theory = Theory.topological().replace(misread=1.5, weigh="count")
     with pytest.warns(ImageWarning, match="2 of 40 images fit no view"):
         learner = BootstrapLearner(theory).fit(spoilt)
@@ -821,12 +821,7 @@ def test_warning_names_bad_images_if_no_fault_is_allowed() -> None:
     trace = simulate(World.named("notched-rectangle"), tours=4, seed=503)
     images = images_of(trace).copy()
     images[9] = np.random.default_rng(0).uniform(0.1, 8, 180)
-    spoilt = replace(
-        trace,
-        steps=tuple(
-            replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)
-        ),
-    )
+    spoilt = with_images(trace, images)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         learner = BootstrapLearner(Theory.topological().replace(displacement="none"))

@@ -175,15 +175,17 @@ def test_repr_of_a_mapper_shows_its_progress() -> None:
     assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
 
 
+def drawn(data: st.DataObject, most: int) -> tuple[Trace, Theory]:
+    """Draw a trace of at most this many steps, and a theory. Sketches ignore displacements."""
+    trace = data.draw(traces(max_steps=most), label="trace").without_displacements()
+    fixed = (*FOREIGN, *PAIRS, "planar")
+    return trace, settle(trace, data.draw(theories(trace, fixed=fixed), label="theory")).theory
+
+
 @settings(max_examples=25)
 @given(st.data())
 def test_online_sketches_are_consistent(data: st.DataObject) -> None:
-    trace = data.draw(
-        traces(max_steps=14), label="trace"
-    ).without_displacements()  # sketches ignore evidence
-    theory = settle(
-        trace, data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory")
-    ).theory
+    trace, theory = drawn(data, 14)
     sketch = data.draw(st.sampled_from(Sketch.all_of(trace.steps[0], theory)), label="sketch")
     for i, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True)):
         assert check(trace.prefix(i + 1), sketch.map(), theory) == ()
@@ -219,12 +221,7 @@ def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
 @settings(max_examples=8)
 @given(st.data())
 def test_map_continued_by_a_sketch_is_consistent(data: st.DataObject) -> None:
-    trace = data.draw(
-        traces(max_steps=10), label="trace"
-    ).without_displacements()  # sketches ignore evidence
-    theory = settle(
-        trace, data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory")
-    ).theory
+    trace, theory = drawn(data, 10)
     draft(
         trace,
         theory,
