@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ssh_abduction.cli.import_log import add_reading
-from ssh_abduction.cli.options import add_theory, output
+from ssh_abduction.cli.options import add_jobs, add_theory, output
 from ssh_abduction.cli.parsing import Verbs
 
 
@@ -54,18 +54,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_setting(
         "again", "whether to map also logs that are already mapped (default: false)", default=False
     )
-    many = parser.add_argument_group("many logs")
-    parser.add(
-        "--jobs N",
-        "map N logs at a time, each in its own process; -1 for one per core (default: 1)",
-        to=many,
-        type=int,
-    )
-    parser.add(
-        "--scheduler ADDRESS",
-        "map on the workers of the Dask scheduler at this address, tcp://host:port",
-        to=many,
-    )
+    add_jobs(parser, "map", "logs")
     add_reading(parser)
     add_theory(
         parser,

@@ -126,6 +126,23 @@ def add_limits(parser: Parser, printed: str, seconds: float | None = None) -> No
     )
 
 
+def add_jobs(parser: Parser, act: str, things: str, said: str | None = None) -> None:
+    """Add the options that spread work on processes or a cluster, such as "solve" of "traces"."""
+    many = parser.add_argument_group(f"many {things}", said)
+    parser.add(
+        "--jobs N",
+        f"{act} N {things} at a time, each in its own process; -1 for one per core (default: 1; "
+        "with --scheduler, two per core of its workers)",
+        to=many,
+        type=int,
+    )
+    parser.add(
+        "--scheduler ADDRESS",
+        f"{act} on the workers of the Dask scheduler at this address, tcp://host:port",
+        to=many,
+    )
+
+
 def add_output(parser: Parser) -> None:
     """Add the option -o TRACE, which names the trace file to write."""
     parser.add(
