@@ -167,6 +167,18 @@ def load(path: str | os.PathLike[str]) -> Stored:
             f"{path}: expected a .skops file that train or save wrote, got something else "
             f"({type(error).__name__}); train it again"
         ) from error
+    _check_parts(held, path)
+    try:
+        return Stored(_learnt_again(held["model"]), tuple(held["classes"]), held["versions"])
+    except Exception as error:  # Each part of a damaged model fails in its own way.
+        raise PerceptionError(
+            f"{path}: model: expected a fitted one, got {type(error).__name__}: {error}; "
+            "train it again"
+        ) from None
+
+
+def _check_parts(held: object, path: str | os.PathLike[str]) -> None:
+    """Raise PerceptionError if an object is not the dict that `save` wrote to a file."""
     if (
         not isinstance(held, dict)
         or not isinstance(held.get("format"), str)
@@ -188,13 +200,6 @@ def load(path: str | os.PathLike[str]) -> Stored:
                 f"{path}: {part}: expected a {kind.__name__}, got {_kind(held.get(part))}; "
                 "save the recogniser again"
             )
-    try:
-        return Stored(_learnt_again(held["model"]), tuple(held["classes"]), held["versions"])
-    except Exception as error:  # Each part of a damaged model fails in its own way.
-        raise PerceptionError(
-            f"{path}: model: expected a fitted one, got {type(error).__name__}: {error}; "
-            "train it again"
-        ) from None
 
 
 def _learnt_again(model: Any) -> Any:

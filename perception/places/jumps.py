@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
@@ -154,23 +155,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
     still = [cut for cut in track.cuts if far[cut] <= STILL and cut not in track.breaks]
     notes = []
     if jumps:
-        first, most = jumps[0], max(jumps, key=far.__getitem__)
-        anew = (
-            ", where it starts anew from 0"
-            if math.hypot(*log.scans[first].odometry[:2]) < ANEW
-            else ""
-        )
-        notes.append(
-            (
-                f"The odometry jumps {_times(len(jumps))} in {len(log)} scans: by "
-                f"{far[first]:.1f} m before scan {first} ({_where(log, first)}){anew}"
-            )
-            + (f", and by {far[most]:.1f} m at most" if len(jumps) > 1 else "")
-            + ". Nothing is known of how the robot moved there, so the trace has no displacement "
-            "across. An odometer that is started anew, or a second program that publishes the same "
-            "odometry, jumps like this. So does a log that is not in the order of the drive."
-            + (TWO_DRIVES if anew or len(jumps) == 1 else "")
-        )
+        notes.append(_describe_jumps(log, jumps, far))
     if still:
         notes.append(
             f"The odometry stands still in {len(still)} steps, from scan {still[0]} "
@@ -200,6 +185,22 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
             "the scans. If the robot was carried there, cut the log there, and map each part."
         )
     return notes
+
+
+def _describe_jumps(log: RobotLog, jumps: list[int], far: Mapping[int, float]) -> str:
+    """Say in a note that the odometer jumped at some cuts, and how far (metres)."""
+    first, most = jumps[0], max(jumps, key=far.__getitem__)
+    starts_anew = math.hypot(*log.scans[first].odometry[:2]) < ANEW
+    return (
+        f"The odometry jumps {_times(len(jumps))} in {len(log)} scans: by {far[first]:.1f} m "
+        f"before scan {first} ({_where(log, first)})"
+        + (", where it starts anew from 0" if starts_anew else "")
+        + (f", and by {far[most]:.1f} m at most" if len(jumps) > 1 else "")
+        + ". Nothing is known of how the robot moved there, so the trace has no displacement "
+        "across. An odometer that is started anew, or a second program that publishes the same "
+        "odometry, jumps like this. So does a log that is not in the order of the drive."
+        + (TWO_DRIVES if starts_anew or len(jumps) == 1 else "")
+    )
 
 
 def _gaps(log: RobotLog, track: Track) -> list[int]:

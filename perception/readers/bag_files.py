@@ -81,10 +81,7 @@ def files_opened(path: Path, format: str) -> Iterator[Files]:
                 # Other parts of the drive may lie beside the file. The user may have meant all.
                 files.notes += _beside(path)
         except OSError as error:
-            raise_if_disk_is_full(error, named(path))
-            raise LogError(
-                f"{named(path)}: expected a readable bag: {error.strerror or error}; check the path"
-            ) from None
+            raise _unreadable(path, error) from None
         yield files
 
 
@@ -94,28 +91,8 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
         (part for part in path.iterdir() if NAMES.search(part.name) and part.is_file()), key=_number
     )
     files = Files("ros2")
-    if (path / "metadata.yaml").exists():
-        try:
-            reader = _by_rosbags(path, "ros2", stack)
-            files.readers.append(reader)
-            if len(reader.storage.storages) < len(parts):
-                files.notes.append(
-                    f"{named(path / 'metadata.yaml')} names {len(reader.storage.storages)} of "
-                    f"the {len(parts)} files beside it, and only these are read. To read all, "
-                    "run ros2 bag reindex."
-                )
-            return files
-        except Exception as error:  # Damaged bytes can raise any error in the library.
-            raise_if_disk_is_full(error, named(path))
-            if not parts:
-                raise LogError(
-                    f"{named(path)}: expected a bag of ROS 2, got one that cannot be opened "
-                    f"({cause(error)}); {REINDEX}"
-                ) from None
-            files.notes.append(
-                f"{named(path / 'metadata.yaml')} cannot be used ({cause(error)}): the bag is "
-                "read without it."
-            )
+    if (path / "metadata.yaml").exists() and _open_by_metadata(path, parts, files, stack):
+        return files
     if not parts:
         raise LogError(
             f"{named(path)}: expected a folder of ROS 2 with metadata.yaml, or with files "
@@ -131,23 +108,7 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
             f"got {names}; name one of the files, or ros2 bag reindex the folder"
         )
     files.format = next((found for part in parts if (found := _format(part))), "ros2")
-    unread = []
-    for part in parts:
-        try:
-            _open_part(part, files, folder, stack)
-        except OSError as error:
-            raise_if_disk_is_full(error, named(part))
-            unread.append(
-                LogError(
-                    f"{named(part)}: expected a readable bag: {error.strerror or error}; "
-                    "check the path"
-                )
-            )
-        except LogError as error:
-            unread.append(error)
-    if not files.readers:
-        raise unread[0]
-    files.notes += [f"A part was not read. {error}" for error in unread]
+    _open_parts(parts, files, folder, stack)
     if len(parts) > 1:
         files.notes.append(
             f"{named(path)} has no metadata.yaml that can be used: its {len(parts)} parts are "
@@ -155,6 +116,58 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
         )
     files.notes += _gaps(parts)
     return files
+
+
+def _unreadable(path: Path, error: OSError) -> LogError:
+    """Make the error for a file or folder that cannot be read, or raise one for a full disk."""
+    raise_if_disk_is_full(error, named(path))
+    return LogError(
+        f"{named(path)}: expected a readable bag: {error.strerror or error}; check the path"
+    )
+
+
+def _open_by_metadata(path: Path, parts: list[Path], files: Files, stack: ExitStack) -> bool:
+    """Open a folder by its metadata.yaml. Return False, with a note, if only `parts` can be read.
+
+    Raises LogError if there are no parts either.
+    """
+    try:
+        reader = _by_rosbags(path, "ros2", stack)
+        files.readers.append(reader)
+        if len(reader.storage.storages) < len(parts):
+            files.notes.append(
+                f"{named(path / 'metadata.yaml')} names {len(reader.storage.storages)} of "
+                f"the {len(parts)} files beside it, and only these are read. To read all, "
+                "run ros2 bag reindex."
+            )
+        return True
+    except Exception as error:  # Damaged bytes can raise any error in the library.
+        raise_if_disk_is_full(error, named(path))
+        if not parts:
+            raise LogError(
+                f"{named(path)}: expected a bag of ROS 2, got one that cannot be opened "
+                f"({cause(error)}); {REINDEX}"
+            ) from None
+        files.notes.append(
+            f"{named(path / 'metadata.yaml')} cannot be used ({cause(error)}): the bag is "
+            "read without it."
+        )
+        return False
+
+
+def _open_parts(parts: list[Path], files: Files, folder: Path, stack: ExitStack) -> None:
+    """Open each part of a drive that can be read, or raise the error of the first part."""
+    unread = []
+    for part in parts:
+        try:
+            _open_part(part, files, folder, stack)
+        except OSError as error:
+            unread.append(_unreadable(part, error))
+        except LogError as error:
+            unread.append(error)
+    if not files.readers:
+        raise unread[0]
+    files.notes += [f"A part was not read. {error}" for error in unread]
 
 
 def _open_part(path: Path, files: Files, folder: Path, stack: ExitStack) -> None:

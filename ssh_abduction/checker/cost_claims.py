@@ -286,17 +286,7 @@ class _Errors:
         pose = np.column_stack([np.cumsum(onward, axis=0), heading])
         off_dstate = z[self._begin : self._begin + self._off.size].reshape(-1, 3) * self._off
         self.position = pose[:, :2] - (off_dstate[:, :2] if len(self._off) else 0.0)
-        # The derivatives of each movement, (x, y, heading), by its three errors, scale and drift.
-        own = np.zeros((size, 3, 5))
-        own[:, 0, 0], own[:, 0, 1] = cos / (1 + scale), -sin / (1 + scale)
-        own[:, 1, 0], own[:, 1, 1] = sin / (1 + scale), cos / (1 + scale)
-        own[:, 2, 2] = 1.0
-        own[:, :2, 3] = -onward / (1 + scale) * self._sigma[0]
-        own[:, 0, 4] = onward[:, 1] * self._way / 2 * self._sigma[1]
-        own[:, 1, 4] = -onward[:, 0] * self._way / 2 * self._sigma[1]
-        own[:, 2, 4] = -self._way * self._sigma[1]
-        own[:, :, :3] = own[:, :, :3] @ self._root
-        own[0] = 0.0
+        own = self._own_errors(cos, sin, onward, 1 + scale)
         rows: list[Array] = []
         off: list[float] = []
         for first, last, is_dstate in self._loops:
@@ -324,6 +314,20 @@ class _Errors:
             rows.append(row)
             off += gap.tolist()
         return np.array(off), np.concatenate(rows) if rows else np.zeros((0, self._size))
+
+    def _own_errors(self, cos: Array, sin: Array, onward: Array, scale: float) -> Array:
+        """Compute derivatives, (n, 3, 5), of movements by their three errors, scale and drift."""
+        own = np.zeros((len(onward), 3, 5))
+        own[:, 0, 0], own[:, 0, 1] = cos / scale, -sin / scale
+        own[:, 1, 0], own[:, 1, 1] = sin / scale, cos / scale
+        own[:, 2, 2] = 1.0
+        own[:, :2, 3] = -onward / scale * self._sigma[0]
+        own[:, 0, 4] = onward[:, 1] * self._way / 2 * self._sigma[1]
+        own[:, 1, 4] = -onward[:, 0] * self._way / 2 * self._sigma[1]
+        own[:, 2, 4] = -self._way * self._sigma[1]
+        own[:, :, :3] = own[:, :, :3] @ self._root
+        own[0] = 0.0
+        return own
 
     def _row(self, pose: Array, own: Array, first: int, last: int) -> Array:
         """Compute the derivatives, by all unknowns, of the pose at `last` minus that at `first`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,8 @@ from ssh_abduction.data.map_file import read_json
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison
+    from ssh_abduction.rivals.drive_joins import DrivePair
+    from ssh_abduction.rivals.known_sides import SharedSides
     from ssh_abduction.rivals.listing import Listing
 
 # Values in run.json that differ between runs even if all settings and results are the same.
@@ -80,23 +82,9 @@ def run(options: argparse.Namespace) -> int:
         between = difference(listing.maps[i], there.maps[j], names, drives=listing.drives)
         print(json_line({**record, **between.to_dict()}) if options.json else between)
         return 0
-    found = compare(listing, other)
-    if listing.weighed is not None:
-        record["confidence"] = listing.weighed.confidence
-    elif listing.by_minimality:
-        record["by_minimality"] = [join.to_dict() for join in listing.by_minimality]
-    drives = joins_of_drives(listing)
-    if drives:
-        record["drives"] = [pair.to_dict() for pair in drives]
-    sides = shared_sides(listing)
-    if sides is not None:
-        record["sides"] = sides.to_dict()
-    if listing.faults:
-        record["faults"] = [fault.to_dict() for fault in listing.faults]
-    if listing.warnings:
-        record["warnings"] = list(listing.warnings)
+    found, drives, sides = compare(listing, other), joins_of_drives(listing), shared_sides(listing)
     if options.json:
-        print(json_line({**record, **found.to_dict()}))
+        print(json_line({**record, **_record(listing, drives, sides), **found.to_dict()}))
         return 0
     lines = [*_lines(found), *_faults(listing)]
     lines += [f"  {listing.joined}"] if listing.joined else []
@@ -106,6 +94,22 @@ def run(options: argparse.Namespace) -> int:
         print(listing.sureness)
     warn(map(printable, listing.warnings))
     return 0
+
+
+def _record(
+    listing: Listing, drives: Sequence[DrivePair], sides: SharedSides | None
+) -> dict[str, Any]:
+    """Return what is known of the maps of a listing, as plain data for --json."""
+    weighed = listing.weighed
+    record = {
+        "by_minimality": [join.to_dict() for join in listing.by_minimality if weighed is None],
+        "drives": [pair.to_dict() for pair in drives],
+        "sides": None if sides is None else sides.to_dict(),
+        "faults": [fault.to_dict() for fault in listing.faults],
+        "warnings": list(listing.warnings),
+    }
+    first = {} if weighed is None else {"confidence": weighed.confidence}
+    return {**first, **{name: value for name, value in record.items() if value}}
 
 
 def differences(first: str, other: str) -> dict[str, tuple[Any, Any]]:

@@ -181,12 +181,9 @@ class MapQuestion(FileQuestion):
             interrupt()
 
         def last_words(_: Stop) -> tuple[FileAnswer, int]:
-            known = [
-                self._answer(number, paths, mapping.known(), content)
-                for mapping in begun
-                if mapping.search is not None
-            ]
-            return known[0] if known else self._given_up(number, paths[0]), interrupted_code()
+            if not begun or begun[0].search is None:
+                return self._given_up(number, paths[0]), interrupted_code()
+            return self._answer(number, paths, begun[0].known(), content), interrupted_code()
 
         guard = Guard(interrupt, last_words, None, None, given_up=given_up, print_last=answer_last)
         # A worker process does not handle Ctrl-C: its parent stops it.
@@ -223,11 +220,8 @@ class MapQuestion(FileQuestion):
         """Make the answer for a log that was mapped, or for several that were mapped together."""
         files, log = done.files(), done.log
         run = json.loads(files["run.json"])
-        run["log"]["source"], run["settings"], run["digest"] = (
-            " + ".join(paths),
-            self.settings,
-            content,
-        )
+        run["log"]["source"] = " + ".join(paths)
+        run["settings"], run["digest"] = self.settings, content
         for drive, path in zip(run.get("drives", ()), paths, strict=False):
             drive["source"] = path
         files["run.json"] = (json.dumps(run, indent=2, ensure_ascii=False) + "\n").encode()

@@ -16,6 +16,7 @@ from typing import Any
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.obeyed_corrections import Obeying
 from ssh_abduction.cli.options import (
+    add_jobs,
     add_limits,
     add_theory,
     check_output,
@@ -108,27 +109,15 @@ def add_parser(verbs: Verbs) -> None:
         type=int,
     )
     add_limits(parser, "the best answer so far")
-    many = parser.add_argument_group(
-        "many traces",
-        (
-            "With several traces, or with one of these options, each result is one line, in the "
-            "order of the traces. If a trace fails, its line says why, and the others are still "
-            "solved. The exit code is 1 if there was an error, else the highest code of the "
-            "traces. Limits hold for each trace. The memory limit is for the whole process: it "
-            "includes other threads of a Dask worker and, except on Linux, earlier traces."
-        ),
-    )
-    parser.add(
-        "--jobs N",
-        "solve N traces at a time, each in its own process; -1 for one per core (default: 1; "
-        "with --scheduler, two per core of its workers)",
-        to=many,
-        type=int,
-    )
-    parser.add(
-        "--scheduler ADDRESS",
-        "solve on the workers of the Dask scheduler at this address, tcp://host:port",
-        to=many,
+    add_jobs(
+        parser,
+        "solve",
+        "traces",
+        "With several traces, or with one of these options, each result is one line, in the order "
+        "of the traces. If a trace fails, its line says why, and the others are still solved. The "
+        "exit code is 1 if there was an error, else the highest code of the traces. Limits hold "
+        "for each trace. The memory limit is for the whole process: it includes other threads of "
+        "a Dask worker and, except on Linux, earlier traces.",
     )
     add_theory(parser)
     parser.add_setting(
@@ -182,6 +171,11 @@ def run(options: argparse.Namespace) -> int:
     trace = _joint(options.traces) if options.together else Trace.load(options.traces[0])
     if options.joint_trace is not None:
         trace.save(options.joint_trace)
+    return _solve(options, trace)
+
+
+def _solve(options: argparse.Namespace, trace: Trace) -> int:
+    """Search for the minimal maps of a trace, and print and save them. Return the exit code."""
     number_steps(options, trace)
     theory = theory_of(options)
     theory.check_steps(trace)

@@ -43,17 +43,14 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     """
     if explanation:
         return f"{solution.status.value}: {explanation}"
-    if solution.status is Status.UNSATISFIABLE and not solution.stopped:
-        kinds = ", ".join(evidence.name for evidence in evidence_of(solution.theory))
-        return (
-            "unsatisfiable: no map satisfies the axioms: the evidence rejects each map that clingo "
-            f"found ({kinds})"
-        )
     if solution.status is Status.UNSATISFIABLE:
-        return (
-            "unsatisfiable: no map satisfies the axioms; the reason was not found in time "
-            f"({solution.stopped})"
+        kinds = ", ".join(evidence.name for evidence in evidence_of(solution.theory))
+        reason = (
+            f"; the reason was not found in time ({solution.stopped})"
+            if solution.stopped
+            else f": the evidence rejects each map that clingo found ({kinds})"
         )
+        return f"unsatisfiable: no map satisfies the axioms{reason}"
     why = f" ({solution.stopped})" if solution.stopped else ""
     seconds = (
         f"{solution.seconds.total:.2f} s, {solution.effort.prefix} of {solution.steps} steps "
@@ -83,20 +80,25 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         return (
             f"feasible{why}: {counts}, {claim}; any map has {bound or 'no proven bound'}; {seconds}"
         )
+    return f"optimal: {counts}; {_number_of_maps(solution, count)}; {seconds}"
+
+
+def _number_of_maps(solution: Solution, count: int) -> str:
+    """Say how many minimal maps there are, how many of each further level, and if all are found."""
     least = solution.levels[0].count if solution.levels else count
     found = (
         counted(least, "minimal maps")
-        if weighed is None
+        if solution.weighed is None
         else f"{counted(least, 'maps')} of least cost"
     )
     for level in solution.levels[1:]:
         parts = (counted(v, k) for k, v in _counts_of(level.cost, solution.theory).items())
         found += f"; {level.count} with {', '.join(parts)}"
+    if solution.complete:
+        return found
     beyond = f" that cost up to {solution.within} more" if solution.minimal_listed else ""
-    return (
-        f"optimal: {counts}; "
-        f"{found}{'' if solution.complete else f', and there may be more{beyond}{why}'}; {seconds}"
-    )
+    stopped = f" ({solution.stopped})" if solution.stopped else ""
+    return f"{found}, and there may be more{beyond}{stopped}"
 
 
 def _counts_of(cost: Cost, theory: Theory) -> dict[str, float]:

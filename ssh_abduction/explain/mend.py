@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import AbductionError
@@ -13,7 +13,7 @@ from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.explain.piece import Piece
-from ssh_abduction.explain.question import LimitedQuestion
+from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Status, Stop
 from ssh_abduction.theory.fields import ASSERTIONS
@@ -137,14 +137,9 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
     """The search for the answer of `explain_trace`, with the same parameters."""
 
     def __init__(
-        self,
-        trace: Trace,
-        theory: Theory | None = None,
-        *,
-        time_limit: float | None = None,
-        memory_limit: int | None = None,
+        self, trace: Trace, theory: Theory | None = None, **limits: Unpack[QuestionLimits]
     ) -> None:
-        super().__init__(trace, theory, time_limit, memory_limit)
+        super().__init__(trace, theory, **limits)
         self._possible: bool | None = None
         self._clash: Explanation | None = None
         self._mends: list[Mend] = []

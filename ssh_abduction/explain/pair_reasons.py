@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
+from typing import Unpack
 
 from ssh_abduction.data.checks import a_count_of_maps
 from ssh_abduction.data.closure import match_in_words
@@ -31,7 +32,7 @@ from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.derivation import Derivation
 from ssh_abduction.explain.no_map import Explanation, check_two_steps, explain
 from ssh_abduction.explain.piece import Piece
-from ssh_abduction.explain.question import LimitedQuestion
+from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import EQUAL, Cost, Judging, Status, Stop, facts
@@ -94,16 +95,9 @@ def explain_pair(
         Kuipers & Beeson 2002, section 4.2: why x0 and x4 of the rectangle differ.
     """
     a_count_of_maps(max_maps, SolverError)
-    return PairQuestion(
-        trace,
-        first,
-        second,
-        checked_theory(theory),
-        time_limit=time_limit,
-        memory_limit=memory_limit,
-        max_maps=max_maps,
-        known=known,
-    ).answer()
+    theory = checked_theory(theory)
+    limits = QuestionLimits(time_limit=time_limit, memory_limit=memory_limit, known=known)
+    return PairQuestion(trace, first, second, theory, max_maps=max_maps, **limits).answer()
 
 
 class PairQuestion(LimitedQuestion[PairExplanation]):
@@ -120,12 +114,10 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         second: int,
         theory: Theory | None = None,
         *,
-        time_limit: float | None = None,
-        memory_limit: int | None = None,
         max_maps: int | None = 100,
-        known: Iterable[SSHMap] = (),
+        **limits: Unpack[QuestionLimits],
     ) -> None:
-        super().__init__(trace, theory, time_limit, memory_limit, known)
+        super().__init__(trace, theory, **limits)
         check_two_steps(trace, first, second)
         names = named_steps(drives_of(trace), len(trace))
         self.first, self.second = names[min(first, second)], names[max(first, second)]

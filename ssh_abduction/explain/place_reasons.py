@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, Unpack
 
 from ssh_abduction.checker.moves import Course
 from ssh_abduction.checker.reading import Reading
@@ -26,7 +26,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import course_named, list_in_words, regions_at
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import attributes_of
-from ssh_abduction.explain.question import LimitedQuestion
+from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
 from ssh_abduction.solver import Stop, with_regions
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -64,15 +64,8 @@ def explain_place(
         MapError: The map has no such place or path, or a known map is of another trace.
         TraceError, TheoryError: As `solve` does.
     """
-    return PlaceQuestion(
-        trace,
-        place,
-        path,
-        checked_theory(theory),
-        time_limit=time_limit,
-        memory_limit=memory_limit,
-        known=known,
-    ).answer()
+    limits = QuestionLimits(time_limit=time_limit, memory_limit=memory_limit, known=known)
+    return PlaceQuestion(trace, place, path, checked_theory(theory), **limits).answer()
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,12 +149,9 @@ class PlaceQuestion(LimitedQuestion[PlaceExplanation]):
         place: int,
         path: int | None = None,
         theory: Theory | None = None,
-        *,
-        time_limit: float | None = None,
-        memory_limit: int | None = None,
-        known: Iterable[SSHMap] = (),
+        **limits: Unpack[QuestionLimits],
     ) -> None:
-        super().__init__(trace, theory, time_limit, memory_limit, known)
+        super().__init__(trace, theory, **limits)
         a_whole_number("place", place, MapError, 0)
         if path is not None:
             a_whole_number("path", path, MapError, 0)

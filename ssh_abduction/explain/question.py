@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable
 from contextlib import suppress
-from typing import Generic, TypeVar
+from typing import Generic, TypedDict, TypeVar
 
 from ssh_abduction.data.maps import Fault, SSHMap, check_of_trace, checked_maps
 from ssh_abduction.data.trace import Trace
@@ -26,6 +26,16 @@ from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 _Answer = TypeVar("_Answer")
+
+
+class QuestionLimits(TypedDict, total=False):
+    """The limits of a question, and known maps of its trace, as in `LimitedQuestion`."""
+
+    time_limit: float | None
+    memory_limit: int | None
+    known: Iterable[SSHMap]
+
+
 SHORTEST = 0.05  # the least time limit of a search in seconds
 
 
@@ -45,8 +55,8 @@ class LimitedQuestion(ABC, Generic[_Answer]):
         self,
         trace: Trace,
         theory: Theory | None,
-        time_limit: float | None,
-        memory_limit: int | None,
+        time_limit: float | None = None,
+        memory_limit: int | None = None,
         known: Iterable[SSHMap] = (),
     ) -> None:
         check_limit("time_limit (--time-limit)", "seconds", time_limit)

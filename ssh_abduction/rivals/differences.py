@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, TypeAlias
 
 import networkx as nx
@@ -201,23 +202,6 @@ def difference(
             f"got {named[-1].stop}; use the drives of the solution"
         )
     table = Table([first, other], named)
-    changes: list[Change] = []
-    for sort in table.ones:
-        found = list(_changes(table, sort))
-        if sort == "courses":  # a step along another path is along another course
-            moved = {
-                t
-                for change in changes
-                if change.sort == "paths"
-                for group in (*change.first, *change.other)
-                for t in group
-            }
-            found = [
-                change
-                for change in found
-                if moved.isdisjoint(t for group in (*change.first, *change.other) for t in group)
-            ]
-        changes += found
     links = (_named_links(first, table.steps), _named_links(other, table.steps))
     unmoved = _unmoved(first, other)
     only = [
@@ -232,13 +216,29 @@ def difference(
         ids=(first.id, other.id),
         names=(called[0], called[1]),
         sizes=(_size(first), _size(other)),
-        changes=tuple(changes),
+        changes=tuple(_all_changes(table)),
         links=(only[0], only[1]),
         faults=(faults[0], faults[1]),
         chi2=(first.fit.chi2, other.fit.chi2) if first.fit and other.fit else None,
         has_places=(bool(first.places), bool(other.places)),
         sides=only_in(first, other, table.steps),
     )
+
+
+def _all_changes(table: Table) -> list[Change]:
+    """List the changes of each sort between the two maps of a table."""
+    changes: list[Change] = []
+    for sort in table.ones:
+        found = list(_changes(table, sort))
+        if sort == "courses":  # a step along another path is along another course
+            moved = {t for change in changes if change.sort == "paths" for t in _steps_of(change)}
+            found = [change for change in found if moved.isdisjoint(_steps_of(change))]
+        changes += found
+    return changes
+
+
+def _steps_of(change: Change) -> Iterable[int]:
+    return chain(*change.first, *change.other)
 
 
 def _changes(table: Table, sort: Sort) -> Iterable[Change]:

@@ -181,26 +181,7 @@ class Listing:
         a_text("where", where, MapError)
         maps = tuple(ssh_map.renumbered() for ssh_map in maps_of(data, where))
         answer: Mapping[str, Any] = data if isinstance(data, Mapping) and "maps" in data else {}
-        for i, (record, ssh_map) in enumerate(zip(answer.get("maps", [data]), maps, strict=True)):
-            if "id" in record and record["id"] != ssh_map.id:
-                mend = "the map was changed by hand: solve again, or leave the id out"
-                raise MapError(
-                    f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got "
-                    f"{brief(record['id'])}; {mend}"
-                )
-        if maps and "steps" in answer and answer["steps"] != len(maps[0].dstate_at):
-            raise MapError(
-                f"{where}: steps: expected {len(maps[0].dstate_at)}, as map 1 has, got "
-                f"{brief(answer['steps'])}; solve the trace again"
-            )
-        # each map is listed once
-        first_with: dict[str, int] = {}
-        for i, ssh_map in enumerate(maps):
-            if (known := first_with.setdefault(ssh_map.id, i)) != i:
-                raise MapError(
-                    f"{where}: maps[{i}]: expected another map, got the same map as maps[{known}] "
-                    "again; leave it out"
-                )
+        _check_listed(maps, answer.get("maps", [data]), answer, where)
         theory = theory_in(answer["theory"], where) if "theory" in answer else None
         status, count = answer.get("status"), answer.get("count", len(maps))
         if status is not None:
@@ -208,28 +189,16 @@ class Listing:
             one_of(f"{where}: status", status, every, MapError, mend="solve again")
         what = "the number of minimal maps"
         a_whole_number(f"{where}: count", count, MapError, what=what, mend="solve again")
-        # with levels, only maps of the first level are minimal
-        levels = answer.get("levels")
-        minimal: Any = len(maps)
-        if levels is not None:
-            first = levels[0] if isinstance(levels, list) and levels else None
-            minimal = first.get("count") if isinstance(first, Mapping) else None
-            if not is_whole(minimal) or not 0 < minimal <= len(maps):
-                raise MapError(
-                    f"{where}: levels: expected a list whose first entry counts the minimal maps, "
-                    f"got {brief(levels)}; solve again"
-                )
+        minimal = _count_minimal(answer.get("levels"), len(maps), where)
         complete = answer.get("complete")
         if complete is not None:
             a_flag(f"{where}: complete", complete, MapError)
-        backbone = None
+        steps, backbone = len(maps[0].dstate_at) if maps else 0, None
         if maps and "backbone" in answer:
-            backbone = Backbone.from_dict(
-                answer["backbone"], len(maps[0].dstate_at), f"{where}: backbone"
-            )
+            backbone = Backbone.from_dict(answer["backbone"], steps, f"{where}: backbone")
         is_optimal = status == Status.OPTIMAL.value
         listed = complete or (minimal < len(maps)) if is_optimal else complete
-        read, steps = FieldReader(where), len(maps[0].dstate_at) if maps else 0
+        read = FieldReader(where)
         drives = drives_in(read, answer if maps else {}, steps)
         weighed = None
         if maps and answer.get("weighed"):
@@ -262,17 +231,15 @@ class Listing:
         first = None
         for i, ssh_map in enumerate(self.maps):
             if len(ssh_map.dstate_at) != self.steps:
-                mend = "compare maps of one trace"
                 raise MapError(
                     f"{self._name(i)}: expected {self.steps} steps, as {self._name(0)} has, got "
-                    f"{len(ssh_map.dstate_at)}; {mend}"
+                    f"{len(ssh_map.dstate_at)}; compare maps of one trace"
                 )
             if not self.one_view:
                 continue
             seen = _seen(ssh_map)
             first = first or seen
-            if first != seen:
-                self._raise_other_trace(first, seen, i)
+            _check_views(first, seen, self._name(i), f"{self._name(0)} has")
         return self
 
     def check_same_trace(self, other: Listing) -> None:
@@ -282,21 +249,12 @@ class Listing:
         )
         ours = "the first maps" if self.source == "maps" else f"the maps of {self.source}"
         if other.steps != self.steps:
-            mend = "compare maps of one trace"
             raise MapError(
                 f"{other.source}: expected {self.steps} steps, as {ours} have, got {other.steps}; "
-                f"{mend}"
+                "compare maps of one trace"
             )
-        if not (self.one_view and other.one_view):
-            return
-        for t, (here, there) in enumerate(
-            zip(_seen(self.maps[0]), _seen(other.maps[0]), strict=True)
-        ):
-            if here != there:
-                raise MapError(
-                    f"{other.source}: expected the view {brief(here)} at step {t}, as {ours} "
-                    f"have, got {brief(there)}; {ONE_TRACE}"
-                )
+        if self.one_view and other.one_view:
+            _check_views(_seen(self.maps[0]), _seen(other.maps[0]), other.source, f"{ours} have")
 
     def number(self, name: str) -> int:
         """Find the index of a map, counted from 0.
@@ -327,23 +285,64 @@ class Listing:
         """Name the map with index i, for messages."""
         return f"maps[{i}]" if self.source == "maps" else f"{self.source}: maps[{i}]"
 
-    def _raise_other_trace(
-        self, first: tuple[View | None, ...], seen: tuple[View | None, ...], i: int
-    ) -> None:
-        """Raise MapError, as map i has other views than the first map."""
-        step = next(t for t, (a, b) in enumerate(zip(first, seen, strict=True)) if a != b)
-        raise MapError(
-            f"{self._name(i)}: expected the view {brief(first[step])} at step {step}, as "
-            f"{self._name(0)} has, got {brief(seen[step])}; {ONE_TRACE}"
-        )
-
 
 Maps: TypeAlias = Solution | Listing | SSHMap | Iterable[SSHMap]
+
+
+def _check_listed(
+    maps: tuple[SSHMap, ...], records: list[Any], answer: Mapping[str, Any], where: str
+) -> None:
+    """Raise MapError if ids or steps in a file are not those of its maps, or a map comes twice."""
+    for i, (record, ssh_map) in enumerate(zip(records, maps, strict=True)):
+        if "id" in record and record["id"] != ssh_map.id:
+            mend = "the map was changed by hand: solve again, or leave the id out"
+            raise MapError(
+                f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got "
+                f"{brief(record['id'])}; {mend}"
+            )
+    if maps and "steps" in answer and answer["steps"] != len(maps[0].dstate_at):
+        raise MapError(
+            f"{where}: steps: expected {len(maps[0].dstate_at)}, as map 1 has, got "
+            f"{brief(answer['steps'])}; solve the trace again"
+        )
+    first_with: dict[str, int] = {}
+    for i, ssh_map in enumerate(maps):
+        if (known := first_with.setdefault(ssh_map.id, i)) != i:
+            raise MapError(
+                f"{where}: maps[{i}]: expected another map, got the same map as maps[{known}] "
+                "again; leave it out"
+            )
+
+
+def _count_minimal(levels: Any, listed: int, where: str) -> int:
+    """Count the minimal maps of a list. If it has levels, only maps of the first are minimal."""
+    if levels is None:
+        return listed
+    first = levels[0] if isinstance(levels, list) and levels else None
+    count = first.get("count") if isinstance(first, Mapping) else None
+    if is_whole(count) and 0 < count <= listed:
+        return int(count)
+    raise MapError(
+        f"{where}: levels: expected a list whose first entry counts the minimal maps, got "
+        f"{brief(levels)}; solve again"
+    )
 
 
 def _has_one_view(theory: Theory) -> bool:
     """Tell whether each dstate has one view by this theory, and all views are known."""
     return "functional_view" not in theory.without and not theory.unknown_views
+
+
+def _check_views(
+    ours: tuple[View | None, ...], theirs: tuple[View | None, ...], name: str, we_have: str
+) -> None:
+    """Raise MapError if two maps show different views at some step."""
+    if ours != theirs:
+        t = next(t for t, (a, b) in enumerate(zip(ours, theirs, strict=True)) if a != b)
+        raise MapError(
+            f"{name}: expected the view {brief(ours[t])} at step {t}, as {we_have}, got "
+            f"{brief(theirs[t])}; {ONE_TRACE}"
+        )
 
 
 def _seen(ssh_map: SSHMap) -> tuple[View | None, ...]:

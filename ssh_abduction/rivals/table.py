@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.drives import Drive, named_steps
-from ssh_abduction.data.maps import DState, SSHMap
-from ssh_abduction.solver import SORTS, Backbone, Shared, Sort
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver import SORTS, Backbone, Shared, Sort, key_of
 
 Ints: TypeAlias = NDArray[np.int32]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -56,7 +56,7 @@ class Table:
             known: dict[tuple[Hashable, ...], Ints] = {}
             rows = []
             for ssh_map in maps:
-                of_dstate = [_name(s, sort) for s in ssh_map.dstates]
+                of_dstate = [key_of(s, sort) for s in ssh_map.dstates]
                 names = tuple(of_dstate[label] for label in label_of[ssh_map.dstate_at])
                 if names not in known:
                     known[names] = _firsts_of(names)
@@ -149,15 +149,4 @@ def _firsts_of(names: Sequence[Hashable]) -> Ints:
     return np.array(
         [NONE if name is None else first.setdefault(name, i) for i, name in enumerate(names)],
         dtype=np.int32,
-    )
-
-
-def _name(dstate: DState, sort: Sort) -> Hashable:
-    """Return a key of a dstate, or of its place, path or course; None if it has none."""
-    if sort == "dstates":
-        return dstate.id
-    if sort == "places":
-        return dstate.place
-    return (
-        dstate.path if sort == "paths" or dstate.path is None else (dstate.path, dstate.direction)
     )

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.solution.sharing import Shared as Shared
     from ssh_abduction.solver.solution.sharing import Sharing as Sharing
     from ssh_abduction.solver.solution.sharing import Sort as Sort
+    from ssh_abduction.solver.solution.sharing import key_of as key_of
     from ssh_abduction.solver.solution.sharing import stretches as stretches
     from ssh_abduction.solver.solution.weighed import EQUAL as EQUAL
     from ssh_abduction.solver.solution.weighed import Weighed as Weighed

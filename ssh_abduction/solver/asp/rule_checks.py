@@ -12,8 +12,9 @@ Errors say how to write the rules.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
+from typing import TypeAlias
 
 from clingo import ast
 
@@ -23,6 +24,8 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
 
+# Of some encodings: the predicates about steps, all that they define, and the numbers of arguments.
+_Predicates: TypeAlias = tuple[frozenset[str], frozenset[str], dict[str, frozenset[int]]]
 # The predicates of the facts of a trace. These facts are added step by step.
 OF_STEPS = {"view", "act", "kind", "turns", "open", "excluded", "elsewhere", "one", "together"}
 READABLE = {"axiom", "path", "prefer", "defeasible"}  # the predicates of a theory's facts
@@ -54,21 +57,12 @@ def check_rules(theory: Theory) -> None:
 @lru_cache(maxsize=64)
 def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> None:
     """Check a file of rules. Raises TheoryError if a rule is not allowed."""
-    of_steps, known, numbers = _predicates(files)
-    statements = _statements(rules)
-    own = {
-        name
-        for other in others
-        for statement, _, _ in _statements(other)
-        for name in _heads(statement)
-    }
-    own |= {name for statement, _, _ in statements for name in _heads(statement)}
-    defined = {
+    predicates, statements = _predicates(files), _statements(rules)
+    own = _derived_by((*others, rules)) | {
         str(statement.name)
         for statement, _, _ in statements
         if statement.ast_type is ast.ASTType.Defined
     }
-    named = {axiom.name for axiom in rules.axioms}
     for statement, part, parameter in statements:
         begin = statement.location.begin
         where = f"{rules.name}:{begin.line}"
@@ -87,70 +81,79 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
                 f"{where}: expected rules without functions of Python, got {function}; "
                 "write rules that derive its value"
             )
-        if statement.ast_type is not ast.ASTType.Rule:
-            continue
-        for name in _heads(statement):
-            if name in known - {"violation"}:
-                raise TheoryError(
-                    f"{where}: expected a rule that reads {name}, got one that defines it; "
-                    "derive violation(name,t), or an atom of your own"
-                )
-        for atom in _derived(statement.head):
-            if atom.name == "violation" and len(atom.arguments) not in numbers["violation"]:
-                raise TheoryError(
-                    f"{where}: {atom}: expected {_counted(numbers['violation'])}, "
-                    f"got {len(atom.arguments)}; derive violation(name,t)"
-                )
-        for violated in _violations(statement):
-            if violated not in named:
-                raise TheoryError(
-                    f"{where}: violation({violated},…): expected a sentence for it; "
-                    f"write % @axiom({violated}) and what it says, on a line before"
-                )
-        for atom, positive in _atoms(statement):
-            name = atom.name
-            if name in of_steps and part == "base":
-                raise TheoryError(
-                    f"{where}: {name}: expected this rule in a program part of steps, as the "
-                    "part base is "
-                    "grounded before there are steps; write #program step(t). before the rule"
-                )
-            if name not in known | own | defined | OF_STEPS | READABLE:
-                raise TheoryError(
-                    f"{where}: {name}: expected an atom that this theory has, got one that nothing "
-                    f"defines; there are {', '.join(sorted(of_steps))}"
-                )
-            if name not in own | defined and len(atom.arguments) not in numbers.get(
-                name, {len(atom.arguments)}
-            ):
-                raise TheoryError(
-                    f"{where}: {atom}: expected {_counted(numbers[name])}, "
-                    f"got {len(atom.arguments)}; write as many as expected"
-                )
-            if (
-                name in of_steps
-                and not positive
-                and part == "step"
-                and atom.arguments
-                and all(_is_settled(a, parameter) for a in atom.arguments)
-            ):
-                raise TheoryError(
-                    f"{where}: not {atom}: expected an atom with {parameter} as its last step, got "
-                    "fixed steps, which clingo reads before it has them; "
-                    f"write {parameter} = {atom.arguments[-1]}, "
-                    f"not {name}(…,{parameter}), in the body"
-                )
+        if statement.ast_type is ast.ASTType.Rule:
+            _check_head(statement, where, predicates, {axiom.name for axiom in rules.axioms})
+            _check_body((statement, part, parameter), where, predicates, own)
     _check_safety(rules)
+
+
+def _check_head(
+    rule: ast.AST, where: str, predicates: _Predicates, axioms: Collection[str]
+) -> None:
+    """Check what a rule derives. Raises TheoryError if it is not allowed."""
+    _, known, numbers = predicates
+    for name in _heads(rule):
+        if name in known - {"violation"}:
+            raise TheoryError(
+                f"{where}: expected a rule that reads {name}, got one that defines it; "
+                "derive violation(name,t), or an atom of your own"
+            )
+    for atom in _derived(rule.head):
+        if atom.name == "violation" and len(atom.arguments) not in numbers["violation"]:
+            raise TheoryError(
+                f"{where}: {atom}: expected {_counted(numbers['violation'])}, "
+                f"got {len(atom.arguments)}; derive violation(name,t)"
+            )
+    for violated in _violations(rule):
+        if violated not in axioms:
+            raise TheoryError(
+                f"{where}: violation({violated},…): expected a sentence for it; "
+                f"write % @axiom({violated}) and what it says, on a line before"
+            )
+
+
+def _check_body(
+    entry: tuple[ast.AST, str, str], where: str, predicates: _Predicates, own: Collection[str]
+) -> None:
+    """Check the atoms of a rule, from `_statements`. Raises TheoryError if one is not allowed.
+
+    `own` has the predicates that the user's rules define.
+    """
+    (rule, part, parameter), (of_steps, known, numbers) = entry, predicates
+    for atom, positive in _atoms(rule):
+        name, count = atom.name, len(atom.arguments)
+        if name in of_steps and part == "base":
+            raise TheoryError(
+                f"{where}: {name}: expected this rule in a program part of steps, as the part base "
+                "is grounded before there are steps; write #program step(t). before the rule"
+            )
+        if name not in {*known, *own, *OF_STEPS, *READABLE}:
+            raise TheoryError(
+                f"{where}: {name}: expected an atom that this theory has, got one that nothing "
+                f"defines; there are {', '.join(sorted(of_steps))}"
+            )
+        if name not in own and count not in numbers.get(name, {count}):
+            raise TheoryError(
+                f"{where}: {atom}: expected {_counted(numbers[name])}, got {count}; write as many "
+                "as expected"
+            )
+        of_later_steps = name in of_steps and not positive and part == "step" and atom.arguments
+        if of_later_steps and all(_is_settled(a, parameter) for a in atom.arguments):
+            raise TheoryError(
+                f"{where}: not {atom}: expected an atom with {parameter} as its last step, got "
+                "fixed steps, which clingo reads before it has them; write "
+                f"{parameter} = {atom.arguments[-1]}, not {name}(…,{parameter}), in the body"
+            )
+
+
+def _derived_by(every: Iterable[Rules]) -> set[str]:
+    """Return the predicates (names) that files of rules derive."""
+    return {name for rules in every for rule, _, _ in _statements(rules) for name in _heads(rule)}
 
 
 def read_by(rules: Rules, every: Iterable[Rules]) -> frozenset[str]:
     """Return the predicates (names) that a file of rules reads but none of the files defines."""
-    own = {
-        name
-        for other in every
-        for statement, _, _ in _statements(other)
-        for name in _heads(statement)
-    }
+    own = _derived_by(every)
     of_rules = [
         statement
         for statement, _, _ in _statements(rules)
@@ -215,9 +218,7 @@ def _check_safety(*files: Rules) -> None:
 
 
 @lru_cache(maxsize=8)
-def _predicates(
-    files: tuple[str, ...],
-) -> tuple[frozenset[str], frozenset[str], dict[str, frozenset[int]]]:
+def _predicates(files: tuple[str, ...]) -> _Predicates:
     """Find the predicates of some encodings.
 
     Returns the names of those about steps; the names of all that the encodings define; and for each

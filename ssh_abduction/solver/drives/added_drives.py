@@ -92,16 +92,9 @@ def solve_onto(
     problem = settle(joint, theory)
     in_use = problem.theory
     if solving.speedups.greedy and len(joint) > READABLE and can_lay(in_use):
-        on_map = None
         judged = all(getattr(in_use, f) == getattr(existing.theory, f) for f in _JUDGES)
         since = len(old) if judged else 0
-        try:
-            with suppress(LimitError), heeding(solving.watch.later(LAYING)):
-                on_map = laid(old, ssh_map, trace, problem, solving.watch, since)
-        except KeyboardInterrupt:
-            if (grown := _grown(ssh_map, old, problem)) is None:
-                raise
-            on_map = unproven(grown, ssh_map, old, problem, solving.watch, "interrupted")
+        on_map = _laid_in_time(old, ssh_map, trace, problem, solving.watch, since)
         if on_map is not None:
             return _named(on_map, ssh_map, corrections)
     short = solving.speedups.that_hold_for(in_use).digest and in_use.displacement == "none"
@@ -144,6 +137,20 @@ def solve_onto(
         ),
     )
     return _named(solution, ssh_map, corrections)
+
+
+def _laid_in_time(
+    old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem, watch: Watch, since: int
+) -> Solution | None:
+    """Call `laid`; None if it takes too long. After Ctrl-C, give the new drives new places."""
+    try:
+        with suppress(LimitError), heeding(watch.later(LAYING)):
+            return laid(old, ssh_map, trace, problem, watch, since)
+    except KeyboardInterrupt:
+        if (grown := _grown(ssh_map, old, problem)) is None:
+            raise
+        return unproven(grown, ssh_map, old, problem, watch, "interrupted")
+    return None
 
 
 def _effort(found: Solution, steps: int, watch: Watch) -> Effort:

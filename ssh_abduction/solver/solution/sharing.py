@@ -229,7 +229,7 @@ class Sharing:
             sorts = SORTS if has_places else SORTS[:1]
             self._kept = {sort: Kept(len(self._label_of)) for sort in sorts}
         for sort, kept in self._kept.items():
-            names = tuple(_name(ssh_map.dstates[label], sort) for label in self._label_of)
+            names = tuple(key_of(ssh_map.dstates[label], sort) for label in self._label_of)
             kept.absorb(names)
 
     def _split_by(self, labels: tuple[int, ...]) -> None:
@@ -378,8 +378,8 @@ def _split(together: Iterable[Pair], parts: Mapping[int, Sequence[int]]) -> Iter
                 yield (a, b) if a <= b else (b, a)
 
 
-def _name(dstate: DState, sort: Sort) -> Hashable:
-    """Return the name that a dstate has for a sort; None if it is along no path."""
+def key_of(dstate: DState, sort: Sort) -> Hashable:
+    """Return a key of a dstate, or of its place, path or course; None if it has none."""
     if sort == "dstates":
         return dstate.id
     if sort == "places":
