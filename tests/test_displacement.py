@@ -23,9 +23,10 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.dead_reckoning import ErrorFilter
 from ssh_abduction.checker.geometry import _square_together
 from ssh_abduction.data import DState, Odometry, TheoryError
+from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.facts.answer_maps import causal_map
 from ssh_abduction.solver.geometry.fit import Poses, fit
-from ssh_abduction.solver.geometry.linear import as_dense, least_squares, system_solved
+from ssh_abduction.solver.geometry.linear import as_dense, inverse, least_squares, system_solved
 from ssh_abduction.solver.geometry.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement
@@ -224,6 +225,21 @@ def test_dense_and_sparse_systems_have_one_solution() -> None:
     right = square @ np.arange(5.0) + 0.1 * np.arange(5.0)
     for matrix in (square, csr_array(square)):
         assert system_solved(matrix, added, right) == pytest.approx(np.arange(5.0))
+
+
+def test_inverse_of_separate_blocks_looks_at_the_clock_for_each() -> None:
+    rng = np.random.default_rng(0)
+    order, whole = rng.permutation(90), np.zeros((90, 90))
+    for block in np.split(order, [20, 50]):
+        some = rng.normal(size=(2 * len(block), len(block)))
+        whole[np.ix_(block, block)] = some.T @ some
+    rows, added = rng.permutation(90)[:40], np.full(90, 0.1)
+    expected = np.linalg.inv(whole + 0.1 * np.identity(90))[np.ix_(rows, rows)]
+    looks: list[None] = []
+    for square in (whole, csr_array(whole)):
+        with heeding(lambda: looks.append(None)):
+            assert inverse(square, added, rows) == pytest.approx(expected)
+    assert len(looks) == 6
 
 
 def test_p_values_of_true_maps_are_plausible() -> None:

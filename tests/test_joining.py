@@ -15,9 +15,10 @@ from together import of_mazes
 from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import Closure, Odometry, Step, together
+from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.star import Gateway, Star
 from ssh_abduction.solver.costs import beams
-from ssh_abduction.solver.costs.estimating import doubt_of
+from ssh_abduction.solver.costs.estimating import doubt_of, may_join_more, rival_of
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.weighing import Weighing
 from ssh_abduction.solver.guesses.joint_maps import Joining
@@ -153,6 +154,27 @@ def test_drives_without_common_views_are_not_joined() -> None:
         joint = together([monday, tuesday])
     *_, apart = joined(settle(joint, Theory()))
     assert [len(piece) for piece in apart.pieces] == [3, 3]
+
+
+def test_causal_drives_that_cannot_share_a_dstate_stay_apart_for_sure() -> None:
+    """Their first views are the same. Only stars may tell the dstates apart."""
+    drives = [
+        Trace.from_steps(
+            views,
+            ["travel"] * 3,
+            displacements=[(5.0, 0.0, 0.0)] * 3,
+            stars=[[ahead, 90, 180], [180], [180], [180]],
+        )
+        for views, ahead in (("abcd", 0), ("aefg", 40))
+    ]
+    for star, may_join in (("alike", False), ("none", True)):
+        problem = settle(together(drives), Theory.causal().replace(star=star))
+        rivals = [rival_of(ssh_map, 0.0) for ssh_map in joined(problem)]
+        assert [groups_of_drives(r.dstates, drives_of(problem.trace)) for r in rivals[-1:]] == [2]
+        assert may_join_more(problem, rivals[-1:]) == may_join
+        log = Log(problem.trace, problem.theory)
+        sights = Sights(problem.trace, problem.theory, log, misreads=False)
+        assert sights.are_alike(sights.shown[0], sights.shown[4]) == may_join
 
 
 @pytest.mark.parametrize("apart", [4.0, 9.0])

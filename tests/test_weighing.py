@@ -29,10 +29,10 @@ from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.costs import beams, weighing
-from ssh_abduction.solver.costs.estimating import estimated
+from ssh_abduction.solver.costs.estimating import estimated, rivals_of
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import Poses, fit
-from ssh_abduction.solver.solution.weighed import Rival, Weighed
+from ssh_abduction.solver.solution.weighed import FITTED, Rival, Weighed
 from ssh_abduction.theory.settle import settle
 
 EQUAL = 1e-6
@@ -547,6 +547,29 @@ def test_estimated_rivals_take_each_drive_apart() -> None:
         (0, 1, 2, 3, 4, 5, 6, 1),
         (0, 1, 2, 0, 1, 2, 3, 4),
     ]
+
+
+def test_estimated_rivals_of_causal_maps_are_deterministic() -> None:
+    """Two circuits of a square, and then back and forth along its first side."""
+    go, around = (10.0, 0.0, 0.0), (0.0, 0.0, math.pi)
+    moves = [("travel", go), ("right", (0.0, 0.0, -math.pi / 2))] * 8
+    moves += [("travel", go), ("around", around)] * 4
+    actions, displacements = zip(*moves, strict=True)
+    views = ["abcdefgh"[t % 8] for t in range(17)] + [*"bxyabxya"]
+    trace = Trace.from_steps(views, actions, displacements=displacements)
+    problem = settle(trace, Theory.causal())
+    best = solve(trace, Theory.causal(), time_limit=100)[0]
+    rivals = [*rivals_of(problem, Misfit(problem), best, 100.0)]
+    assert rivals
+    for rival in rivals:
+        assert not rival.places
+        assert len({*rival.dstates}) == len(best.dstates) + 1
+        leads = {*zip(rival.dstates, actions, rival.dstates[1:], strict=False)}
+        assert len({lead[:2] for lead in leads}) == len(leads)
+    weighed = Weighed(0.0, 0.0, (Rival(50.0, best.dstate_at), *rivals), True)
+    assert weighed.weights[1] / weighed.weights[0] == pytest.approx(
+        math.exp(50.0 - rivals[0].nats - FITTED)
+    )
 
 
 def test_online_mapper_refuses_weigh_cost() -> None:

@@ -157,6 +157,16 @@ class Overlap:
 def groups_of(at: Iterable[Hashable], drive: Iterable[int], tied: Sequence[int]) -> int:
     """Count the groups of drives that share no place with each other.
 
+    The arguments are those of `groups_of_each`.
+    """
+    return len({*groups_of_each(at, drive, tied)})
+
+
+def groups_of_each(
+    at: Iterable[Hashable], drive: Iterable[int], tied: Sequence[int]
+) -> Sequence[int]:
+    """Return the group of each drive, as a number. Drives of two groups share no place.
+
     Args:
         at: The place of each step.
         drive: The drive of each step, as a number.
@@ -164,8 +174,7 @@ def groups_of(at: Iterable[Hashable], drive: Iterable[int], tied: Sequence[int])
     """
     first: dict[Hashable, int] = {}
     pairs = {*zip(at, drive, strict=False)}
-    shared = ((first.setdefault(place, number), number) for place, number in pairs)
-    return len({*_joined(tied, shared)})
+    return _joined(tied, ((first.setdefault(place, number), number) for place, number in pairs))
 
 
 def _joined(groups: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:

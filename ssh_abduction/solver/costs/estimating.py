@@ -2,7 +2,8 @@
 
 The search for maps of least cost (`weighing.py`) finds few rivals of a long trace. So this module
 adds estimated rivals. They are like the best map, but some visits to one of its places are visits
-to a new place. They fit the displacements, and may break axioms.
+to a new place. They fit the displacements, and may break axioms. In a causal map, the visits that
+one action leads to from one dstate stay together, because actions are deterministic.
 """
 
 from __future__ import annotations
@@ -10,18 +11,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, combinations
 from typing import TYPE_CHECKING, TypeAlias
 
 from ssh_abduction.data.drives import Drive, drives_of, step_name
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.observation import View
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.guesses.completing import completed
-from ssh_abduction.solver.solution.weighed import CHANCE, Rival
+from ssh_abduction.solver.solution.weighed import CHANCE, Rival, groups_of_drives
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.theory.evidence.displacement import jumped
+from ssh_abduction.theory.overlap import groups_of_each
 from ssh_abduction.theory.settle import Problem
 
 if TYPE_CHECKING:
@@ -60,7 +64,34 @@ def rivals_of(
         nats: float = kept + misfit.nats_of_course(dstates, places or dstates, jumped(best))
         return nats + dstate * len(set(dstates)) + place * len(set(places))
 
-    return estimated(rival, misfit.visit, free, cost_of, seconds)
+    if rival.places:
+        begins = _begins(rival.places, misfit.visit)
+    else:
+        begins = _first_arrivals(rival.dstates, problem.trace)
+    return estimated(rival, begins, free, cost_of, seconds)
+
+
+def may_join_more(problem: Problem, rivals: Sequence[Rival]) -> bool:
+    """Whether the first rival keeps drives apart that may share dstates, and no other joins more.
+
+    Without places, drives share no dstate if all their views or stars differ.
+    """
+    at, drives = rivals[0].places or rivals[0].dstates, drives_of(problem.trace)
+    groups = min(groups_of_drives(rival.places or rival.dstates, drives) for rival in rivals)
+    of_drive = [i for i, drive in enumerate(drives) for _ in range(drive.first, drive.stop)]
+    of_group = groups_of_each(at, of_drive, range(len(drives)))
+    group = [of_group[i] for i in of_drive]
+    if len({*group}) == 1 or groups < len({*group}):
+        return False
+    theory = problem.theory
+    if theory.level != "causal" or theory.misread or theory.unknown_views:
+        return True
+    apart = problem.pairs.apart
+    alike: dict[View | None, list[int]] = {}
+    for step, view in enumerate(problem.trace.views):
+        alike.setdefault(view, []).append(step)
+    pairs = chain.from_iterable(combinations(steps, 2) for steps in alike.values())
+    return any(group[i] != group[j] and i not in apart.get(j, ()) for i, j in pairs)
 
 
 def doubt_of(problem: Problem, best: SSHMap) -> str | None:
@@ -103,19 +134,19 @@ def maps_apart(
 
 
 def estimated(
-    best: Rival, visit: Sequence[int], drives: Sequence[Drive], cost_of: CostOf, seconds: float
+    best: Rival, begins: Sequence[int], drives: Sequence[Drive], cost_of: CostOf, seconds: float
 ) -> Iterator[Rival]:
     """Yield rivals that cost little more than the best map, each once.
 
     In each rival, some visits to a place of the best map are visits to a new place instead: a
     single visit, or a visit and all later ones. Or one of `drives` shares no dstate and no place
-    with the others. `visit` has, for each step, the first step of its visit. `seconds` is the time
-    that this may take.
+    with the others. `begins` has, for each step, the first step of its visit. Steps with the same
+    one stay together. `seconds` is the time that this may take.
     """
     watch = Watch().part(seconds)
     tried: set[Course] = {(best.dstates, best.places)}
     apart = ((_apart(best, drive), CHANCE * CERTAIN) for drive in drives)
-    for course, most in chain(apart, ((moved, CERTAIN) for moved in _all_moved(best, visit))):
+    for course, most in chain(apart, ((moved, CERTAIN) for moved in _all_moved(best, begins))):
         if course in tried:
             continue
         tried.add(course)
@@ -139,42 +170,48 @@ def _apart(best: Rival, drive: Drive) -> Course:
     return dstates, places
 
 
-def _all_moved(best: Rival, visit: Sequence[int]) -> Iterator[Course]:
+def _all_moved(best: Rival, begins: Sequence[int]) -> Iterator[Course]:
     """Yield the dstates and places of each map in which some visits to a place get a new place."""
-    at = best.places or best.dstates
     visits: dict[int, list[int]] = {}  # the first steps of the visits to each place
-    for step, begin in enumerate(_begins(at, visit)):
+    for step, (name, begin) in enumerate(zip(best.places or best.dstates, begins, strict=True)):
         if begin == step:
-            visits.setdefault(at[step], []).append(step)
-    for name, begins in visits.items():
-        singly = [{begin} for begin in begins[1:]]
-        from_then_on = [set(begins[i:]) for i in range(1, len(begins) - 1)]
-        for moved in (*singly, *from_then_on) if len(begins) > 1 else ():
-            yield _moved(best, visit, name, moved)
+            visits.setdefault(name, []).append(step)
+    for firsts in visits.values():
+        singly = [{begin} for begin in firsts[1:]]
+        from_then_on = [set(firsts[i:]) for i in range(1, len(firsts) - 1)]
+        yield from (_moved(best, begins, moved) for moved in (*singly, *from_then_on))
 
 
-def _moved(best: Rival, visit: Sequence[int], place: int, moved: Collection[int]) -> Course:
-    """Return the dstates and places of a map after some visits to a place get a new place."""
-    at = best.places or best.dstates
-    begins = _begins(at, visit)
-    new = [name == place and begin in moved for name, begin in zip(at, begins, strict=True)]
-    more = len(at)
-    dstates = [name + more * is_new for name, is_new in zip(best.dstates, new, strict=True)]
-    places = [name + more * is_new for name, is_new in zip(best.places, new, strict=False)]
+def _moved(best: Rival, begins: Sequence[int], moved: Collection[int]) -> Course:
+    """Return the dstates and places of a map after some visits get a new place."""
+    more = len(begins)
+    dstates, places = (
+        [name + more * (begin in moved) for name, begin in zip(of, begins, strict=False)]
+        for of in (best.dstates, best.places)
+    )
     return tuple(numbered(dstates)), tuple(numbered(places))
 
 
-def _begins(at: Sequence[int], visit: Sequence[int]) -> list[int]:
+def _begins(places: Sequence[int], visit: Sequence[int]) -> list[int]:
     """For each step, find the first step of its visit. A visit also begins where the place changes.
 
-    `at` has the place of each step; without places, the dstate. `visit` has the first step of each
-    step's visit, as the trace alone divides the steps into visits.
+    `places` has the place of each step. `visit` has the first step of each step's visit, as the
+    trace alone divides the steps into visits.
     """
     begins: list[int] = []
-    for step, name in enumerate(at):
-        is_first = not step or at[step - 1] != name or visit[step] == step
+    for step, place in enumerate(places):
+        is_first = not step or places[step - 1] != place or visit[step] == step
         begins.append(step if is_first else begins[-1])
     return begins
+
+
+def _first_arrivals(dstates: Sequence[int], trace: Trace) -> list[int]:
+    """For each step, find the first step to which the same action leads from the same dstate."""
+    first: dict[tuple[int, str], int] = {}
+    return [0] + [
+        step if action.starts else first.setdefault((dstates[step - 1], action.name), step)
+        for step, action in enumerate(trace.actions, 1)
+    ]
 
 
 def dstates_and_places(ssh_map: SSHMap) -> Course:

@@ -23,6 +23,7 @@ from typing import TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.engines.refusing import minimal_part
+from ssh_abduction.solver.geometry.equations import Equations
 from ssh_abduction.solver.geometry.fit import Array, Poses
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, nats_of
@@ -50,6 +51,7 @@ class Misfit:
         self.visit = [0]
         for t, action in enumerate(self.trace.actions, 1):
             self.visit.append(self.visit[-1] if stays and action.kind == "turn" else t)
+        self._equations = Equations.of(self.trace)
         self._known: dict[_Groups, tuple[float, Array]] = {}
 
     def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
@@ -132,11 +134,11 @@ class Misfit:
         """
         if groups not in self._known:
             headings, positions, wrong = groups
-            trace = self.trace.without_displacements_at(wrong)
+            said = self.trace.without_displacements_at(wrong) if wrong else self._equations
             number = {heading: i for i, heading in enumerate(dict.fromkeys(headings))}
             position = dict(zip(headings, positions, strict=True))
             poses = Poses(
-                trace, [number[heading] for heading in headings], [position[h] for h in number]
+                said, [number[heading] for heading in headings], [position[h] for h in number]
             )
             square, at = poses.placed()
             self._known[groups] = square + 2 * self._overlap.nats(positions), at

@@ -50,6 +50,7 @@ from ssh_abduction.solver.costs.estimating import (
     doubt_of,
     dstates_and_places,
     least_places,
+    may_join_more,
     rival_of,
     rivals_of,
 )
@@ -71,7 +72,6 @@ from ssh_abduction.solver.solution.weighed import (
     Rival,
     Weighed,
     groups_of_drives,
-    may_join_more,
 )
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Status
@@ -374,8 +374,8 @@ class Weighing:
             rival = rival_of(candidate.map, candidate.nats)
             rivals.setdefault((rival.dstates, rival.places), rival)
         found, excess = list(rivals.values()), self._excess()
-        drives = drives_of(self._parts.task.trace)
-        is_likely = excess < math.inf and not may_join_more(found, drives)
+        problem = self._parts.task.problem
+        is_likely = excess < math.inf and not may_join_more(problem, found)
         return Weighed(
             bound=self.bound,
             within=self._within if self.proven else 0.0,
@@ -383,8 +383,8 @@ class Weighing:
             searched=is_likely and self._beams.found(self.candidates[0].nats),
             broken=self._beams.broken,
             excess=excess if excess < math.inf else 1.0,
-            doubt=doubt_of(self._parts.task.problem, self.candidates[0].map),
-            drives=drives,
+            doubt=doubt_of(problem, self.candidates[0].map),
+            drives=drives_of(problem.trace),
         )
 
     def _excess(self) -> float:

@@ -16,7 +16,13 @@ from ssh_abduction.data.drives import drives_of, starts_of, together
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.costs.estimating import ESTIMATING, doubt_of, rival_of, rivals_of
+from ssh_abduction.solver.costs.estimating import (
+    ESTIMATING,
+    doubt_of,
+    may_join_more,
+    rival_of,
+    rivals_of,
+)
 from ssh_abduction.solver.derived_regions import Deriving
 from ssh_abduction.solver.drives.digest import Digest
 from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning
@@ -24,7 +30,7 @@ from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
-from ssh_abduction.solver.solution.weighed import IMPROBABLE, Weighed, may_join_more
+from ssh_abduction.solver.solution.weighed import IMPROBABLE, Weighed
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Bound, Cost, Effort, Seconds, Status, nats_of
 from ssh_abduction.theory.settle import Problem
@@ -72,7 +78,7 @@ def laid(
         bound=nats_of(replace(Cost.of(ssh_map), paths=0), theory) + kept.chi2 / 2,
         within=0.0,
         rivals=(known[0], *(replace(rival, estimated=True) for rival in known[1:]), *moved),
-        searched=best.fit.p >= IMPROBABLE and not may_join_more(known, drives_of(joint)),
+        searched=best.fit.p >= IMPROBABLE and not may_join_more(problem, known),
         broken=existing.broken,
         doubt=doubt_of(problem, best),
         drives=drives_of(joint),

@@ -78,19 +78,21 @@ class Poses:
     """
 
     def __init__(
-        self, trace: Trace, headings: Sequence[int], positions: Sequence[Hashable]
+        self, said: Trace | Equations, headings: Sequence[int], positions: Sequence[Hashable]
     ) -> None:
         """Collect the equations. Nothing is solved yet.
 
-        `headings` has, for each step, the number of its unknown heading (mostly its dstate), from 0
-        without gaps. `positions` has, for each of these headings, the name of the position that it
-        belongs to (mostly the place of the dstate).
+        `said` is the trace, or the equations of its steps. For each step, `headings` has the number
+        of its unknown heading (mostly its dstate), from 0 without gaps. `positions` has, for each
+        of these headings, the name of the position that it belongs to (mostly the place of the
+        dstate).
         """
         self._dstates = len(positions)
         labels = np.asarray(headings, dtype=int)
-        said = Equations.of(trace).beside(labels, self._dstates)
+        of_steps = said if isinstance(said, Equations) else Equations.of(said)
+        said = of_steps.beside(labels, self._dstates)
         if said.spreads.any():
-            positions = [*positions, *((t, "robot") for t in range(len(trace)))]
+            positions = [*positions, *((t, "robot") for t in range(len(labels)))]
         self._from, self._to = said.first, said.last
         self._moved, self._way, self._sigma = said.moved, said.way, said.sigma
         self._scaled = said.scaled

@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
+
+from ssh_abduction.runtime.clock import look_at_clock
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -66,6 +69,20 @@ def inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
 
     The matrix is dense or sparse. The n numbers in `added` are added to its diagonal.
     """
+    block = connected_components(csr_array(square), directed=False)[1]
+    found = np.zeros((len(rows), len(rows)))
+    for name in np.unique(block[rows]):
+        look_at_clock()
+        own, wanted = np.flatnonzero(block == name), np.flatnonzero(block[rows] == name)
+        part = square[own][:, own]
+        found[np.ix_(wanted, wanted)] = _block_inverse(
+            part, added[own], np.searchsorted(own, rows[wanted])
+        )
+    return found
+
+
+def _block_inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
+    """Compute the same as `inverse` at once."""
     if square.shape[0] <= DENSE_INVERSE:
         # If these rows come last, the wanted part of the inverse depends only on the last block of
         # the Cholesky factor.

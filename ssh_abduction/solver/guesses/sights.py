@@ -50,7 +50,10 @@ class Sights:
         """
         starts = starts_of(trace)
         self.seen = numbered(trace.views) if theory.changed else log.seen
-        self.shown = [_shown(step, theory.star) for step in trace.steps]
+        # In a causal theory, a place is a dstate, so star=alike compares the stars of places, too.
+        is_alike = theory.star == "alike" and theory.level == "causal"
+        star = "gateways" if is_alike else theory.star
+        self.shown = [_shown(step, star) for step in trace.steps]
         self._steps, self._star = trace.steps, theory.star
         self.drive = [bisect_right(starts, t) for t in range(len(trace))]
         self._misreads, self._price = misreads, theory.prices[0] * theory.changed

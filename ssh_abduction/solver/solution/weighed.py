@@ -30,6 +30,10 @@ DOUBTED = 0.05
 # Drives look alike by chance more often than costs say. So the gain from laying drives on each
 # other is divided by this before it becomes a probability (docs/measurements/truth.md).
 CHANCE = 10.0
+# A dstate that a rival has besides those of a causal map gets the pose that fits best: three
+# numbers, which each lower the misfit by chance. So this many nats are added before the cost of an
+# estimated causal rival becomes a probability (Akaike 1974: one nat for each number fitted).
+FITTED = 3.0
 # A misfit is improbable if the true map has a larger one with less than this probability.
 IMPROBABLE = 0.01
 MOST = 700.0  # exp of more nats overflows
@@ -101,13 +105,17 @@ class Weighed:
         """The probability of each rival, assuming that there are no other maps.
 
         Drives that share places form groups. If the groups of a rival differ from those of the best
-        map, the difference of the two costs is divided by CHANCE.
+        map, the difference of the two costs is divided by CHANCE. Else an estimated causal rival
+        costs FITTED nats more.
         """
         ways = [groups_of_drives(r.places or r.dstates, self.drives) for r in self.rivals]
-        likely = [
-            math.exp((self.nats - rival.nats) / self.excess / (1.0 if way == ways[0] else CHANCE))
+        less = [
+            (self.nats - rival.nats) / CHANCE
+            if way != ways[0]
+            else self.nats - rival.nats - FITTED * (rival.estimated and not rival.places)
             for rival, way in zip(self.rivals, ways, strict=True)
         ]
+        likely = [math.exp(nats / self.excess) for nats in less]
         return tuple(weight / sum(likely) for weight in likely)
 
     @property
@@ -295,12 +303,6 @@ def probability_in_words(probability: float) -> str:
     if probability < 0.005:
         return "below 0.01"
     return "above 0.99" if probability >= 0.995 else f"{probability:.2f}"
-
-
-def may_join_more(rivals: Sequence[Rival], drives: Sequence[Drive]) -> bool:
-    """Whether the first rival keeps drives apart, and no other one joins more of them."""
-    groups = [groups_of_drives(rival.places or rival.dstates, drives) for rival in rivals]
-    return groups[0] > 1 and groups[0] == min(groups)
 
 
 def groups_of_drives(at: Sequence[int], drives: Sequence[Drive]) -> int:
