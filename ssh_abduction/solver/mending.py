@@ -178,7 +178,8 @@ class Mending:
         """Yield a better map, with the faults of a sketch (a map that is made without a search).
 
         The causal theory does not notice a fault that only adds links to its map. Such a fault may
-        still contradict the axioms of places. Then no trace that causal maps mend has a map.
+        still contradict the axioms of places. Then the trace still has no map after causal maps
+        have mended it.
         """
         proven = self._best is not None and self._best.cost[0] == self.bound
         if not proven and (guess := mended_sketch(self._task.trace, self._task.theory)):
