@@ -263,11 +263,11 @@ class Unknown:
 
     Attributes:
         unknown: Scans after a jump of the odometer, or after a motion that the odometer missed.
-        carried: Those of `unknown` to which the robot was carried while nothing was logged.
+        carried: The scans in `unknown` before which the robot was carried while nothing was logged.
         doubtful: Scans after other long steps. Such a step is a jump if the scan matches only near
             the previous pose.
-        seams: Scans at which a second drive seems to begin. The step to them is unknown unless the
-            scan matches at its end.
+        seams: Scans at which a second drive seems to begin. The step to such a scan is unknown
+            unless the scan matches where the step ends.
         still: First and last scan of each stretch in which the odometer stands still, though the
             scans change.
     """

@@ -28,7 +28,7 @@ class Track:
             NaN for a later scan whose beams meet nothing. Empty if nothing was matched.
         cuts: Indices of scans before which the motion is unknown because the odometer jumped. No
             displacement crosses a cut.
-        breaks: Those of `cuts` after which the robot may be anywhere, because the scan shows
+        breaks: The scans in `cuts` after which the robot may be anywhere, because the scan shows
             nothing that was seen before. Neither a path nor a place crosses a break.
         is_reliable: Whether scans match, and agree with the odometry, as in good logs. True if
             nothing was judged.
