@@ -48,16 +48,14 @@ def run() -> "NoReturn":
 def _interrupt(number: int, frame: "FrameType | None") -> None:
     """Handle a signal: raise KeyboardInterrupt, or end the program while a module is being loaded.
 
-    A KeyboardInterrupt would be unsafe there: C code, such as that of numpy, prints a traceback or
-    turns it into another error.
+    A signal soon after another one raises nothing: it would stop the making of the answer.
     """
-    program.heard.append(number)
-    while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            _end()
-        frame = frame.f_back
-    program.raised.append(number)
-    raise KeyboardInterrupt
+    is_new = program.hear(number)
+    if program.is_loading(frame):
+        _end()
+    if is_new:
+        program.raised.append(number)
+        raise KeyboardInterrupt
 
 
 def _end(number: "int | None" = None, _: object = None) -> "NoReturn":

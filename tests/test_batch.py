@@ -28,8 +28,9 @@ from ssh_abduction import Theory, Trace
 from ssh_abduction.cli import batch, cluster_jobs, main, mapping
 from ssh_abduction.cli.batch import SolveQuestion
 from ssh_abduction.cli.cluster_jobs import Absence, answers_on_cluster
-from ssh_abduction.cli.jobs import FileAnswer, StopFlag, answers_here
+from ssh_abduction.cli.jobs import FileAnswer, answers_here
 from ssh_abduction.cli.mapping import MapQuestion
+from ssh_abduction.cli.outcome import StopFlag
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.theory import Speedups
 

@@ -30,8 +30,9 @@ from perception.store import load
 from simulator.rounds import record_plan
 from ssh_abduction import AbductionError, Theory
 from ssh_abduction.cli import main
-from ssh_abduction.cli.jobs import StopFlag, answers_here
+from ssh_abduction.cli.jobs import answers_here
 from ssh_abduction.cli.mapping import MapQuestion
+from ssh_abduction.cli.outcome import StopFlag
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.data.trace import Trace

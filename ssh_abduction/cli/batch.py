@@ -23,7 +23,6 @@ from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.jobs import (
     FileAnswer,
     FileQuestion,
-    StopFlag,
     answers_here,
     final_code,
     in_a_line,
@@ -31,6 +30,7 @@ from ssh_abduction.cli.jobs import (
 from ssh_abduction.cli.options import check_jobs, theory_of
 from ssh_abduction.cli.outcome import (
     Given,
+    StopFlag,
     all_given,
     answer_ending,
     answer_opening,
@@ -47,7 +47,7 @@ from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.runtime.program import SIGNALLED
+from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
 from ssh_abduction.solver import Backbone, Search, Solution, Start, Stop, workers, written_map
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
@@ -156,15 +156,16 @@ class SolveQuestion(FileQuestion):
     ) -> contextlib.AbstractContextManager[object]:
         """Make a guard that ends a worker process at its limits; nothing in other processes."""
 
-        def last_words(why: Stop) -> tuple[FileAnswer, int]:
-            # Nobody reads the exit code of this process.
+        def last_words(why: Stop) -> tuple[str, int, Callable[[], None]]:
             try:
                 solution = search.snapshot(why)
                 given = [(ssh_map, None) for ssh_map in solution.maps] if self.json else []
                 found = [*maps] or given
-                return self._answer(number, path, search, solution, found, None, None), EXIT_ERROR
+                answer = self._answer(number, path, search, solution, found, None, None)
             except Exception as error:  # without an answer, the process would seem to be killed
-                return self.failed(number, path, error), EXIT_ERROR
+                answer = self.failed(number, path, error)
+            # Nobody reads the exit code of this process.
+            return "", EXIT_ERROR, partial(workers.reply, answer)
 
         if not workers.serves():
             return contextlib.nullcontext()
@@ -174,7 +175,6 @@ class SolveQuestion(FileQuestion):
             self.limit,
             self.memory,
             given_up=given_up,
-            print_last=workers.reply,
         )
 
     def _answer(
@@ -248,10 +248,10 @@ def _printed(answers: Generator[FileAnswer], total: int, stop: StopFlag) -> list
     lines: dict[int, str] = {}  # the lines that wait for an earlier trace
     codes: list[int] = []
     turn = 0
-    with _progress(total) as (say, advance), contextlib.closing(answers):
+    with _progress(total) as (pausing, advance), contextlib.closing(answers):
         try:
             for answer in answers:
-                with on_ctrl_c(stop.set):  # Ctrl-C must not lose a line or cut it in two
+                with _whole_lines(stop, pausing) as say:
                     lines[answer.number] = answer.line
                     warn(answer.warnings)
                     codes.append(answer.code)
@@ -263,9 +263,28 @@ def _printed(answers: Generator[FileAnswer], total: int, stop: StopFlag) -> list
                     stop.set()
         except KeyboardInterrupt:
             stop.set()
-        for number in sorted(lines):  # lines that still wait for an answer that did not come
-            say(lines[number])
+        with _whole_lines(stop, pausing) as say:
+            for number in sorted(lines):  # lines that still wait for an answer that did not come
+                say(lines[number])
     return codes
+
+
+@contextlib.contextmanager
+def _whole_lines(
+    stop: StopFlag, pausing: Callable[[], contextlib.AbstractContextManager[object]]
+) -> Iterator[Callable[[str], None]]:
+    """Yield a function that prints a line. Ctrl-C neither loses a line nor cuts it in two.
+
+    But if nobody reads the output after Ctrl-C, the process ends.
+    """
+    guard = Guard(stop.set, lambda _: ("", interrupted_code()), None, None, given_up=stop.is_set)
+
+    def say(line: str) -> None:
+        with pausing():
+            guard.say(lambda: f"{line}\n")
+
+    with on_ctrl_c(stop.set), guard:
+        yield say
 
 
 def _forget_memory() -> None:
@@ -278,23 +297,26 @@ def _forget_memory() -> None:
 
 
 @contextlib.contextmanager
-def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], None]]]:
-    """Show a progress bar on a terminal. Yield functions that print a line, and that advance it."""
+def _progress(
+    total: int,
+) -> Iterator[tuple[Callable[[], contextlib.AbstractContextManager[object]], Callable[[], None]]]:
+    """Show a progress bar on a terminal. Yield functions that hide it, and that advance it."""
     if not sys.stderr.isatty():
-        yield partial(print, flush=True), lambda: None
+        yield contextlib.nullcontext, lambda: None
         return
     with progress_bar() as progress:
         task = progress.add_task("traces", total=total)
 
-        def say(line: str) -> None:
-            """Print a line above the bar, without the line breaks that rich would add."""
+        @contextlib.contextmanager
+        def pausing() -> Iterator[None]:
+            """Hide the bar while a line is printed, as rich would add line breaks to the line."""
             progress.live.transient = True
             progress.stop()
-            print(line, flush=True)
+            yield
             progress.live.transient = False
             progress.start()
 
         yield (
-            (say if sys.stdout.isatty() else partial(print, flush=True)),
+            pausing if sys.stdout.isatty() else contextlib.nullcontext,
             partial(progress.advance, task),
         )

@@ -12,8 +12,8 @@ from concurrent.futures import CancelledError
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from ssh_abduction.cli.jobs import FileQuestion, StopFlag, solved_in_worker
-from ssh_abduction.cli.outcome import warn
+from ssh_abduction.cli.jobs import FileQuestion, solved_in_worker
+from ssh_abduction.cli.outcome import StopFlag, warn
 from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError, SolverError, brief
 from ssh_abduction.solver import POLL, workers

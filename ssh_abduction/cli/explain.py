@@ -138,7 +138,7 @@ def run(options: argparse.Namespace) -> int:
         Guard(question.interrupt, last_words, options.time_limit, options.memory_limit) as guard,
     ):
         answer = question.answer()
-        guard.say(lambda: written(answer))
+        guard.finish(_exit_code(answer), lambda: written(answer))
     return _exit_code(answer)
 
 

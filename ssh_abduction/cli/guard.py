@@ -15,8 +15,9 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from types import TracebackType
-from typing import Any, NoReturn, Self
+from typing import NoReturn, Self
 
 from ssh_abduction.runtime import program
 from ssh_abduction.solver import POLL, Stop, end_all, resident_memory
@@ -27,6 +28,8 @@ LATE = 1.1, 0.8
 LARGE = 1.1, 100.0
 # A search must end within this many seconds after Ctrl-C.
 DEAF = 1.5
+# Files must be written within this many seconds after Ctrl-C: a pipe may have no reader.
+SAVING = 10.0
 # Text is printed in pieces of this many characters.
 PIECE = 2**16
 
@@ -38,28 +41,26 @@ class Guard:
 
     Args:
         interrupt: Asks the search to end soon.
-        last_words: Takes the reason for the end. Returns what remains to be printed, and the exit
-            code.
+        last_words: Takes the reason for the end. Returns what remains to be printed, the exit code,
+            and perhaps a function that saves the answer.
         limit: The time limit in seconds; None for no limit.
         memory: The memory limit in MiB; None for no limit.
         given_up: Returns whether the answer is not needed any more.
-        print_last: Prints the first result of `last_words`; None prints to standard output.
     """
 
     def __init__(
         self,
         interrupt: Callable[[], None],
-        last_words: Callable[[Stop], tuple[Any, int]],
+        last_words: Callable[[Stop], tuple[str, int] | tuple[str, int, Callable[[], None]]],
         limit: float | None,
         memory: float | None,
         *,
         given_up: Callable[[], bool] = lambda: False,
-        print_last: Callable[[Any], None] | None = None,
     ) -> None:
         self._interrupt, self._last_words, self._given_up = interrupt, last_words, given_up
         self._limit, self._memory = limit, memory
-        self._print_last = print_last or _print
         self._signals, self._printer = _Signals(), _Printer()
+        self._finished: int | None = None  # the exit code, once the whole answer is printed
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._over = threading.Event()
         self._began = time.monotonic()
@@ -86,12 +87,23 @@ class Guard:
         """Make a text and print it. The last words on Ctrl-C come after it, never inside it."""
         self._printer.say(text)
 
+    def finish(
+        self, code: int, text: Callable[[], str] = str, save: Callable[[], None] = lambda: None
+    ) -> None:
+        """Make and print the rest of the answer, and save it. No last words come afterwards.
+
+        `code` is the exit code if a limit then ends the process.
+        """
+        with self._printer.speaking:
+            self._printer.say(text)
+            self._finished = code
+            self._printer.wait_for(save, SAVING)
+
     def _watch(self) -> None:
         """Watch the limits and signals, in the second thread, until the `with` block ends."""
         speaking = self._printer.speaking
         while not self._over.wait(POLL):
-            if self._is_called() and self._deaf_at is None:
-                self._deaf_at = time.monotonic() + DEAF
+            if self._is_called():
                 self._interrupt()
             why = self._why()
             if why is not None and speaking.acquire(blocking=False):
@@ -108,7 +120,10 @@ class Guard:
         numbers = self._signals.received()
         # The handler in the main thread may not have run yet, and may never run.
         program.heard.extend(numbers)
-        return bool(numbers) or self._given_up()
+        is_called = bool(numbers) or self._given_up()
+        if is_called and self._deaf_at is None:
+            self._deaf_at = time.monotonic() + DEAF
+        return is_called
 
     def _why(self) -> Stop | None:
         """The reason to end the process now; None if there is none."""
@@ -127,11 +142,16 @@ class Guard:
 
     def _end(self, why: Stop) -> None:
         """Print the last words, and end the process and its helper processes without clean-up."""
+        if self._finished is not None:
+            self._leave(self._finished)
         self._interrupt()
         code = 1
+        threading.Thread(target=self._leave_if_stuck, daemon=True).start()
         try:
-            words, code = self._last_words(why)
-            self._print_last(words)
+            words, code, *saves = self._last_words(why)
+            self._printer.say(lambda: words)
+            for save in saves:
+                self._printer.wait_for(save, SAVING)
         except BaseException as error:
             with suppress(OSError, ValueError):
                 print(
@@ -142,6 +162,18 @@ class Guard:
                 )
         finally:
             self._leave(code)
+
+    def _leave_if_stuck(self) -> NoReturn:
+        """End the process at Ctrl-C if nobody reads the last words, or if they take long to make.
+
+        This runs in a third thread while the second one prints the last words.
+        """
+        begun = time.monotonic()
+        while not (self._is_deaf() and self._printer.is_unread()):
+            time.sleep(POLL)
+            if self._is_called() and time.monotonic() > begun + SAVING:
+                break
+        self._leave(program.interrupted_code())
 
     def _leave(self, code: int) -> NoReturn:
         end_all()
@@ -188,24 +220,28 @@ class _Printer:
     def __init__(self) -> None:
         self.speaking = threading.RLock()
         self.waited = 0.0
-        self._writes_since: float | None = None  # when the current piece of text was begun
+        self._begun: float | None = None  # when the current piece of text was begun
+        self._patience = DEAF  # how many seconds it may take
 
     def say(self, text: Callable[[], str]) -> None:
         """Make a text while holding the lock, and print it in pieces."""
         with self.speaking:
             made = text()
             for start in range(0, len(made), PIECE):
-                self._writes_since = time.monotonic()
-                sys.stdout.write(made[start : start + PIECE])
-                self.waited += time.monotonic() - self._writes_since
-                self._writes_since = None
+                self.wait_for(partial(sys.stdout.write, made[start : start + PIECE]))
+            if made:
+                self.wait_for(sys.stdout.flush)
+
+    def wait_for(self, write: Callable[[], object], patience: float = DEAF) -> None:
+        """Call a function that may wait for a reader or a disk, and should take few seconds."""
+        self._patience, self._begun = patience, time.monotonic()
+        try:
+            write()
+        finally:
+            self.waited += time.monotonic() - self._begun
+            self._begun = None
 
     def is_unread(self) -> bool:
-        """Whether the reader of the output has not read the current piece for DEAF seconds."""
-        since = self._writes_since
-        return since is not None and time.monotonic() > since + DEAF
-
-
-def _print(words: str) -> None:
-    sys.stdout.write(words)
-    sys.stdout.flush()
+        """Whether the current piece has waited longer than it should."""
+        begun = self._begun
+        return begun is not None and time.monotonic() > begun + self._patience

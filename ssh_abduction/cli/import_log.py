@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ssh_abduction.cli.options import add_output, check_output, write
+from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c, warn
 from ssh_abduction.cli.parsing import Parser, Verbs
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError
+from ssh_abduction.runtime import program
 
 if TYPE_CHECKING:
     from perception.places.importing import Imported
     from perception.places.visits import Visit
     from perception.readers.scans import RobotLog
 
+
+Item = TypeVar("Item")
 
 # Repeats perception.readers.logs, whose import would delay all verbs.
 FORMATS = ("carmen", "g2o", "ros1", "ros2", "mcap")
@@ -149,8 +154,6 @@ def _laser_value(field: str, text: str) -> Any:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.cli.outcome import warn
-
     check_output(options.output, "the trace")
     log, done = (_live if options.log == "-" else _whole)(options, lambda note: warn([note]))
     said = (
@@ -174,7 +177,10 @@ def _whole(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Ro
 
 
 def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[RobotLog, Imported]:
-    """Import the log on standard input as it arrives, and print each visit once it is final."""
+    """Import the log on standard input as it arrives, and print each visit once it is final.
+
+    Ctrl-C ends the log: the trace is that of the drive so far.
+    """
     from perception.places.importing import import_live
     from perception.readers.logs import live_log
 
@@ -196,7 +202,9 @@ def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Rob
             flush=True,
         )
 
-    log, done = import_live(items, options.width or WIDTH, None, tell, show, "-")
+    stop = StopFlag()
+    with until_ctrl_c(items, stop) as some:
+        log, done = import_live(some, options.width or WIDTH, None, tell, show, "-")
     if more := len(done.visits) - next(numbers):
         print(
             f"at the end of the drive: {counted(more, 'more visits')} where stretches of it "
@@ -206,6 +214,35 @@ def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Rob
     for warning in log.warnings:
         tell(warning)
     return log, done
+
+
+@contextmanager
+def until_ctrl_c(items: Iterator[Item], stop: StopFlag) -> Iterator[Iterator[Item]]:
+    """Yield an iterator over items that ends at Ctrl-C, which sets `stop`."""
+    waits = False
+
+    def end() -> None:
+        is_first = not stop.is_set()
+        stop.ask()
+        if is_first and waits:  # else the item that came last is still in use
+            raise KeyboardInterrupt
+
+    def some() -> Iterator[Item]:
+        nonlocal waits
+        while not stop.is_set():
+            try:
+                waits = True
+                item = next(items)
+                waits = False
+            except (StopIteration, KeyboardInterrupt):
+                break
+            yield item
+        if stop.is_set():
+            program.raised.append(program.heard[-1])  # for the exit code
+            print("ssh-abduction: interrupted: the log ends here", file=sys.stderr)
+
+    with on_ctrl_c(end):
+        yield some()
 
 
 def named_after(path: str) -> str:

@@ -11,23 +11,10 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
 from ssh_abduction.cli import EXIT_ERROR
-from ssh_abduction.cli.outcome import on_ctrl_c
+from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c
 from ssh_abduction.data.errors import AbductionError, SolverError, printable
 from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
 from ssh_abduction.solver import workers
-
-
-class StopFlag:
-    """A flag that asks all work to stop. Unlike a `threading.Event`, signal handlers may set it."""
-
-    def __init__(self) -> None:
-        self._is_set = False
-
-    def set(self) -> None:
-        self._is_set = True
-
-    def is_set(self) -> bool:
-        return self._is_set
 
 
 def in_a_line(error: Exception) -> str:
@@ -114,16 +101,11 @@ def answers_here(
     yield what is known. A second Ctrl-C raises KeyboardInterrupt.
     """
 
-    def end() -> None:
-        if stop.is_set():  # this is the second Ctrl-C
-            raise KeyboardInterrupt
-        stop.set()
-
     from joblib import effective_n_jobs
 
     tasks = [(number, path, question, None) for number, path in enumerate(paths)]
     processes = min(effective_n_jobs(jobs), len(paths))
-    with on_ctrl_c(end):
+    with on_ctrl_c(stop.ask):
         for answer in workers.answers(
             solved_in_worker, tasks, processes, stop.is_set, question.overdue, question.patience
         ):

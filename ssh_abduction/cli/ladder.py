@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -76,9 +75,9 @@ def run(options: argparse.Namespace) -> int:
             rungs.append(rung)
             if options.json:
                 guard.say(lambda: f"{json_line(rungs[-1].to_dict())}\n")
-                sys.stdout.flush()
-        guard.say(written)
-    return interrupted_code() if under_way.interrupted else 0
+        code = interrupted_code() if under_way.interrupted else 0
+        guard.finish(code, written)
+    return code
 
 
 def _row(rung: Rung) -> list[object]:

@@ -13,6 +13,7 @@ import json
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -24,14 +25,13 @@ from ssh_abduction.cli.import_log import WIDTH, named_after, reading_of
 from ssh_abduction.cli.jobs import (
     FileAnswer,
     FileQuestion,
-    StopFlag,
     answers_here,
     final_code,
     in_a_line,
 )
 from ssh_abduction.cli.obeyed_corrections import say_obeyed
 from ssh_abduction.cli.options import check_jobs, choices_of, theory_of
-from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
+from ssh_abduction.cli.outcome import StopFlag, exit_code, on_ctrl_c, warn
 from ssh_abduction.cli.run_folders import (
     check_folder,
     digest,
@@ -54,6 +54,10 @@ from ssh_abduction.robot_logs.log_picture import paths_mean_something
 
 GIVEN_UP = "expected time to map this log, got an interruption; map it again"
 KEPT = 64  # the copy of a log for a worker keeps this many last characters of its name
+
+
+class UnwrittenError(AbductionError):
+    """The files of a run cannot be written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,18 +122,18 @@ class MapQuestion(FileQuestion):
         path: str,
         content: bytes | None = None,
         given_up: Callable[[], bool] = lambda: False,
-        answer_last: Callable[[FileAnswer], None] = workers.reply,
+        keep: Callable[[FileAnswer], None] | None = None,
         tell: Callable[[str], None] = lambda note: None,
     ) -> FileAnswer:
         """Implement `FileQuestion.answer`: map one log. If that fails, the answer says why.
 
-        `answer_last` takes the answer if the process has to end because clingo does not
-        stop. `tell` takes each warning about the log as soon as it is known.
+        `keep` writes the answer, unless it is an error; None in a worker process. `tell` takes each
+        warning about the log as soon as it is known.
         """
         try:
             if given_up():
                 return self._given_up(number, path)
-            rest = (given_up, answer_last, tell)
+            rest = (given_up, keep, tell)
             if content is None:
                 return self._mapped(number, [path], [path], digest([path]), *rest)
             sent = hashlib.sha256(content).hexdigest()
@@ -139,17 +143,19 @@ class MapQuestion(FileQuestion):
                 here = Path(folder) / Path(path).name[-KEPT:]
                 here.write_bytes(content)
                 return self._mapped(number, [path], [str(here)], sent, *rest)
+        except UnwrittenError:
+            raise
         except Exception as error:  # one bad log must not stop the others
             return self.failed(number, path, error)
 
     def answer_together(
         self,
         paths: Sequence[str],
-        answer_last: Callable[[FileAnswer], None],
+        keep: Callable[[FileAnswer], None],
         tell: Callable[[str], None],
     ) -> FileAnswer:
         """Map the logs of several drives through one building together. Raises AbductionError."""
-        return self._mapped(0, paths, paths, digest(paths), lambda: False, answer_last, tell)
+        return self._mapped(0, paths, paths, digest(paths), lambda: False, keep, tell)
 
     def _mapped(
         self,
@@ -158,14 +164,13 @@ class MapQuestion(FileQuestion):
         files: Sequence[str],
         content: str | None,
         given_up: Callable[[], bool],
-        answer_last: Callable[[FileAnswer], None],
+        keep: Callable[[FileAnswer], None] | None,
         tell: Callable[[str], None],
     ) -> FileAnswer:
         """Map one log, or several together, from `files`, which may be copies.
 
         `content` is the digest of the logs before they are read. If a log changes later, the next
-        call sees another digest and maps them again. `answer_last` takes the answer if clingo does
-        not stop.
+        call sees another digest and maps them again. `keep` writes the answer; None in a worker.
         """
         begun: list[LogMapping] = []  # one entry, once the logs are read
         names = [named_after(path) for path in paths]
@@ -175,44 +180,49 @@ class MapQuestion(FileQuestion):
                 mapping.interrupt()
 
         def end() -> None:
-            # End at once if nothing is known yet, or if this is the second Ctrl-C.
-            if not begun or begun[0].search is None or begun[0].interrupted:
+            if not begun or begun[0].search is None:  # nothing is known yet
                 raise KeyboardInterrupt
             interrupt()
 
-        def last_words(_: Stop) -> tuple[FileAnswer, int]:
-            if not begun or begun[0].search is None:
-                return self._given_up(number, paths[0]), interrupted_code()
-            return self._answer(number, paths, begun[0].known(), content), interrupted_code()
+        def last_words(_: Stop) -> tuple[str, int, Callable[[], None]]:
+            is_begun = begun and begun[0].search is not None
+            answer = (
+                self._answer(number, paths, begun[0].known(), content)
+                if is_begun
+                else self._given_up(number, paths[0])
+            )
+            return "", interrupted_code(), partial(keep or workers.reply, answer)
 
-        guard = Guard(interrupt, last_words, None, None, given_up=given_up, print_last=answer_last)
+        guard = Guard(interrupt, last_words, None, None, given_up=given_up)
         # A worker process does not handle Ctrl-C: its parent stops it.
-        with contextlib.nullcontext() if workers.serves() else on_ctrl_c(end):
-            with guard:
-                from perception.readers.logs import read_log
-                from ssh_abduction.robot_logs.log_maps import LogMapping, map_log
+        with contextlib.nullcontext() if workers.serves() else on_ctrl_c(end), guard:
+            from perception.readers.logs import read_log
+            from ssh_abduction.robot_logs.log_maps import LogMapping, map_log
 
-                logs = [read_log(file, **self.reading) for file in files]
-                begun.append(LogMapping())
-                for log, name in zip(logs, names, strict=True):
-                    for warning in log.warnings:
-                        tell(warning if len(logs) == 1 else f"{name}: {warning}")
-                done = map_log(
-                    logs if len(logs) > 1 else logs[0],
-                    self.theory,
-                    choices=self.choices,
-                    width=self.width,
-                    name=names if len(logs) > 1 else names[0],
-                    time_limit=self.limit,
-                    max_maps=self.maps or None,
-                    with_ladder=self.ladder,
-                    corrections=self.corrections,
-                    mapping=begun[0],
-                    tell=tell,
-                )
-                if self.corrections:
-                    say_obeyed(self.corrections, done.imported.trace)
-            return self._answer(number, paths, done, content)
+            logs = [read_log(file, **self.reading) for file in files]
+            begun.append(LogMapping())
+            for log, name in zip(logs, names, strict=True):
+                for warning in log.warnings:
+                    tell(warning if len(logs) == 1 else f"{name}: {warning}")
+            done = map_log(
+                logs if len(logs) > 1 else logs[0],
+                self.theory,
+                choices=self.choices,
+                width=self.width,
+                name=names if len(logs) > 1 else names[0],
+                time_limit=self.limit,
+                max_maps=self.maps or None,
+                with_ladder=self.ladder,
+                corrections=self.corrections,
+                mapping=begun[0],
+                tell=tell,
+            )
+            if self.corrections:
+                say_obeyed(self.corrections, done.imported.trace)
+            answer = self._answer(number, paths, done, content)
+            if keep:
+                guard.finish(answer.code, save=partial(keep, answer))
+        return answer
 
     def _answer(
         self, number: int, paths: Sequence[str], done: LogMap, content: str | None
@@ -365,22 +375,21 @@ def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
         warn([warning])
 
     def keep(answer: FileAnswer) -> None:
-        if answer.code == EXIT_ERROR:
-            raise AbductionError(answer.line)
         try:
             write_run(folder, answer.files)
         except OSError as error:
-            raise AbductionError(unwritten(error, folder)) from None
+            raise UnwrittenError(unwritten(error, folder)) from None
         _say(answer, folder)
         warn([warning for warning in answer.warnings if warning not in printed])
 
     check_folder(folder)
     question = question.obeying(folder)
     if len(logs) == 1:
-        answer = question.answer(0, logs[0], answer_last=keep, tell=tell)
+        answer = question.answer(0, logs[0], keep=keep, tell=tell)
     else:
-        answer = question.answer_together(logs, answer_last=keep, tell=tell)
-    keep(answer)
+        answer = question.answer_together(logs, keep=keep, tell=tell)
+    if answer.code == EXIT_ERROR:
+        raise AbductionError(answer.line)
     return answer.code
 
 

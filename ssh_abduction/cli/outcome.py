@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import os
 import signal
 import sys
 import threading
@@ -10,6 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from itertools import zip_longest
 from pathlib import Path
+from types import FrameType
 from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -149,26 +152,50 @@ def _has_maps(file: str) -> bool:
     return False
 
 
+class StopFlag:
+    """A flag that asks all work to stop. Unlike a `threading.Event`, signal handlers may set it."""
+
+    def __init__(self) -> None:
+        self.since = math.inf  # when it was set first
+
+    def set(self) -> None:
+        self.since = min(self.since, time.monotonic())
+
+    def ask(self) -> None:
+        """Set the flag at Ctrl-C. A second Ctrl-C, some time later, raises KeyboardInterrupt."""
+        if time.monotonic() > self.since + program.AGAIN:
+            raise KeyboardInterrupt
+        self.set()
+
+    def is_set(self) -> bool:
+        return self.since < math.inf
+
+
 @contextlib.contextmanager
-def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
+def on_ctrl_c(action: Callable[[], None]) -> Iterator[None]:
     """While the block runs, call `action` at Ctrl-C and SIGTERM instead of ending the program.
 
-    If `action` is None, these signals are ignored, also in processes started meanwhile. While the
-    block runs, the Guard of the whole program receives no signals. So code that may ignore `action`
-    needs its own Guard.
+    `action` may raise KeyboardInterrupt. While the block runs, the Guard of the whole program
+    receives no signals. So code that may ignore `action` needs its own Guard. A signal that was
+    ignored before is ignored still, as shells want it for programs in the background.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # Python lets only the main thread handle signals
         return
 
-    def hear(number: int, _: object) -> None:
-        program.heard.append(number)
-        if action:
+    def hear(number: int, frame: FrameType | None) -> None:
+        program.hear(number)
+        try:
             action()
+        except KeyboardInterrupt:
+            if program.is_loading(frame):
+                os._exit(program.interrupted_code())
+            raise
 
     before = {
-        number: signal.signal(number, hear if action else signal.SIG_IGN)
+        number: signal.signal(number, hear)
         for number in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(number) is not signal.SIG_IGN
     }
     descriptor = signal.set_wakeup_fd(-1)
     try:

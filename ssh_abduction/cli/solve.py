@@ -197,29 +197,28 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
             until_printed.enter_context(on_ctrl_c(search.interrupt))
             printed = (_Json if options.json else _Text)(search, obeying)
 
-            def last_words(why: Stop) -> tuple[tuple[str, Solution], int]:
+            def last_words(why: Stop) -> tuple[str, int, Callable[[], None]]:
                 solution = obeying.with_names(search.snapshot(why))
                 warn(warnings_of(search, solution))
-                return (printed.last_words(solution), solution), exit_code(solution)
-
-            def print_last(last: tuple[str, Solution]) -> None:
-                print(last[0], end="", flush=True)
-                save_solution(last[1], options.output)
+                save = partial(save_solution, solution, options.output)
+                return printed.last_words(solution), exit_code(solution), save
 
             guard = Guard(
                 search.interrupt,
                 last_words,
                 options.time_limit,
                 options.memory_limit,
-                print_last=print_last,
             )
             until_printed.enter_context(guard)
             explanation = printed.searched(guard.say)
         solution = obeying.finished(search.solution(tuple(printed.kept)), options.time_limit)
-        guard.say(partial(printed.end, solution, explanation))
+
+        def save() -> None:
+            options.json = False  # the JSON is complete: a later error must not follow it
+            save_solution(solution, options.output)
+
+        guard.finish(exit_code(solution), printed.end(solution, explanation), save)
         warn(warnings_of(search, solution))
-        options.json = False  # the JSON is complete: a later error must not follow it
-        save_solution(solution, options.output)
     return exit_code(solution)
 
 
@@ -248,16 +247,17 @@ class _Text:
                 self._room -= len(ssh_map.dstates)
         return why_no_map(self._search)
 
-    def end(self, solution: Solution, explanation: Explanation | None) -> str:
-        """Make the whole output as text."""
+    def end(self, solution: Solution, explanation: Explanation | None) -> Callable[[], str]:
+        """Make the whole output as text, and return a function that returns it."""
         lines = _lines(self._search, solution, explanation, self._search.backbone)
-        return _text(chain(lines, self._obeying.blamed(explanation)))
+        text = _text(chain(lines, self._obeying.blamed(explanation)))
+        return lambda: text
 
     def last_words(self, solution: Solution) -> str:
         """The text of a process that must end although its search does not stop."""
-        kept = (
-            tuple(self.kept) if solution.status is Status.OPTIMAL and self.kept else solution.maps
-        )
+        # To compare several maps may take long.
+        first = tuple(self.kept[:1])
+        kept = first if solution.status is Status.OPTIMAL and first else solution.maps
         return _text(_lines(self._search, replace(solution, maps=kept), None, None))
 
 
@@ -296,15 +296,25 @@ class _Json:
                 say(self._let_go)
         return why_no_map(self._search)
 
-    def end(self, solution: Solution, explanation: Explanation | None) -> str:
-        """Make the rest of the JSON: the maps in memory, and the fields after the maps."""
-        maps = "".join(map(self._line, all_given(solution)))
-        return self._opening() + maps + self._end(solution, explanation, self._search.backbone)
+    def end(self, solution: Solution, explanation: Explanation | None) -> Callable[[], str]:
+        """Return a function that makes the rest of the JSON: the maps in memory, and the fields."""
+        given = all_given(solution)
+        fields = self._fields(solution, explanation, self._search.backbone, len(given))
 
-    def _end(
-        self, solution: Solution, explanation: Explanation | None, backbone: Backbone | None
+        def text() -> str:
+            return self._opening() + "".join(map(self._line, given)) + fields
+
+        return text
+
+    def _fields(
+        self,
+        solution: Solution,
+        explanation: Explanation | None,
+        backbone: Backbone | None,
+        more: int = 0,
     ) -> str:
-        end = answer_ending(self._search, solution, explanation, self._maps, backbone)
+        """Make the fields after the maps; `more` maps are not printed yet."""
+        end = answer_ending(self._search, solution, explanation, self._maps + more, backbone)
         if blamed := self._obeying.blamed(explanation):
             end["corrections"] = blamed
         return f"\n],{json_line(end)[1:]}\n"
@@ -315,7 +325,7 @@ class _Json:
         if not self._maps and solution.maps:
             words += self._line((solution.maps[0], None))
         # The backbone is left out: another thread may be changing it.
-        return words + self._end(solution, None, None)
+        return words + self._fields(solution, None, None)
 
     def _opening(self) -> str:
         """Begin the JSON; "" if it is begun already."""

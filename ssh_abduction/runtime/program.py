@@ -6,12 +6,23 @@ current folder can take the place of a module of Python.
 
 import os
 import sys
+import time
+
+TYPE_CHECKING = False  # as in typing, which takes longer to load than this whole module
+
+if TYPE_CHECKING:
+    from types import FrameType
 
 # The exit code for a signal is SIGNALLED plus its number. Ctrl-C is signal 2 everywhere.
 SIGNALLED, CTRL_C = 128, 2
 
+# Users press Ctrl-C twice, and `timeout` sends a signal to a process and to its group. So a signal
+# this many seconds after the first one asks for nothing new.
+AGAIN = 1.5
+
 heard: list[int] = []  # the signals that asked this process to end, in order
 raised: list[int] = []  # the signals that raised a KeyboardInterrupt
+_heard_at: list[float] = []  # when the last signal came that asked for something new
 
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
@@ -25,6 +36,35 @@ _START = (
 def interrupted_code() -> int:
     """Return the exit code after the last signal: 130 for Ctrl-C (the default), 143 for SIGTERM."""
     return SIGNALLED + (heard[-1] if heard else CTRL_C)
+
+
+def is_loading(frame: "FrameType | None") -> bool:
+    """Whether a module is being loaded in a frame, or in one that called it.
+
+    A KeyboardInterrupt would be unsafe there: C code, such as that of numpy, prints a traceback or
+    turns it into another error.
+    """
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def hear(number: int) -> bool:
+    """Note a signal. Return False if it soon follows another one, and so asks for nothing new."""
+    heard.append(number)
+    now = time.monotonic()
+    is_new = not _heard_at or now > _heard_at[0] + AGAIN
+    if is_new:
+        _heard_at[:] = [now]
+    return is_new
+
+
+def forget() -> None:
+    """Forget the last signal, as it had no effect."""
+    raised.clear()
+    _heard_at.clear()
 
 
 def command(module: str) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import clingo
 
+from ssh_abduction.runtime import program
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch, peak_memory
 from ssh_abduction.solver.values import Grounding
@@ -25,7 +26,8 @@ PREPARING = 0.6, 1.0
 SLOW = 0.05  # log the grounding if it takes more seconds than this
 _log = log_of(__name__)
 _ONE = clingo.Number(1)
-_grounding = threading.Lock()
+# Reentrant: a KeyboardInterrupt between taking and using it must not block this thread forever.
+_grounding = threading.RLock()
 _under_way: set[clingo.SolveHandle] = set()  # the running searches of clingo, each in a thread
 
 
@@ -100,6 +102,7 @@ class Control(clingo.Control):
             super().__del__()  # type: ignore[no-untyped-call]
         except KeyboardInterrupt:
             # Python only prints what is raised here. So let Ctrl-C come again a bit later.
+            program.forget()
             threading.Timer(POLL, signal.raise_signal, [signal.SIGINT]).start()
 
     @contextmanager

@@ -29,9 +29,12 @@ Result = TypeVar("Result")
 
 # A process may take this many seconds to start, even on a busy machine.
 STARTING = 10.0
+DYING = 1.0  # seconds to wait for the end of a process that was killed
 
 _BEGIN = b"\0ssh-abduction answers\n"  # whatever Python prints before this is no answer
 _under_way: set[subprocess.Popen[bytes]] = set()
+# The folders for temporary files of the processes under way.
+_folders: set[tempfile.TemporaryDirectory[str]] = set()
 
 
 class Lost(NamedTuple):
@@ -148,7 +151,7 @@ def answers(
     ready = queue.Queue[Any]()
     workers: list[Worker | None] = [None] * processes
     over = threading.Event()  # set when the caller wants no more answers
-    folder = tempfile.TemporaryDirectory(prefix="ssh-abduction-", ignore_cleanup_errors=True)
+    folder = _new_folder()
 
     def run(place: int) -> None:
         try:
@@ -196,7 +199,7 @@ def answers(
     finally:
         over.set()
         _end([*filter(None, workers)], threads)
-        folder.cleanup()
+        _delete(folder)
 
 
 def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) -> Result:
@@ -252,9 +255,29 @@ def _attempted(
 
 
 def end_all() -> None:
-    """Kill all processes that were started here. Call this before this process exits."""
-    for process in list(_under_way):
+    """Kill all processes that were started here, and delete their temporary files.
+
+    Call this before this process exits.
+    """
+    killed = list(_under_way)
+    for process in killed:
         process.kill()
+    for process in killed:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(DYING)
+    for folder in list(_folders):
+        _delete(folder)
+
+
+def _new_folder() -> tempfile.TemporaryDirectory[str]:
+    folder = tempfile.TemporaryDirectory(prefix="ssh-abduction-", ignore_cleanup_errors=True)
+    _folders.add(folder)
+    return folder
+
+
+def _delete(folder: tempfile.TemporaryDirectory[str]) -> None:
+    folder.cleanup()
+    _folders.discard(folder)
 
 
 def _living(worker: Worker | None, folder: str) -> Worker:
