@@ -102,11 +102,11 @@ def doubt_of(problem: Problem, best: SSHMap) -> str | None:
     overlap = problem.overlap
     if not overlap.near or not overlap.of_map(best):
         return None
-    from ssh_abduction.solver.geometry.fit import Poses  # loads scipy
+    if best.fit is None:
+        from ssh_abduction.solver.geometry.fit import fit  # loads scipy
 
-    places = [dstate.place for dstate in best.dstates]
-    at = Poses.of_map(problem.trace, best).placed()[1].tolist()
-    for *steps, _ in overlap.crowded(dict(enumerate(best.dstate_at)), places, at):
+        best = replace(best, fit=fit(problem.trace, best))
+    for *steps, _ in overlap.crowded_in(best):
         names = (step_name(drives_of(problem.trace), step) for step in steps)
         return f"{' and '.join(names)} are at one position, but at two places"
     return None
