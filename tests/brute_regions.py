@@ -67,11 +67,19 @@ def sides(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> set[tuple[i
             break
         before |= more
     excused = {frozenset(pair) for pair in ssh_map.excused}
+    on = {(place[s], course[s][0]) for s in course}
+    loose = {
+        h
+        for p, h in on
+        for q, g in on
+        if h == g and p != q and not any(c[0] == h and {a, b} == {p, q} for c, a, b in before)
+    }
     return {
         (q, c)
         for p, c, b in branches
         for e, o, q in before
         if "side_of_branch" in axioms
+        and not ("sides_need_order" in axioms and c[0] in loose)
         and e == b
         and o == p
         and frozenset((c[0], b[0])) not in excused

@@ -99,7 +99,14 @@ CASES: dict[str, tuple[Theory, str, str, str]] = {
         "0 1+ behind1/1 2-/2 0+/3 1- behind2",
         "0 behind1/3 behind2",
     ),
-    "order_transitive": (PLAIN, "a T b R c T d T e", "0 1+ behind1/2,3 0+", "0 1+ behind1/2 0+"),
+    "order_transitive": (PLAIN, "a T b R c T d T e", "0 1+ behind1/2,3 0+", "0 behind1/2 0+"),
+    # The first and the last street are one path of the map, which is bent.
+    "sides_need_order": (
+        PLAIN,
+        "a T b R c T d L e T f R g T h",
+        "0 1+/1 2-/3 1-/4 2+",
+        "0 1+/1 2-/2 0+/3 1-/4 2+",
+    ),
 }
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import combinations
 from typing import TypeAlias
 
 from ssh_abduction.checker.moves import Course, along, course_of, opposite
@@ -26,7 +27,8 @@ def known_sides(m: Reading) -> Mapping[Course, Mapping[int, RightBranch]]:
     A course is a path in one direction.
 
     Here the order of places comes from travels alone. If a map lists places in an order that
-    travels do not imply, another order may be just as right.
+    travels do not imply, another order may be just as right. Nothing is known to lie beside a path
+    if travels do not order all its places: it may be two corridors.
     """
     follows: dict[Course, dict[int, set[int]]] = defaultdict(lambda: defaultdict(set))
     for _, course, p, q in m.along_travels if "travel_orders" in m.axioms else ():
@@ -40,7 +42,13 @@ def known_sides(m: Reading) -> Mapping[Course, Mapping[int, RightBranch]]:
             later = set(reached(later, next_of.__getitem__))
         return later - {place}
 
-    return branches_right_of(m, after)
+    def is_ordered(path: int) -> bool:
+        pairs = combinations(m.along.get(path, ()), 2)
+        return all(q in after(p, (path, 1)) or p in after(q, (path, 1)) for p, q in pairs)
+
+    ordered = {path.id for path in m.map.paths if is_ordered(path.id)}
+    found = branches_right_of(m, after)
+    return {course: places for course, places in found.items() if course[0] in ordered}
 
 
 def _beside(m: Reading) -> dict[_Places, str]:
