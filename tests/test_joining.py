@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
-from itertools import product
+from itertools import pairwise, product
 from unittest.mock import patch
 
 import changes
@@ -14,7 +15,7 @@ from together import of_mazes
 
 from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
 from ssh_abduction.checker.checker import violations
-from ssh_abduction.data import Closure, Odometry, Step, together
+from ssh_abduction.data import Action, Closure, Odometry, Step, together
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.star import Gateway, Star
 from ssh_abduction.solver.costs import beams
@@ -46,6 +47,37 @@ def along(*drives: str) -> Trace:
         Trace.from_steps(views, ["travel"] * count, displacements=[way] * count)
         for views, count in zip(drives, counts, strict=True)
     )
+
+
+def street_tour(route: str, at: Mapping[str, tuple[float, float]], streets: set[str]) -> Trace:
+    """A drive along straight streets, with all streets of each place as its star.
+
+    `at` has the position of each place in metres. All dead ends have the view "end".
+    """
+
+    def bearing(here: str, there: str) -> float:
+        return math.degrees(math.atan2(at[there][1] - at[here][1], at[there][0] - at[here][0]))
+
+    def seen(place: str, heading: float) -> Step:
+        ways = [name for name in at if name + place in streets or place + name in streets]
+        bearings = sorted((heading - bearing(place, way)) % 360 for way in ways)
+        star = tuple(Gateway(b, 0.75) for b in bearings)
+        return Step("end" if len(ways) == 1 else place, star=star)
+
+    heading = bearing(*route[:2])
+    steps = [seen(route[0], heading)]
+    for here, there in pairwise(route):
+        turn = math.remainder(bearing(here, there) - heading, 360)
+        if turn:
+            kind = "around" if abs(turn) == 180 else "left" if turn > 0 else "right"
+            steps[-1] = replace(steps[-1], action=Action(f"{kind} {turn:.0f}", "turn", kind))
+            heading += turn
+            steps.append(replace(seen(here, heading), displacement=(0, 0, math.radians(turn))))
+        steps[-1] = replace(steps[-1], action=Action("travel", "travel"))
+        steps.append(
+            replace(seen(there, heading), displacement=(math.dist(at[here], at[there]), 0, 0))
+        )
+    return Trace(tuple(steps))
 
 
 @pytest.mark.parametrize("stars", [True, False], ids=["stars", "no stars"])
@@ -145,6 +177,16 @@ def test_sights_compare_gateways_by_bearing(
     settled = settle(trace, Theory(changed=changed, star="gateways", boundary="none")).theory
     sights = Sights(trace, settled, Log(trace, settled), misreads=False)
     assert sights.are_alike(*sights.shown) == is_one
+
+
+def test_near_rooms_whose_doors_face_other_ways_stay_two() -> None:
+    """Two dead ends are 1 m apart, and the ways into them are at right angles."""
+    at = {"a": (0, 0), "b": (5, 0), "c": (12, 0), "d": (17, 0), "x": (8, 3), "y": (9, 3)}
+    streets = {"ab", "bc", "cd", "bx", "cy"}
+    drives = street_tour("abxbcd", at, streets), street_tour("abcycd", at, streets)
+    *_, best = joined(settle(together(drives), Theory(boundary="none")))
+    assert len(best.pieces) == 1
+    assert len(best.places) == 6
 
 
 def test_drives_without_common_views_are_not_joined() -> None:

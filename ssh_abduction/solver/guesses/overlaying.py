@@ -194,6 +194,7 @@ class Overlay:
     def __init__(self, standing: Part, drive: Part, problem: Problem, sights: Sights) -> None:
         theory, both = problem.theory, standing.beside(drive)
         self._both, self._sights, self._overlap = both, sights, problem.overlap
+        self._steps = both.step_at
         self._old = len(standing.places), len(standing.sights)
         self._has_places = theory.level == "topological"
         self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
@@ -385,7 +386,7 @@ class Overlay:
         """Merge two places, and perhaps two headings there. Raises _ClashError."""
         state, position = self._state, self._both.position
         changes = self._sights.merged(state.sights[p], state.sights[q])
-        if math.isinf(changes):
+        if math.isinf(changes) or (heading is None and not changes and not self._may_face(p, q)):
             raise _ClashError
         state.kept_places = _merged(state.kept_places, p, q)
         state.sights[p] = {**state.sights[p], **state.sights[q]}
@@ -395,6 +396,18 @@ class Overlay:
             self._condition(same, self._prices[1] - changes)
         else:
             self._condition([*same, heading], sum(self._prices) - changes)
+
+    def _may_face(self, p: int, q: int) -> bool:
+        """Whether the gateways of two places agree if each place is turned as its dstates face."""
+        (s, *_), (x, *_), c = self._dstates_at(p), self._dstates_at(q), self._state.covariance
+        turns = list(self._sights.turns(self._steps[s], self._steps[x]))
+        i, j = self._both.heading[s], self._both.heading[x]
+        spread = c[i, i] + c[j, j] - 2 * c[i, j] + self._spreads[2]
+        off = [
+            math.remainder(self._state.mean[i] + turn - self._state.mean[j], math.tau)
+            for turn in turns
+        ]
+        return not turns or any(abs(by) < TURNED or by * by < FAR * spread for by in off)
 
     def _condition(self, same: list[tuple[int, int]], saved: float) -> None:
         """Condition the poses on the equality of pairs of entries. Update the cost in nats."""
