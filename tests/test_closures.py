@@ -188,7 +188,7 @@ def test_beam_cost_with_closures_equals_the_cost_of_the_map() -> None:
     assert maps[0] == maps[1]
     without, square = (Poses.of_map(drive, maps[0]).misfit() for drive in (known.trace, trace))
     assert square > without + 10
-    bests = [beam.best.nats for beam in beams if beam.best]
+    bests = [beam.hypotheses[0].nats for beam in beams if beam.hypotheses]
     assert bests[1] - bests[0] == pytest.approx((square - without) / 2, rel=0.02)
 
 

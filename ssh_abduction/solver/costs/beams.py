@@ -174,7 +174,7 @@ class Beams:
                     found[self._add(merged)] = merged
             # A beam without axioms would be the same if the checker refused nothing.
             broken = -math.inf if beam.refuses else 0.0
-            estimate = beam.best.nats if beam.best else math.inf
+            estimate = beam.hypotheses[0].nats if beam.hypotheses else math.inf
             self._take(min(found, default=math.inf), estimate, broken)
         return True
 

@@ -87,7 +87,7 @@ class Beam:
     """The search for hypotheses of little cost.
 
     Attributes:
-        best: The best hypothesis of the whole trace; None before there is one.
+        hypotheses: The hypotheses of the whole trace, by cost; none before `maps` has ended.
         refuses: Whether the checker refused a hypothesis.
     """
 
@@ -104,7 +104,7 @@ class Beam:
         # The prices of a dstate and of a place.
         self._prices = theory.prices[0], theory.prices[1] if has_places else 0.0
         self._reckoning, self._frames = HypothesisPoses(trace), frames_of(trace)
-        self.best: Hypothesis | None = None
+        self.hypotheses: list[Hypothesis] = []
         self.refuses = False
         self._kept: list[list[Hypothesis]] = []  # the beam after each check
         self._sights = Sights(trace, self._bare, log, misreads=theory.misread > 0)
@@ -142,7 +142,7 @@ class Beam:
             kept[-1] = kept[-1][:SPARE]  # saves memory
             kept.append(beam)
         self._kept = kept[-1:]
-        self.best = kept[-1][0]
+        self.hypotheses = kept[-1]
         for found in kept[-1][: ALIKE * self._width]:
             if (ssh_map := self._map(found, len(self._trace))) is not None:
                 yield ssh_map

@@ -17,9 +17,9 @@ Reference:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, permutations
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -65,6 +65,8 @@ _Anchors: TypeAlias = dict[_Pair, list[_Anchor]]
 
 # The width of the beam that maps each drive alone.
 ALONE = 4
+# If a drive stays apart, try this many other maps of it.
+OTHERS = 2
 # Two dstates may coincide if their headings differ by less than this many radians, and their
 # positions by less than this share of a usual travel.
 TURNED, SHIFTED = 0.4, 0.4
@@ -99,10 +101,10 @@ class Joining:
         """
         first = sum(len(part.labels) for part in standing)
         drives = [drive for drive in drives_of(self._problem.trace) if drive.first >= first]
-        parts = [self._alone(drive) for drive in drives]
-        alone = [*standing, *(part for part in parts if part is not None)]
-        if None in parts:
+        found = [self._alone(drive) for drive in drives]
+        if not all(found):
             return
+        alone = [*standing, *(part for part, *_ in found)]
         anchors = {
             (first, second): self._anchors(first, second)
             for first, second in combinations(alone, 2)
@@ -110,7 +112,10 @@ class Joining:
         }
         starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
         joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
-        best = min(joined, key=lambda parts: sum(map(self._nats, parts)), default=alone)
+        best = min(joined, key=self._nats_of, default=alone)
+        others = {part: rest for part, *rest in found}
+        while mended := [*self._joined_by_others(best, others)]:
+            best = min(mended, key=self._nats_of)
         if len(best) < len(alone):
             yield from self._beside(alone)
         dearer = []
@@ -119,7 +124,7 @@ class Joining:
             if (both := self._joined(*pair, ways, math.inf)) is not None:
                 dearer.append([*(part for part in best if part not in pair), both])
         if dearer:
-            yield from self._beside(min(dearer, key=lambda parts: sum(map(self._nats, parts))))
+            yield from self._beside(min(dearer, key=self._nats_of))
         yield from self._beside(best)
 
     def _all_joined(self, parts: list[Part], anchors: _Anchors, start: _Pair) -> list[Part]:
@@ -135,6 +140,21 @@ class Joining:
             pair = max(anchors, key=lambda pair: anchors[pair][:1], default=start)
         return parts
 
+    def _joined_by_others(
+        self, parts: Sequence[Part], others: Mapping[Part, Sequence[Part]]
+    ) -> Iterator[list[Part]]:
+        """Yield ways to join a drive that is apart, if another map of it is taken.
+
+        `others` has the other maps of each drive that cost little more. One of them may be the true
+        one, which the drive alone does not tell.
+        """
+        for part, second in permutations(parts, 2):
+            most = self._nats_of([part, second])
+            for other in others.get(part, ()):
+                ways = self._anchors(second, other)
+                if (both := self._joined(second, other, ways, most)) is not None:
+                    yield [*(kept for kept in parts if kept not in (part, second)), both]
+
     def _beside(self, parts: Sequence[Part]) -> Iterator[SSHMap]:
         """Yield a map with these parts as separate pieces, unless it breaks an axiom."""
         whole = parts[0]
@@ -143,18 +163,19 @@ class Joining:
         if ssh_map := self._map(whole):
             yield ssh_map
 
-    def _alone(self, drive: Drive) -> Part | None:
-        """Map a drive alone; None if no map is found."""
+    def _alone(self, drive: Drive) -> list[Part]:
+        """Map a drive alone. Return its cheapest maps, the best first; none if none is found."""
         trace = self._problem.trace[drive.first : drive.stop]
         theory = self._problem.theory.of_steps(drive.first, len(trace))
         theory = replace(theory, several_drives=False, changed=0.0)
         problem = Problem.of(trace, theory)
         beam = Beam(problem, Log(trace, theory, problem.pairs), ALONE)
-        if next(beam.maps(), None) is None or beam.best is None:
-            return None
+        if next(beam.maps(), None) is None:
+            return []
+        found = beam.hypotheses[: 1 + OTHERS]
         if beam.refuses:
-            self.broken += beam.best.nats - beam.nats_without_axioms()
-        return Part.of(beam.best, drive.first, self._log, self.sights)
+            self.broken += found[0].nats - beam.nats_without_axioms()
+        return [Part.of(one, drive.first, self._log, self.sights) for one in found]
 
     def _anchors(self, first: Part, second: Part) -> list[_Anchor]:
         """List the anchors (ways to lay one map on the other) of two maps, the best first."""
@@ -235,6 +256,10 @@ class Joining:
                 found.append(part)
         found.sort(key=self._nats)
         return next((joined for joined in found if self._map(joined)), None)
+
+    def _nats_of(self, parts: Sequence[Part]) -> float:
+        """Compute the cost of parts as separate pieces, in nats."""
+        return sum(map(self._nats, parts))
 
     def _nats(self, part: Part) -> float:
         """Compute the cost of a part in nats, with the price of places at one position."""

@@ -194,7 +194,7 @@ class Overlay:
     def __init__(self, standing: Part, drive: Part, problem: Problem, sights: Sights) -> None:
         theory, both = problem.theory, standing.beside(drive)
         self._both, self._sights, self._overlap = both, sights, problem.overlap
-        self._steps = both.step_at
+        self._steps, self._may_change = both.step_at, theory.changed > 0
         self._old = len(standing.places), len(standing.sights)
         self._has_places = theory.level == "topological"
         self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
@@ -386,7 +386,7 @@ class Overlay:
         """Merge two places, and perhaps two headings there. Raises _ClashError."""
         state, position = self._state, self._both.position
         changes = self._sights.merged(state.sights[p], state.sights[q])
-        if math.isinf(changes) or (heading is None and not changes and not self._may_face(p, q)):
+        if math.isinf(changes) or (heading is None and not self._may_face(p, q)):
             raise _ClashError
         state.kept_places = _merged(state.kept_places, p, q)
         state.sights[p] = {**state.sights[p], **state.sights[q]}
@@ -398,7 +398,12 @@ class Overlay:
             self._condition([*same, heading], sum(self._prices) - changes)
 
     def _may_face(self, p: int, q: int) -> bool:
-        """Whether the gateways of two places agree if each place is turned as its dstates face."""
+        """Whether the gateways of two places agree if each place is turned as its dstates face.
+
+        This is unknown, and so True, if gateways may change between drives.
+        """
+        if self._may_change:
+            return True
         (s, *_), (x, *_), c = self._dstates_at(p), self._dstates_at(q), self._state.covariance
         turns = list(self._sights.turns(self._steps[s], self._steps[x]))
         i, j = self._both.heading[s], self._both.heading[x]
