@@ -13,6 +13,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import (
     Corrections,
     MapError,
+    Odometry,
     SSHMap,
     TheoryError,
     drives_of,
@@ -192,6 +193,29 @@ def test_solve_obeys_recorded_corrections(folder: Path, capsys: pytest.CaptureFi
     elsewhere = ["solve", *solving(folder)[1:4], "--corrections", building, "--json"]
     assert main(elsewhere) == 0
     assert json.loads(capsys.readouterr().out)["theory"]["different"] == [[1, 4]]
+
+
+def test_corrections_of_a_drive_hold_beside_a_drive_with_other_odometry() -> None:
+    monday = Trace.from_steps(
+        "abc", ["travel", "around"], displacements=[(5, 0, 0), (0, 0, 3.14)], name="monday"
+    )
+    monday = replace(monday, odometry=Odometry(along=0.1))
+    tuesday = replace(monday, odometry=Odometry(along=0.2), name="tuesday")
+    said = Corrections.for_drives(monday).with_name("hall", "place", "monday:1")
+    solution = solve([monday, tuesday], corrections=said)
+    assert solution[0].names[0].text == "hall"
+    other = replace(monday, steps=(*monday.steps[:2], replace(monday.steps[2], view="d")))
+    with pytest.raises(MapError, match="got other steps of monday"):
+        solve(other, corrections=said)
+
+
+def test_explain_takes_the_folder_of_maps_that_solve_wrote(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["explain", str(folder / "building"), "monday:1", "tuesday:0"]) == 0
+    assert "monday:1 and tuesday:0" in capsys.readouterr().out
+    assert main(["explain", str(folder), "monday:1", "tuesday:0"]) == 1
+    assert "expected a readable" in capsys.readouterr().err
 
 
 def test_any_step_at_a_place_renames_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -98,6 +98,8 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    if not Path(trace_path(options.trace)).exists():  # a folder with a file of solve -o
+        options.trace = maps_path(options.trace)
     kept = trace_of_maps(options.trace)
     if kept is not None or Path(options.trace).is_dir():
         options.theory = options.theory or maps_path(options.trace)

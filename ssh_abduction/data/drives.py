@@ -37,8 +37,9 @@ from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace, checked_trace
 
 SEEN = "star_seen"  # the field of a step that keeps the star before a person corrected it
-# The fields of a step that a solver reads.
-_READ = frozenset({"view", "action", "star", "displacement", "covariance", "confidence"})
+# The fields of a step that its fingerprint covers. Covariances are left out, as `together` adds
+# them if drives differ in their odometry.
+_MARKED = frozenset({"view", "action", "star", "displacement", "confidence"})
 # In one building, the median travels of two drives hardly differ by this factor. Millimetres and
 # centimetres are 1000 and 100 to the metre.
 UNITS = 30.0
@@ -140,12 +141,12 @@ def with_fingerprints(trace: Trace) -> tuple[Drive, ...]:
 
 
 def _fingerprint(steps: Sequence[Step]) -> str:
-    """Return a digest, of 16 hexadecimal digits, of the fields of steps that a solver reads."""
+    """Return a digest, of 16 hexadecimal digits, of what the robot did and saw."""
     lines = [step.to_json() for step in steps]
     for i, (step, line) in enumerate(zip(steps, lines, strict=True)):
         if SEEN in step.extra:
             line["star"] = step.extra[SEEN]
-        kept = _READ if i else _READ - {"displacement", "covariance"}
+        kept = _MARKED if i else _MARKED - {"displacement"}
         kept = kept if i < len(steps) - 1 else kept - {"action"}
         lines[i] = {name: value for name, value in line.items() if name in kept}
     return hashlib.sha256("\n".join(map(json_line, lines)).encode()).hexdigest()[:16]
