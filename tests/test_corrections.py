@@ -349,6 +349,22 @@ def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixt
     assert "it contradicts the trace: the robot" in capsys.readouterr().err
 
 
+def test_contradicting_correction_is_refused_in_a_folder_that_map_wrote(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The verb map writes the trace beside the maps."""
+    assert main(solving(folder, "round")) == 0
+    building = folder / "building"
+    data = json.loads((building / "maps.json").read_text())
+    del data["trace"]
+    (building / "maps.json").write_text(json.dumps(data))
+    (building / "run.json").write_text("{}")
+    ROUND.save(building / "trace.jsonl")
+    assert main(["correct", str(building), "--closed", "round:1 back"]) == 1
+    assert "it contradicts the trace: the robot" in capsys.readouterr().err
+    assert main(["correct", str(building), "--open", "round:1 ahead"]) == 0
+
+
 @pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
 @pytest.mark.parametrize("onto", [False, True])
 def test_warning_if_a_later_drive_contradicts_a_gateway_correction(

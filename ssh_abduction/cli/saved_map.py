@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ssh_abduction.cli.options import maps_path, read_maps, trace_of_maps
+from ssh_abduction.cli.options import maps_path, read_maps, trace_beside, trace_of_maps
 from ssh_abduction.data.corrections import Corrections, Naming
 from ssh_abduction.data.corrections_file import FILE, direction, load_corrections, save_corrections
 from ssh_abduction.data.drives import Drive, step_name, step_of
@@ -16,6 +16,7 @@ from ssh_abduction.data.errors import MapError, TraceError, brief, named
 from ssh_abduction.data.map_parts import NAMED, thing_named
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import region_of
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
 from ssh_abduction.rivals.listing import Listing
 
@@ -79,7 +80,9 @@ class SavedMap:
         Raises MapError if a gateway contradicts the trace, or a drive or a step is unknown.
         """
         corrections.known_in(self.drives)
-        if (trace := trace_of_maps(str(self.file))) is not None:
+        beside = trace_beside(str(self.file))
+        trace = Trace.load(beside) if beside else trace_of_maps(str(self.file))
+        if trace is not None:
             corrections.corrected(trace)
         file = self.file.parent / FILE
         save_corrections(corrections, file)
