@@ -158,8 +158,7 @@ def row_of_file(task: tuple[float, str, str]) -> str:
     done = import_log(log)
     seconds = process_time() - start
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    way = np.array([scan.odometry[:2] for scan in log.scans])
-    driven = float(np.hypot(*np.diff(way, axis=0).T).sum()) / SPEED
+    driven = float(np.hypot(*np.diff(log.odometry[:, :2], axis=0).T).sum()) / SPEED
     places = done.seconds["track"] + done.seconds["places"]
     return (
         f"| {kilometres:g} | {len(log)} | {len(done.visits)} | {len(done.trace.closures)} | "

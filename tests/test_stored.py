@@ -1,9 +1,10 @@
-"""Ranges of a log are kept in temporary files: the same values, and hardly any memory."""
+"""A table keeps the scans of a log: the same values, and hardly any memory."""
 
 from __future__ import annotations
 
 import math
 import tracemalloc
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,12 @@ import pytest
 from perception.readers import stored
 from perception.readers.logs import read_log
 from perception.readers.scans import LaserScanner, Scan
-from perception.readers.stored import RangeStore, in_turn
+from perception.readers.stored import ScanTable, in_turn, without_ranges
 from perception.readers.writers import write_carmen
 
 BEAMS = 360
 LASER = LaserScanner(-math.pi / 2, math.pi / BEAMS, BEAMS, 8.0)
+LASER_OF_9 = LaserScanner(-math.pi / 2, math.pi / 9, 9, 8.0)
 
 
 def scans_of(count: int) -> list[Scan]:
@@ -25,8 +27,8 @@ def scans_of(count: int) -> list[Scan]:
 
 
 def test_kept_ranges_survive_the_release_of_their_memory() -> None:
-    scans, store = scans_of(200), RangeStore()
-    kept = [store.kept(scan) for scan in scans]
+    scans = scans_of(200)
+    kept = ScanTable(scans)
     for _ in range(2):
         assert all((a.ranges == b.ranges).all() for a, b in zip(in_turn(kept), scans, strict=True))
     # The ranges lie in several files, one behind the other.
@@ -39,9 +41,43 @@ def no_file() -> None:
 
 def test_ranges_stay_in_memory_on_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stored.tempfile, "TemporaryFile", no_file)
-    scans, store = scans_of(3), RangeStore()
-    for kept, scan in zip(in_turn([store.kept(scan) for scan in scans]), scans, strict=True):
+    scans = scans_of(3)
+    for kept, scan in zip(in_turn(ScanTable(scans)), scans, strict=True):
         assert (kept.ranges == scan.ranges).all()
+
+
+def test_table_returns_the_scans_that_were_put_in() -> None:
+    other = LaserScanner(0.0, 0.1, 3, 4.0, (0.1, 0.2, 0.3))
+    full = Scan(
+        np.array([1.0, math.inf, math.nan]), other, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0), 7.5, 8
+    )
+    scans = [*scans_of(2), full]
+    table = ScanTable(scans)
+    table[0] = without_ranges(full)
+    assert [vars_of(scan) for scan in table[1:]] == [vars_of(scan) for scan in scans[1:]]
+    assert vars_of(table[-1]) == vars_of(full) != vars_of(table[0])
+    assert np.isnan(table[0].ranges).all()
+    with pytest.raises(IndexError):
+        table[3]
+
+
+def vars_of(scan: Scan) -> list[str]:
+    return [repr(getattr(scan, field.name)) for field in fields(scan)]
+
+
+def test_table_needs_little_memory_for_each_scan() -> None:
+    count = 2000
+    tracemalloc.start()
+    try:
+        table = ScanTable(
+            Scan(np.full(9, 0.1 * k), LASER_OF_9, (0.1 * k,) * 3, (0.2 * k,) * 3, 0.3 * k, k)
+            for k in range(count)
+        )
+        size = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    assert len(table) == count
+    assert size < 120 * count
 
 
 @pytest.mark.slow

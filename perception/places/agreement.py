@@ -105,7 +105,7 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
     Stretches across a cut of the track, where the motion is unknown, are ignored. If the
     odometer hardly moved, only lengths are compared.
     """
-    odometry = np.array([scan.odometry for scan in log.scans])
+    odometry = log.odometry
     stretches = [
         (i, j) for i, j in _stretches(odometry) if not any(i < cut <= j for cut in track.cuts)
     ]

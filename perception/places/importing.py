@@ -133,7 +133,7 @@ def import_live(
 ) -> tuple[RobotLog, Imported]:
     """Import a log as a trace while it is read or recorded.
 
-    Memory hardly grows: each scan leaves about 400 bytes, and each visit its local map. If the
+    Memory hardly grows: each scan leaves about 200 bytes, and each visit its local map. If the
     odometry is good, the trace is that of `import_log`. They can differ because each step of the
     odometer is judged by earlier steps only.
 
@@ -159,6 +159,7 @@ def import_live(
             visits.append(visit)
             show(visit)
         log, track, notes = live.result()
+    del live  # It has a copy of the track.
     _refuse_bad(log, track, notes)
     return log, _imported(log, track, tuple(visits), width, name, notes, seconds)
 
@@ -320,7 +321,9 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 def calibrated(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> Track:
     """Return a track with covariances that agree with the closures between visits, if any."""
-    return replace(track, covariances=track.covariances * factor_of(track, visits, closings))
+    factor = factor_of(track, visits, closings)
+    vars(track).pop("spreads", None)  # They are not used again, and need much memory.
+    return replace(track, covariances=track.covariances * factor)
 
 
 def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
@@ -88,11 +88,11 @@ def seams_of(log: RobotLog) -> list[tuple[int, str]]:
 
     The laser changes for good, or the clock is reset.
     """
-    lasers = [(scan.laser.first, scan.laser.step, scan.laser.mount) for scan in log.scans]
-    other = [i for i in range(1, len(log)) if lasers[i] != lasers[i - 1]]
+    lasers = pairwise((s.laser.first, s.laser.step, s.laser.mount) for s in log.scans)
+    other = [i for i, (last, laser) in enumerate(lasers, 1) if laser != last]
     seams = {i: "The laser changes" for i in other if len(other) == 1}
-    times = [scan.time for scan in log.scans]
-    steps = [0.0 if last is None or time is None else time - last for last, time in pairwise(times)]
+    times = pairwise(scan.time for scan in log.scans)
+    steps = [0.0 if last is None or time is None else time - last for last, time in times]
     # A single wrong time is followed by a step back to the clock.
     resets = [i for i, step in enumerate(steps, 1) if not -ANEW_CLOCK <= step <= DAY]
     if len(resets) <= SEAMS and all(later - first > 1 for first, later in pairwise(resets)):
@@ -124,7 +124,7 @@ def usual_step(log: RobotLog) -> float:
     return float(np.median(far[far > 0])) if (far > 0).any() else 0.0
 
 
-def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan, ...]:
+def _of_source(scans: Sequence[Scan], members: NDArray[np.intp]) -> tuple[Scan, ...]:
     """Replace the odometry of all scans by that of one source, interpolated or extrapolated."""
     from scipy.interpolate import interp1d
 
@@ -369,8 +369,7 @@ def _moved_while_still(
 
 def stands_still(log: RobotLog) -> NDArray[np.bool_]:
     """Find the steps between n scans in which the odometer repeats a pose: mask, (n - 1,)."""
-    poses = np.array([scan.odometry for scan in log.scans])
-    return np.asarray(np.abs(np.diff(poses, axis=0)).max(axis=1) < STILL)
+    return np.asarray(np.abs(np.diff(log.odometry, axis=0)).max(axis=1) < STILL)
 
 
 class StandstillCheck:
@@ -425,7 +424,7 @@ def _change(first: Scan, last: Scan) -> float:
 
 def _far(log: RobotLog, steps: int) -> NDArray[np.float64]:
     """Distances in metres by odometry from each scan to the scan `steps` later, (n - steps,)."""
-    positions = np.array([scan.odometry[:2] for scan in log.scans])
+    positions = log.odometry[:, :2]
     return np.asarray(np.hypot(*(positions[steps:] - positions[:-steps]).T))
 
 

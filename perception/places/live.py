@@ -1,7 +1,7 @@
 """Imports a log while it is read or recorded.
 
 The scans are processed one at a time. Only the track, the visits with their local maps, and about
-400 bytes per scan for the checks at the end are kept.
+90 bytes per scan for the checks at the end are kept.
 
 The first scans wait until the units of the odometry are recognised. Then the scans get the checks
 of a whole log, but in stretches of 1,600 scans. Each stretch is checked four times: when it has
@@ -14,12 +14,7 @@ import math
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
-from functools import lru_cache
 from itertools import chain
-
-import numpy as np
-from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.places import jumps, log_checks
@@ -30,6 +25,7 @@ from perception.places.track import Track, Trust
 from perception.places.units import LEAST_WAY, Units, units_of
 from perception.places.visits import Visit
 from perception.readers.scans import Damage, RobotLog, Scan
+from perception.readers.stored import ScanTable, without_ranges
 from ssh_abduction.data.errors import brief, is_finite, named
 
 # The number of first scans over which the track is compared with the odometry.
@@ -85,7 +81,7 @@ class LiveLog:
         self._items, self._width, self._source = items, width, source
         self._tell = Teller(tell)
         self._damaged: list[Damage] = []
-        self._scans: list[Scan] = []
+        self._scans = ScanTable()
         self._begun: list[Scan] = []  # the first COMPARED scans, with their ranges
         self._latest: deque[Scan] = deque(maxlen=log_checks.BESIDE + 1)
         self._poor = self._wanted = 0  # poor matches so far, and scans to keep after the last one
@@ -143,7 +139,8 @@ class LiveLog:
         self._latest.append(one.scan)
         if one.share < log_checks.POORLY and self._poor < MOST_POOR:
             self._poor, self._wanted = self._poor + 1, log_checks.BESIDE
-            self._scans[-len(self._latest) :] = self._latest
+            for back, scan in enumerate(reversed(self._latest), 1):
+                self._scans[-back] = scan
         elif self._wanted:
             self._scans[-1], self._wanted = one.scan, self._wanted - 1
         if one.cut and len(self._done.cuts) <= SAID:
@@ -159,17 +156,7 @@ class LiveLog:
 
     @property
     def _log(self) -> RobotLog:
-        return RobotLog(tuple(self._scans), tuple(self._damaged), source=self._source)
-
-
-@lru_cache
-def _unknown(beams: int) -> NDArray[np.float64]:
-    return np.full(beams, np.nan)
-
-
-def without_ranges(scan: Scan) -> Scan:
-    """Copy a scan, with unknown ranges that need no memory."""
-    return replace(scan, ranges=_unknown(len(scan.ranges)))
+        return RobotLog(self._scans, tuple(self._damaged), source=self._source)
 
 
 class Teller:

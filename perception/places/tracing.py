@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -148,7 +149,7 @@ def _step(
     if scan.corrected is not None:
         truth = {"pose": [round(x, 4) for x in moved(scan.corrected, seen)]}
     return Step(
-        image=tuple(round(float(r), 3) for r in _image(patch, visit.middle, pose[2])),
+        image=tuple(map(_millimetres, _image(patch, visit.middle, pose[2]).tolist())),
         star=_star(visit, pose[2]),
         displacement=None
         if onward is None
@@ -205,6 +206,12 @@ def _image(patch: PackedPatch, middle: Array, heading: float) -> Array:
     # The middle itself counts as free.
     free[:, : round(2 * CELL / (CELL / 2))] = True
     return np.asarray(np.where(free.all(axis=1), far[-1], far[np.argmin(free, axis=1)]))
+
+
+@lru_cache(4096)
+def _millimetres(metres: float) -> float:
+    """Round a range. Images share their few different ranges, and so need less memory."""
+    return round(metres, 3)
 
 
 def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> Covariance:

@@ -15,6 +15,9 @@ from perception.readers.scans import Pose
 
 Array = NDArray[np.float64]
 
+# Number of increments of a track whose covariances are added up at once.
+BLOCK = 4096
+
 
 @dataclass(frozen=True, eq=False)
 class Track:
@@ -57,14 +60,21 @@ class Track:
 
         The covariance of each increment is first expressed as an error at the origin of the frame.
         """
-        cos, sin = np.cos(self.poses[:-1, 2]), np.sin(self.poses[:-1, 2])
-        arms = np.zeros((len(self.poses), 3, 3))
-        arms[1:, 0] = np.stack([cos, -sin, self.poses[1:, 1]], axis=1)
-        arms[1:, 1] = np.stack([sin, cos, -self.poses[1:, 0]], axis=1)
-        arms[:, 2, 2] = 1.0
-        steps = arms @ self.covariances @ arms.transpose(0, 2, 1)
-        steps[0] = 0.0
-        return np.asarray(np.cumsum(steps, axis=0))
+        total = np.zeros_like(self.covariances)
+        # Blocks of increments need less memory than all at once.
+        for begin in range(1, len(total), BLOCK):
+            block = slice(begin, begin + BLOCK)
+            x, y, _ = self.poses[block].T
+            heading = self.poses[begin - 1 :][: len(x), 2]
+            cos, sin = np.cos(heading), np.sin(heading)
+            arms = np.zeros((len(x), 3, 3))
+            arms[:, 0] = np.stack([cos, -sin, y], axis=1)
+            arms[:, 1] = np.stack([sin, cos, -x], axis=1)
+            arms[:, 2, 2] = 1.0
+            steps = arms @ self.covariances[block] @ arms.transpose(0, 2, 1)
+            steps[0] += total[begin - 1]
+            np.cumsum(steps, axis=0, out=total[block])
+        return total
 
     @cached_property
     def spans(self) -> tuple[tuple[int, int], ...]:

@@ -73,8 +73,8 @@ def _length(log: RobotLog) -> tuple[float, list[str]]:
     usual = jumps.usual_step(log)
     if usual <= SPARSE:
         return 1.0, []
-    far = np.array([scan.odometry[:2] for scan in log.scans])
-    begin = int(np.argmax(np.hypot(*np.diff(far, axis=0).T) > usual / 2))
+    far = np.hypot(*np.diff(log.odometry[:, :2], axis=0).T)
+    begin = int(np.argmax(far > usual / 2))
     stretch = replace(log, scans=log.scans[begin : begin + STRETCH])
     if len(stretch) < LEAST_SCANS:
         return 1.0, []
@@ -82,8 +82,8 @@ def _length(log: RobotLog) -> tuple[float, list[str]]:
     # Relative difference between odometry in this unit and scan matching.
     def off(unit: str) -> float:
         tried = Units(UNITS[unit]).convert(stretch)
-        measured, seen = np.array([scan.odometry[:2] for scan in tried.scans]), follow(tried)
-        ways = [np.hypot(*np.diff(way, axis=0).T) for way in (measured, seen.poses[:, :2])]
+        seen = follow(tried)
+        ways = [np.hypot(*np.diff(way[:, :2], axis=0).T) for way in (tried.odometry, seen.poses)]
         if seen.breaks or share_failing(seen) > HOPELESS:
             return math.inf
         return float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9))
@@ -107,7 +107,7 @@ def ahead(log: RobotLog) -> float:
 
     It is 1 for a robot that stands. Jumps of the odometer do not count.
     """
-    poses = np.array([scan.odometry for scan in log.scans])
+    poses = log.odometry
     steps = np.diff(poses[:, :2], axis=0)
     length = np.hypot(*steps.T)
     length[length > max(jumps.FAR, jumps.UNUSUAL * jumps.usual_step(log))] = 0.0
@@ -120,5 +120,4 @@ def ahead(log: RobotLog) -> float:
 
 def way_of(log: RobotLog) -> float:
     """Compute the length of the drive by odometry, in metres."""
-    places = np.array([scan.odometry[:2] for scan in log.scans])
-    return float(np.hypot(*np.diff(places, axis=0).T).sum())
+    return float(np.hypot(*np.diff(log.odometry[:, :2], axis=0).T).sum())

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.readers.scans import Scan, shared
-from perception.readers.stored import RangeStore, in_memory, in_turn
+from perception.readers.stored import ScanTable, in_memory, in_turn
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Pose, displacement_between
 
@@ -146,15 +146,15 @@ class Meaning:
 
 def interpret_log(
     scans: Sequence[Scan], options: LaserOptions
-) -> tuple[tuple[Scan, ...], tuple[str, ...]]:
+) -> tuple[ScanTable, tuple[str, ...]]:
     """Interpret the ranges of a whole log, as the driver wrote them, and note what was found.
 
     `options` override the survey. In the result, ranges are infinite if nothing came back and
-    NaN if nothing is known. They are kept in temporary files (`RangeStore`). Raises LogError if
-    the user gives one mount, but the scans come from several lasers.
+    NaN if nothing is known. Raises LogError if the user gives one mount, but the scans come from
+    several lasers.
     """
     interpret, notes = interpreter_of(scans, options)
-    return tuple(map(RangeStore().kept, map(interpret, in_turn(scans)))), notes
+    return ScanTable(map(interpret, in_turn(scans))), notes
 
 
 def interpreter_of(

@@ -15,7 +15,7 @@ from perception.readers import bag_files, bag_topics, bags, carmen
 from perception.readers.echoes import LaserOptions, interpret_log, interpret_scan, interpreter_of
 from perception.readers.lines import LONGEST_LINE, Piped, lines, opened, piped
 from perception.readers.scans import Damage, RobotLog, Scan, SurveyedLog
-from perception.readers.stored import RangeStore
+from perception.readers.stored import ScanTable
 from ssh_abduction.data.checks import a_list, a_path, a_text
 from ssh_abduction.data.errors import brief, named
 from ssh_abduction.data.odometry import Pose
@@ -76,12 +76,10 @@ def read_log(
     """
     options = LaserOptions(fov, mount, no_return, zero_is)
     with _reading(path, format, scan_topic, odom_topic) as reading:
-        scans: list[Scan] = []
-        damaged: list[Damage] = []
-        store = RangeStore()
+        scans, damaged = ScanTable(), list[Damage]()
         for item in reading.items:
             if isinstance(item, Scan):
-                scans.append(store.kept(item))
+                scans.append(item)
             else:
                 damaged.append(item)
     if not scans:

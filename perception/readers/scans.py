@@ -12,9 +12,10 @@ the robot, x is ahead and y to the left.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,7 +131,7 @@ class RobotLog:
             reconstructed.
     """
 
-    scans: tuple[Scan, ...]
+    scans: Sequence[Scan]
     damaged: tuple[Damage, ...] = ()
     format: str = ""
     source: str = ""
@@ -138,6 +139,12 @@ class RobotLog:
 
     def __len__(self) -> int:
         return len(self.scans)
+
+    @cached_property
+    def odometry(self) -> NDArray[np.float64]:
+        """The poses by the odometer: (n, 3), metres and radians."""
+        numbers = chain.from_iterable(scan.odometry for scan in self.scans)
+        return np.fromiter(numbers, np.float64).reshape(-1, 3)
 
     @property
     def warnings(self) -> tuple[str, ...]:
