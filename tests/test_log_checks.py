@@ -185,6 +185,32 @@ def test_odometry_of_scans_a_metre_apart_is_converted(
     assert "unreliable" not in notes
 
 
+@pytest.mark.parametrize(
+    ("step", "count", "digits", "warns"),
+    [
+        (0.01, 3.28, 2, True),
+        (0.001, 3.28084, 4, True),
+        (0.01, 1.0, 2, False),
+        (0.001, 3.28084, 2, False),  # rounding hides the steps
+        (1e-9, 3.28, 9, False),
+    ],
+)
+def test_steps_of_ranges_show_feet(
+    scans: Scans, step: float, count: float, digits: int, warns: bool
+) -> None:
+    some = [
+        replace(
+            scan,
+            ranges=np.round(count * step * np.round(scan.ranges / step), digits),
+            laser=replace(scan.laser, reach=count * scan.laser.reach),
+            odometry=(count * scan.odometry[0], count * scan.odometry[1], scan.odometry[2]),
+        )
+        for scan in scans
+    ]
+    notes = log_checks.describe_feet(RobotLog(tuple(some)))
+    assert ["in feet" in note for note in notes] == [True] * warns
+
+
 def test_scans_out_of_order_are_not_taken_for_two_sources(scans: Scans) -> None:
     notes = notes_of(some_elsewhere(scans[:120]))
     assert "not in the order of time, sort it" in notes

@@ -235,7 +235,7 @@ def _units_of(log: RobotLog, tell: Teller) -> Units:
             "in turn; let only one source publish odometry, or import the log from a file"
         )
     units, notes = units_of(log)
-    tell(notes)
+    tell([*notes, *log_checks.describe_feet(log)])
     return units
 
 

@@ -52,6 +52,14 @@ DARK = 5
 FAR_WALLS = 50.0
 # In more than half of the scans of good logs, more than this share of the beams meets a wall.
 MEETING = 0.02
+# Lasers measure in STEPS of metres. In feet, their ranges below CLOSE are multiples of a step times
+# FEET: at least to the degree IN_STEP, which is 1 for exact multiples and about 0 for other ranges.
+# DISTINCT ranges show that. In most scans the nearest wall is then more than APART away. In good
+# logs it is 0.7 to 1.3 m away (docs/measurements/robustness.md).
+STEPS, FEET = (0.01, 0.001), 3.28084
+CLOSE, IN_STEP, DISTINCT, APART = 8.0, 0.3, 100, 1.7
+# At most about this many scans are looked at.
+SAMPLED = 200
 
 
 def refuse_lengths(log: RobotLog) -> None:
@@ -77,11 +85,32 @@ def refuse_lengths(log: RobotLog) -> None:
         )
 
 
+def describe_feet(log: RobotLog) -> list[str]:
+    """Describe ranges that are in feet. Their steps and their lengths show it together."""
+    near, shortest = [np.zeros(0)], [0.0]
+    for scan in in_turn(log.scans[:: 1 + len(log) // SAMPLED]):
+        met = scan.ranges[(scan.ranges > 0) & (scan.ranges < min(scan.laser.reach, CLOSE))]
+        near.append(met)
+        shortest += [float(met.min())] if len(met) else []
+    ranges = np.unique(np.concatenate(near))
+    steps = [FEET * step for step in STEPS]
+    # The ranges are angles on a circle as long as the step. Multiples of the step are one angle.
+    fits = [float(abs(np.exp(2j * np.pi * ranges / step).mean())) for step in steps]
+    if len(ranges) < DISTINCT or np.median(shortest) < APART or max(fits) < IN_STEP:
+        return []
+    return [
+        "The lengths seem to be in feet: the ranges are multiples of "
+        f"{steps[int(np.argmax(fits))]:.4f}, which is a step of a laser in feet, and the nearest "
+        f"wall is {np.median(shortest):.1f} away in most scans. Divide ranges and positions by "
+        f"{FEET:.3f}."
+    ]
+
+
 def refuse_shuffled(log: RobotLog) -> None:
     """Raise a LogError if the scans of a log are in random order."""
     if len(log) < 4 * max(LAGS):
         return
-    places = np.array([scan.odometry[:2] for scan in log.scans])
+    places = log.odometry[:, :2]
     next_to, *apart = (
         float(np.percentile(np.hypot(*(places[lag:] - places[:-lag]).T), 25)) for lag in (1, *LAGS)
     )
@@ -107,7 +136,7 @@ def checked(log: RobotLog) -> tuple[RobotLog, list[str], list[str]]:
     log, alternating = jumps.keep_one_source(log)
     units, converted = units_of(log)
     log = units.convert(log)
-    return log, [*alternating, *converted], describe_drive(log)
+    return log, [*alternating, *converted, *describe_feet(log)], describe_drive(log)
 
 
 def describe_drive(log: RobotLog, begin: int = 0, unseen: bool | None = None) -> list[str]:
