@@ -21,7 +21,7 @@ from in_processes import sleep, until
 
 from perception.readers.writers import write_carmen
 from ssh_abduction import Trace, solve
-from ssh_abduction.cli import main
+from ssh_abduction.cli import guard, main
 from ssh_abduction.cli.import_log import until_ctrl_c
 from ssh_abduction.cli.jobs import FileAnswer
 from ssh_abduction.cli.mapping import MapQuestion
@@ -30,7 +30,7 @@ from ssh_abduction.robot_logs import log_maps
 from ssh_abduction.robot_logs.log_maps import LogMapping
 from ssh_abduction.runtime import program
 from ssh_abduction.solver import Search
-from ssh_abduction.solver.asp import control, workers
+from ssh_abduction.solver.asp import control, limits, workers
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 SOON = 60  # seconds, enough on a slow and busy machine
@@ -173,6 +173,26 @@ def test_second_ctrl_c_soon_after_the_first_waits_for_answers(
     monkeypatch.setattr(program, "AGAIN", -1.0)
     with pytest.raises(KeyboardInterrupt):
         stop.ask()
+
+
+@pytest.mark.parametrize(
+    ("last_words", "used", "waited", "is_deaf"),
+    [
+        (None, 0.4, 1.6, False),
+        (None, 1.6, 1.6, True),
+        (None, 0.4, 6.1, True),
+        (lambda _: ("", 0), 0.4, 1.6, True),
+    ],
+)
+def test_code_without_last_words_has_more_time_on_a_busy_machine(
+    last_words: Any, used: float, waited: float, is_deaf: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    guarding = guard.Guard(lambda: None, last_words, given_up=lambda: True)
+    clock = SimpleNamespace(process_time=lambda: 0.0, monotonic=lambda: 0.0)
+    monkeypatch.setattr(limits, "time", clock)
+    assert guarding._is_called()
+    clock.process_time, clock.monotonic = (lambda: used), (lambda: waited)
+    assert guarding._is_deaf() == is_deaf
 
 
 def test_ignored_signal_is_ignored_during_a_search() -> None:

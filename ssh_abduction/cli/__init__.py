@@ -190,7 +190,7 @@ def _main(arguments: Sequence[str] | None) -> int:
             try:
                 warn(options.notes)
                 check_inputs_are_kept(options)
-                guard = Guard(lambda: None, lambda _: ("", program.interrupted_code()), None, None)
+                guard = Guard(lambda: None)
                 with contextlib.redirect_stdout(output), guard:
                     code = int(options.run(options))
             finally:

@@ -47,7 +47,7 @@ from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
+from ssh_abduction.runtime.program import SIGNALLED
 from ssh_abduction.solver import Backbone, Search, Solution, Start, Stop, workers, written_map
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
@@ -277,7 +277,7 @@ def _whole_lines(
 
     But if nobody reads the output after Ctrl-C, the process ends.
     """
-    guard = Guard(stop.set, lambda _: ("", interrupted_code()), None, None, given_up=stop.is_set)
+    guard = Guard(stop.set, given_up=stop.is_set)
 
     def say(line: str) -> None:
         with pausing():

@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import NoReturn, Self
 
 from ssh_abduction.runtime import program
-from ssh_abduction.solver import POLL, Stop, end_all, resident_memory
+from ssh_abduction.solver import POLL, Stop, end_all, process_clock, resident_memory
 
 # A search is ended after the first number times its time limit, plus the second in seconds.
 LATE = 1.1, 0.8
@@ -28,6 +28,9 @@ LATE = 1.1, 0.8
 LARGE = 1.1, 100.0
 # A search must end within this many seconds after Ctrl-C.
 DEAF = 1.5
+# If only the search itself can print its answer, it may wait for a processor until WAITING times as
+# many seconds are over.
+WAITING = 4.0
 # Files must be written within this many seconds after Ctrl-C: a pipe may have no reader.
 SAVING = 10.0
 # Text is printed in pieces of this many characters.
@@ -42,7 +45,8 @@ class Guard:
     Args:
         interrupt: Asks the search to end soon.
         last_words: Takes the reason for the end. Returns what remains to be printed, the exit code,
-            and perhaps a function that saves the answer.
+            and perhaps a function that saves the answer. None prints nothing. The code then has
+            more time on a busy machine, as only itself can print its answer.
         limit: The time limit in seconds; None for no limit.
         memory: The memory limit in MiB; None for no limit.
         given_up: Returns whether the answer is not needed any more.
@@ -51,9 +55,10 @@ class Guard:
     def __init__(
         self,
         interrupt: Callable[[], None],
-        last_words: Callable[[Stop], tuple[str, int] | tuple[str, int, Callable[[], None]]],
-        limit: float | None,
-        memory: float | None,
+        last_words: Callable[[Stop], tuple[str, int] | tuple[str, int, Callable[[], None]]]
+        | None = None,
+        limit: float | None = None,
+        memory: float | None = None,
         *,
         given_up: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -64,7 +69,7 @@ class Guard:
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._over = threading.Event()
         self._began = time.monotonic()
-        self._deaf_at: float | None = None  # when the search should have ended after Ctrl-C
+        self._since_call: Callable[[], float] | None = None  # the seconds since Ctrl-C
 
     def __enter__(self) -> Self:
         # Python lets only the main thread listen to signals.
@@ -121,8 +126,8 @@ class Guard:
         # The handler in the main thread may not have run yet, and may never run.
         program.heard.extend(numbers)
         is_called = bool(numbers) or self._given_up()
-        if is_called and self._deaf_at is None:
-            self._deaf_at = time.monotonic() + DEAF
+        if is_called and self._since_call is None:
+            self._since_call = process_clock(1.0 if self._last_words else WAITING)
         return is_called
 
     def _why(self) -> Stop | None:
@@ -138,12 +143,14 @@ class Guard:
 
     def _is_deaf(self) -> bool:
         """Whether the search still runs although it was asked to end more than DEAF seconds ago."""
-        return self._deaf_at is not None and time.monotonic() > self._deaf_at
+        return self._since_call is not None and self._since_call() > DEAF
 
     def _end(self, why: Stop) -> None:
         """Print the last words, and end the process and its helper processes without clean-up."""
         if self._finished is not None:
             self._leave(self._finished)
+        if self._last_words is None:
+            self._leave(program.interrupted_code())
         self._interrupt()
         code = 1
         threading.Thread(target=self._leave_if_stuck, daemon=True).start()

@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
     def interrupt() -> None:
         watch.interrupted = True
 
-    guard = Guard(interrupt, lambda _: ("", interrupted_code()), None, None)
+    guard = Guard(interrupt)
     with said_of(named(options.maps), MapError), on_ctrl_c(interrupt), guard:
         experiment = next_experiment(maps, trace, theory=theory, complete=complete, watch=watch)
     if options.json:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp.limits import Stop as Stop
     from ssh_abduction.solver.asp.limits import Watch as Watch
     from ssh_abduction.solver.asp.limits import check_limit as check_limit
+    from ssh_abduction.solver.asp.limits import process_clock as process_clock
     from ssh_abduction.solver.asp.limits import resident_memory as resident_memory
     from ssh_abduction.solver.asp.rule_checks import check_rules as check_rules
     from ssh_abduction.solver.asp.workers import end_all as end_all

@@ -41,6 +41,16 @@ def processor_clock() -> Callable[[], float]:
     return clock
 
 
+def process_clock(waiting: float) -> Callable[[], float]:
+    """Make a clock of this process's processor time, at least 1 / `waiting` of the wall time."""
+    used, began = time.process_time(), time.monotonic()
+
+    def clock() -> float:
+        return max(time.process_time() - used, (time.monotonic() - began) / waiting)
+
+    return clock
+
+
 def check_limit(name: str, unit: str, limit: object) -> None:
     """Raise SolverError if a limit is neither None nor a number above 0. Name it and its unit."""
     if (
