@@ -396,7 +396,7 @@ def test_wider_beams_follow_while_they_find_better_maps(
 
     def beam(width: int) -> SimpleNamespace:
         widths.append(width)
-        return SimpleNamespace(width=width, best=None, refuses=False)
+        return SimpleNamespace(width=width, hypotheses=[], refuses=False)
 
     def maps_of(beam: SimpleNamespace) -> list[int]:
         clock[0] += beam.width / 800

@@ -3,7 +3,7 @@
 >>> from ssh_abduction import Trace, solve
 >>> found = shared_sides(Listing.of(solve(Trace.load("examples/aces3-route.jsonl"))))
 >>> len(found.forced), len(found.possible), found.proven
-(16, 15, True)
+(5, 11, True)
 >>> print(found.forced[0])
 the place of step 0 lies right of the path of step 2
 
