@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import NoReturn, Self
 
 from ssh_abduction.runtime import program
-from ssh_abduction.solver import POLL, Stop, end_all, process_clock, resident_memory
+from ssh_abduction.solver import POLL, WAITING, Stop, end_all, processor_clock, resident_memory
 
 # A search is ended after the first number times its time limit, plus the second in seconds.
 LATE = 1.1, 0.8
@@ -28,9 +28,6 @@ LATE = 1.1, 0.8
 LARGE = 1.1, 100.0
 # A search must end within this many seconds after Ctrl-C.
 DEAF = 1.5
-# If only the search itself can print its answer, it may wait for a processor until WAITING times as
-# many seconds are over.
-WAITING = 4.0
 # Files must be written within this many seconds after Ctrl-C: a pipe may have no reader.
 SAVING = 10.0
 # Text is printed in pieces of this many characters.
@@ -127,7 +124,8 @@ class Guard:
         program.heard.extend(numbers)
         is_called = bool(numbers) or self._given_up()
         if is_called and self._since_call is None:
-            self._since_call = process_clock(1.0 if self._last_words else WAITING)
+            waiting = 1.0 if self._last_words else WAITING
+            self._since_call = processor_clock(time.process_time, waiting)
         return is_called
 
     def _why(self) -> Stop | None:

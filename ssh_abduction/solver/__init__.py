@@ -14,11 +14,12 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp import workers as workers
     from ssh_abduction.solver.asp.control import Control as Control
     from ssh_abduction.solver.asp.limits import POLL as POLL
+    from ssh_abduction.solver.asp.limits import WAITING as WAITING
     from ssh_abduction.solver.asp.limits import LimitError as LimitError
     from ssh_abduction.solver.asp.limits import Stop as Stop
     from ssh_abduction.solver.asp.limits import Watch as Watch
     from ssh_abduction.solver.asp.limits import check_limit as check_limit
-    from ssh_abduction.solver.asp.limits import process_clock as process_clock
+    from ssh_abduction.solver.asp.limits import processor_clock as processor_clock
     from ssh_abduction.solver.asp.limits import resident_memory as resident_memory
     from ssh_abduction.solver.asp.rule_checks import check_rules as check_rules
     from ssh_abduction.solver.asp.workers import end_all as end_all

@@ -31,22 +31,17 @@ def now() -> float:
     return time.perf_counter()
 
 
-def processor_clock() -> Callable[[], float]:
-    """Make a clock of this thread's processor time, at least 1 / WAITING of the wall-clock time."""
-    used, began = time.thread_time(), now()
+def processor_clock(
+    processor: Callable[[], float] = time.thread_time, waiting: float = WAITING
+) -> Callable[[], float]:
+    """Make a clock of processor time, at least 1 / `waiting` of the wall-clock time.
+
+    `processor` returns the processor time, in seconds: of this thread, or of the whole process.
+    """
+    used, began = processor(), now()
 
     def clock() -> float:
-        return max(time.thread_time() - used, (now() - began) / WAITING)
-
-    return clock
-
-
-def process_clock(waiting: float) -> Callable[[], float]:
-    """Make a clock of this process's processor time, at least 1 / `waiting` of the wall time."""
-    used, began = time.process_time(), time.monotonic()
-
-    def clock() -> float:
-        return max(time.process_time() - used, (time.monotonic() - began) / waiting)
+        return max(processor() - used, (now() - began) / waiting)
 
     return clock
 
