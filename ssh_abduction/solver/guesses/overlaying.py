@@ -404,15 +404,20 @@ class Overlay:
         """
         if self._may_change:
             return True
-        (s, *_), (x, *_), c = self._dstates_at(p), self._dstates_at(q), self._state.covariance
-        turns = list(self._sights.turns(self._steps[s], self._steps[x]))
-        i, j = self._both.heading[s], self._both.heading[x]
-        spread = c[i, i] + c[j, j] - 2 * c[i, j] + self._spreads[2]
-        off = [
-            math.remainder(self._state.mean[i] + turn - self._state.mean[j], math.tau)
-            for turn in turns
-        ]
-        return not turns or any(abs(by) < TURNED or by * by < FAR * spread for by in off)
+        (s, *_), (x, *_) = self._dstates_at(p), self._dstates_at(q)
+        turns = self._sights.turns(self._steps[s], self._steps[x])
+        twists = [self._twist(s, x, turn) for turn in turns]
+        return not twists or any(abs(off) < TURNED or square < FAR for off, square in twists)
+
+    def _twist(self, s: int, x: int, turn: float = 0.0) -> tuple[float, float]:
+        """Compute how far the heading of s, after a turn, is off that of x, and its chi-square.
+
+        The turn and the result are in radians.
+        """
+        state, i, j = self._state, self._both.heading[s], self._both.heading[x]
+        c = state.covariance
+        off = math.remainder(state.mean[i] + turn - state.mean[j], math.tau)
+        return off, off * off / float(c[i, i] + c[j, j] - 2 * c[i, j] + self._spreads[2])
 
     def _condition(self, same: list[tuple[int, int]], saved: float) -> None:
         """Condition the poses on the equality of pairs of entries. Update the cost in nats."""
@@ -446,14 +451,11 @@ class Overlay:
         """
         found = []
         for s, x in combinations(self._dstates_at(place), 2):
-            i, j = self._both.heading[s], self._both.heading[x]
-            c = self._state.covariance
-            off = math.remainder(self._state.mean[i] - self._state.mean[j], math.tau)
-            square = off * off / (c[i, i] + c[j, j] - 2 * c[i, j] + self._spreads[2])
+            off, square = self._twist(s, x)
             may_be_one = not {s, x} <= self._state.kept and self._look_alike(s, x)
             is_one_way = abs(off) < TURNED and square < 2 * self._prices[0]
             if is_one_way and may_be_one:
-                found.append((float(square), (s, x)))
+                found.append((square, (s, x)))
         return found
 
 
