@@ -108,10 +108,11 @@ def _contradictions(
     unit = 90 if solution.theory.star == "frame" else 1
     doubted = [(p, d) for p in said.gateways for d in drives]
     if solution.theory.star != "none":
-        doubted = [(p, d) for p, d in doubted if _may_keep_out(p, d, trace, ssh_map)]
+        seen = _as_seen(trace)
+        doubted = [(p, d) for p, d in doubted if _may_keep_out(p, d, seen, ssh_map)]
         if not doubted:
             return
-        found = find(*obeyed(replace(said, gateways=()), _as_seen(trace), solution.theory))
+        found = find(*obeyed(replace(said, gateways=()), seen, solution.theory))
     for passage, drive in doubted:
         apart = drive in _apart(passage, drives, ssh_map)
         sentence = f"{named(said.source or 'corrections')}: {passage}: "
@@ -172,13 +173,14 @@ def _as_seen(trace: Trace) -> Trace:
     return replace(trace, steps=tuple(steps))
 
 
-def _may_keep_out(passage: Passage, drive: Drive, trace: Trace, ssh_map: SSHMap) -> bool:
+def _may_keep_out(passage: Passage, drive: Drive, seen: Trace, ssh_map: SSHMap) -> bool:
     """Whether a corrected gateway may keep a drive out of its place.
 
     The drive shares no place with the drives of the correction; or it was not at the place, but saw
-    nearby as many gateways as the robot saw there before the correction.
+    nearby as many gateways as the robot saw there before the correction. `seen` is the trace as it
+    was before.
     """
-    drives = drives_of(trace)
+    drives = drives_of(seen)
     if drive in _apart(passage, drives, ssh_map):
         return True
     there = [step_of(drives, step) for step, _ in passage.seen]
@@ -187,14 +189,16 @@ def _may_keep_out(passage: Passage, drive: Drive, trace: Trace, ssh_map: SSHMap)
     if any(ssh_map.place_of(t) in places for t in steps):
         return False
     poses = ssh_map.fit.poses if ssh_map.fit else ()
-    near = median(travels_of(trace) or [0.0]) / 2
-    seen = [step.gateways and len(step.gateways.gateways) for step in _as_seen(trace).steps]
+    near = median(travels_of(seen) or [0.0]) / 2
+    counts = [step.gateways and len(step.gateways.gateways) for step in seen.steps]
 
     def is_near(t: int, u: int) -> bool:
         here, other = (poses[ssh_map.dstate_at[step]] for step in (t, u))
         return math.hypot(here.x - other.x, here.y - other.y) < near
 
-    return any(seen[t] == seen[u] and (not poses or is_near(t, u)) for t in steps for u in there)
+    return any(
+        counts[t] == counts[u] and (not poses or is_near(t, u)) for t in steps for u in there
+    )
 
 
 def _seen_otherwise(
