@@ -94,6 +94,11 @@ class DriveStep(int):
         return format(str(self), form)
 
 
+def drive_of_steps(drives: Sequence[Drive]) -> list[int]:
+    """Return, for each step of a joint trace, the index of its drive."""
+    return [i for i, drive in enumerate(drives) for _ in range(drive.first, drive.stop)]
+
+
 def named_steps(drives: Sequence[Drive], steps: int) -> Sequence[int]:
     """Return the numbers of all steps, or names such as "tuesday:14" for several drives."""
     if len(drives) < 2:

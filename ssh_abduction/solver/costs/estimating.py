@@ -14,7 +14,7 @@ from dataclasses import replace
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, TypeAlias
 
-from ssh_abduction.data.drives import Drive, drives_of, step_name
+from ssh_abduction.data.drives import Drive, drive_of_steps, drives_of, step_name
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.observation import View
 from ssh_abduction.data.trace import Trace
@@ -78,7 +78,7 @@ def may_join_more(problem: Problem, rivals: Sequence[Rival]) -> bool:
     """
     at, drives = rivals[0].places or rivals[0].dstates, drives_of(problem.trace)
     groups = min(groups_of_drives(rival.places or rival.dstates, drives) for rival in rivals)
-    of_drive = [i for i, drive in enumerate(drives) for _ in range(drive.first, drive.stop)]
+    of_drive = drive_of_steps(drives)
     of_group = groups_of_each(at, of_drive, range(len(drives)))
     group = [of_group[i] for i in of_drive]
     if len({*group}) == 1 or groups < len({*group}):

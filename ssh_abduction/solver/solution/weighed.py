@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from ssh_abduction.data.drives import Drive, named_steps
+from ssh_abduction.data.drives import Drive, drive_of_steps, named_steps
 from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.map_parts import FAULTS
 from ssh_abduction.theory.overlap import groups_of
@@ -307,7 +307,7 @@ def probability_in_words(probability: float) -> str:
 
 def groups_of_drives(at: Sequence[int], drives: Sequence[Drive]) -> int:
     """Count the groups of drives that share no dstate or place; `at` has that of each step."""
-    drive = [i for i, d in enumerate(drives) for _ in range(d.first, d.stop)]
+    drive = drive_of_steps(drives)
     return groups_of(at, drive, range(len(drives)))
 
 
