@@ -188,10 +188,11 @@ def test_code_without_last_words_has_more_time_on_a_busy_machine(
     last_words: Any, used: float, waited: float, is_deaf: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     guarding = guard.Guard(lambda: None, last_words, given_up=lambda: True)
-    clock = SimpleNamespace(process_time=lambda: 0.0, monotonic=lambda: 0.0)
-    monkeypatch.setattr(limits, "time", clock)
+    passed = SimpleNamespace(used=0.0, waited=0.0)
+    monkeypatch.setattr(time, "process_time", lambda: passed.used)
+    monkeypatch.setattr(limits, "now", lambda: passed.waited)
     assert guarding._is_called()
-    clock.process_time, clock.monotonic = (lambda: used), (lambda: waited)
+    passed.used, passed.waited = used, waited
     assert guarding._is_deaf() == is_deaf
 
 
