@@ -23,6 +23,7 @@ from ssh_abduction.solver.costs.estimating import doubt_of, may_join_more, rival
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.weighing import Weighing
 from ssh_abduction.solver.guesses.joint_maps import Joining
+from ssh_abduction.solver.guesses.separations import Separations
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.weighed import groups_of_drives
@@ -187,6 +188,26 @@ def test_near_rooms_whose_doors_face_other_ways_stay_two() -> None:
     *_, best = joined(settle(together(drives), Theory(boundary="none")))
     assert len(best.pieces) == 1
     assert len(best.places) == 6
+
+
+def test_near_places_between_which_the_robot_travels_stay_two_in_a_joint_map() -> None:
+    views, travel = "abcddefg", Action("travel", "travel")
+    spread = ((0.2, 0, 0), (0, 0.2, 0), (0, 0, 0.01))
+    moved = [Step(v, travel, displacement=(5.0, 0, 0), covariance=spread) for v in views]
+    moved[4] = replace(moved[4], displacement=(0.5, 0, 0))
+    moved[0] = Step(views[0], travel)
+    moved[-1] = replace(moved[-1], action=None)
+    shorter = [Step(views[1], travel), *moved[2:]]
+    trace = together([Trace(tuple(moved)), Trace(tuple(shorter))])
+    *_, best = joined(settle(trace, Theory(boundary="none")))
+    assert best.labels == (0, 1, 2, 3, 4, 5, 6, 7, 1, 2, 3, 4, 5, 6, 7)
+
+
+def test_separations_hold_for_all_that_is_merged() -> None:
+    apart = Separations({0: 0, 1: 1, 2: 2, 4: 3}, [(0, 2), (0, 3)])  # step 3 has no number
+    assert apart.separate([0, 1, 1, 3], 0, 1)
+    assert apart.separate([0, 1, 1, 3], 1, 0)
+    assert not apart.separate([0, 1, 1, 3], 0, 3)
 
 
 def test_drives_without_common_views_are_not_joined() -> None:

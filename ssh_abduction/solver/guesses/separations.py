@@ -1,0 +1,47 @@
+"""Which dstates, and which places, the steps of a trace keep apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from ssh_abduction.theory.pairs import pairs_in
+from ssh_abduction.theory.settle import Problem
+
+
+class Separations:
+    """Pairs of numbers (of dstates or places) of which two steps say that they are not one."""
+
+    def __init__(self, labels: Mapping[int, int], pairs: Iterable[tuple[int, int]]) -> None:
+        """Read pairs of steps that are apart. `labels` numbers steps; other steps are left out."""
+        size = max(labels.values()) + 1
+        self._apart = np.zeros((size, size), bool)
+        for t, u in pairs:
+            if t in labels and u in labels:
+                self._apart[labels[t], labels[u]] = self._apart[labels[u], labels[t]] = True
+
+    @staticmethod
+    def of_dstates(problem: Problem, labels: Mapping[int, int]) -> Separations:
+        """List the dstates that the evidence about pairs of steps keeps apart."""
+        return Separations(labels, pairs_in(problem.pairs.apart))
+
+    @staticmethod
+    def of_places(problem: Problem, labels: Mapping[int, int]) -> Separations:
+        """List the places that are apart by evidence, or as a travel leads from one to the other.
+
+        Travels are ignored if they may stay at a place, or if actions may have slipped.
+        """
+        theory, actions = problem.theory, enumerate(problem.trace.actions)
+        leaves = theory.level == "topological" and "travel_leaves" in theory.hard
+        travels = [(t, t + 1) for t, action in actions if action.kind == "travel"]
+        known = travels if leaves and not theory.slipped else []
+        return Separations(labels, [*pairs_in(problem.pairs.elsewhere), *known])
+
+    def separate(self, merged: Sequence[int], first: int, second: int) -> bool:
+        """Whether any number merged into `first` is apart from any that is merged into `second`.
+
+        `merged` has, for each number, the number that it is merged into.
+        """
+        into = np.asarray(merged)
+        return self._apart[np.ix_(into == first, into == second)].any().item()
