@@ -38,6 +38,7 @@ from perception.places.closures import (
 from perception.places.distinctive import WIDTH, WINDOW, find_visits
 from perception.places.following import follow, share_failing, turned_wrongly
 from perception.places.live import LiveLog
+from perception.places.loops import agreeing
 from perception.places.partings import with_partings
 from perception.places.tracing import DRIFT, to_trace
 from perception.places.track import Track
@@ -205,6 +206,7 @@ def _imported(
         )
     with _timed(seconds, "trace"):
         closings = find_closures(track, visits, patches_of(visits), 2 * WINDOW)
+        closings = agreeing(track, visits, closings)
         track = calibrated(track, visits, closings)
         visits, closings = with_partings(track, visits, closings)
         trace = to_trace(log, track, visits, closings, name)

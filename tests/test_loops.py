@@ -1,0 +1,81 @@
+"""Closures that contradict other closures are dropped."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from perception.places.closures import VisitMatch
+from perception.places.loops import agreeing
+from perception.places.matching import Match
+from perception.places.track import Array, Track, points_turned
+from perception.places.visits import Visit
+
+# The robot drives 12 m and comes back on the other side of a long loop.
+OUT = np.column_stack([np.arange(0.0, 12.1, 0.5), np.zeros(25), np.zeros(25)])
+BACK = OUT[::-1] + np.array([0.0, 0.0, math.pi])
+LOOP = np.column_stack([np.full(100, 12.0), np.linspace(0, 100, 100), np.zeros(100)])
+VISITS = range(0, 25, 4)  # scans of the first pass; each place is passed again later
+
+
+def drive(variance: float, bent: float = 0.0) -> tuple[Track, list[Visit]]:
+    """A drive over places and back over the same places. The track is bent before the way back."""
+    back = BACK.copy()
+    back[:, :2] = points_turned(bent, back[:, :2] - 6.0) + 6.0
+    back[:, 2] += bent
+    poses = np.concatenate([OUT, LOOP, LOOP[::-1], back])
+    covariances = np.full((len(poses), 1, 1), variance) * np.diag([1.0, 1.0, 0.01])
+    track = Track(poses, covariances)
+    last = len(poses) - 1
+    scans = [*VISITS, *(last - scan for scan in reversed(VISITS))]
+    return track, [Visit(scan, poses[scan, :2], scan, scan) for scan in scans]
+
+
+def closures(visits: Sequence[Visit], bent: float, wrong: dict[int, Array]) -> list[VisitMatch]:
+    """True closures between the two visits of each place; some are shifted."""
+    n = len(visits)
+    found = []
+    for k in reversed(range(n // 2)):
+        shift = wrong.get(k, np.zeros(2))
+        match = Match(0.9 - 0.01 * k, -bent, shift, 0.9, 0.1)
+        found.append(VisitMatch(k, n - 1 - k, match))
+    return found
+
+
+@pytest.mark.parametrize("bent", [0.0, 0.4, -2.0])
+@pytest.mark.parametrize("shift", [(2.0, 0.0), (0.0, -3.0)])
+def test_closure_that_contradicts_most_others_is_dropped(
+    bent: float, shift: tuple[float, float]
+) -> None:
+    track, visits = drive(1e-5, bent)
+    found = closures(visits, bent, {2: np.array(shift)})
+    assert [closure.first for closure in agreeing(track, visits, found)] == [6, 5, 4, 3, 1, 0]
+    assert agreeing(track, visits, closures(visits, bent, {})) != []
+
+
+def test_closures_without_contradictions_are_kept() -> None:
+    track, visits = drive(1e-5, 0.4)
+    found = closures(visits, 0.4, {})
+    assert agreeing(track, visits, found) == found
+    unsure, _ = drive(1.0, 0.4)
+    wrong = closures(visits, 0.4, {2: np.array([2.0, 0.0])})
+    assert agreeing(unsure, visits, wrong) == wrong
+
+
+def test_of_two_closures_the_one_with_the_lower_score_is_dropped() -> None:
+    track, visits = drive(1e-5)
+    *_, two, one, _ = closures(visits, 0.0, {1: np.array([3.0, 0.0])})
+    assert agreeing(track, visits, [two, one]) == [one]
+    better = replace(two, match=replace(two.match, score=0.95))
+    assert agreeing(track, visits, [better, one]) == [better]
+
+
+def test_closures_across_a_cut_are_not_compared() -> None:
+    track, visits = drive(1e-5)
+    two, one = closures(visits, 0.0, {1: np.array([3.0, 0.0])})[-3:-1]
+    cut = replace(track, cuts=(visits[one.last].scan,))
+    assert agreeing(cut, visits, [two, one]) == [two, one]
