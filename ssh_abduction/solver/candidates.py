@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import math
 import threading
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
+from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import choosing
@@ -22,11 +25,13 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch, processor_clock
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
 from ssh_abduction.solver.guesses.mended import first_contradiction, mended_sketch
+from ssh_abduction.solver.guesses.separate import has_no_frames, separate_map
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
 from ssh_abduction.theory.speedups import Speedups, row
+from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from ssh_abduction.solver.guesses.beam import Beam
@@ -52,8 +57,8 @@ class Candidates:
     """Makes maps of the whole trace, and keeps the best one that the checker accepts.
 
     Attributes:
-        contradicting: The steps that contradicted sketches (maps made without a search). The step
-            of the most reliable sketch comes first.
+        contradicting: The steps that contradicted maps made without a search. The step of the most
+            reliable map comes first.
     """
 
     def __init__(
@@ -211,7 +216,11 @@ class Candidates:
         sketches = sketches_of(trace.steps[0], theory)
         if known is not None:
             sketches.insert(0, sketch_beyond(known, trace.prefix(len(known.dstate_at)), theory))
-        kinds = [partial(self._go_on_to_end, sketch) for sketch in sketches]
+        kinds: list[Callable[[], None]] = [
+            partial(self._go_on_to_end, sketch) for sketch in sketches
+        ]
+        if has_no_frames(theory):
+            kinds.append(self._offer_separate)
         if theory.misread or theory.slipped or theory.jumped:
             kinds.append(partial(self._offer_mended))
         return [self.merge, *kinds]
@@ -219,9 +228,40 @@ class Candidates:
     def _go_on_to_end(self, sketch: Sketch) -> None:
         """Extend a map to the end of the trace and offer it, unless a step contradicts it."""
         if (wrong := first_contradiction(sketch, self._task.trace)) is None:
-            self.offer(sketch.map())
+            self._offer_or_blame(sketch.map())
         else:
             self.contradicting[wrong] = None
+
+    def _offer_separate(self) -> None:
+        """Offer a map in which steps share a dstate only if the axioms force them to."""
+        trace, theory = self._trace, self._task.theory
+        if (ssh_map := separate_map(trace, theory)) is not None:
+            self._offer_or_blame(ssh_map)
+            return
+        # The first steps of a trace contradict no more than all steps.
+        wrong = bisect_left(range(len(trace)), True, lo=1, key=self._has_no_separate_map) - 1
+        self.contradicting[wrong] = None
+
+    def _has_no_separate_map(self, size: int) -> bool:
+        """Whether the axioms force steps that look different to share a dstate, up to a size."""
+        theory = self._task.theory.of_steps(0, size)
+        return separate_map(self._trace.prefix(size), theory) is None
+
+    def _offer_or_blame(self, ssh_map: SSHMap) -> None:
+        """Offer a map. If no map is known then, note the steps at which this one breaks axioms."""
+        self.offer(ssh_map)
+        if self._known.best is None:
+            whole = self._with_unknown_views(ssh_map)
+            broken = next(violations(self._trace, whole, self._task.theory), None)
+            if broken is not None and broken.steps:
+                last = max(broken.steps)
+                # The next travel may put these steps on a path.
+                later = (
+                    t
+                    for t in range(last, len(self._trace) - 1)
+                    if self._trace.actions[t].kind == "travel"
+                )
+                self.contradicting |= dict.fromkeys((next(later, last - 1) + 1, last))
 
     def _offer_mended(self) -> None:
         """Offer a map made without a search. Treat steps that contradict it as wrong."""
@@ -264,6 +304,14 @@ class Candidates:
         views = answer_maps.views_of(dict(enumerate(ssh_map.dstate_at)), self._trace)
         dstates = tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
         return replace(ssh_map, dstates=dstates)
+
+
+def has_quick_map(trace: Trace, theory: Theory) -> bool:
+    """Whether the checker accepts one of the surest maps that are made without a search."""
+    maps = [separate_map(trace, theory)] if has_no_frames(theory) else []
+    sketches = [] if theory.unknown_views else sketches_of(trace.steps[0], theory)[-2:]
+    maps += [sketch.map() for sketch in sketches if first_contradiction(sketch, trace) is None]
+    return any(m is not None and next(violations(trace, m, theory), None) is None for m in maps)
 
 
 def _with_all_views(task: Task) -> Task:

@@ -6,12 +6,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import zip_longest
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import each_looking, heeding
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.candidates import has_quick_map
 from ssh_abduction.solver.map_list import Priced, note
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status
@@ -24,7 +26,9 @@ OVERTIME, OVERTIME_SHARE = 0.5, 0.05
 INTERRUPTED = 0.6
 # If a stopped search has no map, it looks for a clash in stretches of this many steps, for at most
 # CLASHING seconds. A short stretch takes a few hundredths of a second.
-STRETCHES, CLASHING = (2, 3, 4, 6, 8, 12), 0.3
+STRETCHES, CLASHING = (2, 3, 4, 6, 8, 12), 0.5
+# After these, it looks in stretches of whole visits to places, of up to VISITS visits.
+VISITS = 12
 
 
 def fall_back(parts: Parts, answer: Answer) -> None:
@@ -58,15 +62,38 @@ def clash_in(
     """
     if theory.has_faults or theory.rules:
         return None
-    bare = theory.replace(weigh="count", displacement="none")
+    counting = theory.replace(weigh="count")
+    bare = counting.replace(displacement="none")
     for found in each_looking(stretches):
         *steps, last = trace.steps[found.start : found.stop]
-        if not any(step.action and step.action.starts for step in steps):
-            piece = Trace((*steps, replace(last, action=None)), odometry=trace.odometry)
-            maps, proven = maps_of(piece, bare.of_steps(found.start, len(found)))
-            if proven and not maps:
-                return found
+        if any(step.action and step.action.starts for step in steps):
+            continue
+        piece = Trace((*steps, replace(last, action=None)), odometry=trace.odometry)
+        # The axiom one_pose compares the first steps of visits, so it needs whole visits.
+        axioms = counting if _begins_visit(trace, found.start) else bare
+        part = axioms.of_steps(found.start, len(found))
+        if has_quick_map(piece, part):
+            continue
+        maps, proven = maps_of(piece, part)
+        if proven and not maps:
+            return found
     return None
+
+
+def _begins_visit(trace: Trace, step: int) -> bool:
+    """Whether a visit to a place begins at a step."""
+    return step == 0 or trace.actions[step - 1].kind == "travel"
+
+
+def _stretches(trace: Trace, ends: Sequence[int]) -> Iterator[range]:
+    """List stretches of steps that may clash, the shortest first. Each ends at one of `ends`."""
+    for length in STRETCHES:
+        yield from (range(max(t + 1 - length, 0), t + 1) for t in ends if length < len(trace))
+    begins = [
+        [i for i in range(t, -1, -1) if _begins_visit(trace, i)][1 : VISITS + 1] for t in ends
+    ]
+    for starts in zip_longest(*begins):
+        yield from (range(i, t + 1) for i, t in zip(starts, ends, strict=True) if i is not None)
 
 
 def late_clash(
@@ -83,12 +110,7 @@ def late_clash(
         return None
     said = (*task.theory.same, *task.theory.same_place)
     ends = dict.fromkeys((*parts.candidates.contradicting, *(max(pair) for pair in said)))
-    stretches = (
-        range(max(t + 1 - length, 0), t + 1)
-        for length in STRETCHES
-        for t in ends
-        if length < len(task.trace)
-    )
+    stretches = _stretches(task.trace, list(ends))
     part = Watch().part(CLASHING, time.thread_time)
     with suppress(LimitError, KeyboardInterrupt), heeding(part.check):
         clash = clash_in(task.trace, task.theory, stretches, maps_of)
