@@ -496,7 +496,9 @@ def test_sentence_names_the_most_probable_missed_join() -> None:
     assert doubtful.sentence.endswith("; the most doubtful join is of steps 0 and 2 (0.69)")
     assert replace(weighed, rivals=(best,)).missed is None
     turned = replace(weighed, rivals=(best, Rival(11.0, (0, 1, 2, 3), (0, 1, 0, 2))))
-    assert turned.sentence.endswith("; steps 0 and 2 may be one dstate or two (0.73)")
+    assert turned.sentence.endswith(
+        "; steps 0 and 2 are one dstate with probability 0.73, else two dstates of one place"
+    )
     assert replace(weighed, doubt="the track is unreliable").missed is None
 
 

@@ -163,7 +163,7 @@ class StopFlag:
 
     def ask(self) -> None:
         """Set the flag at Ctrl-C. A second Ctrl-C, some time later, raises KeyboardInterrupt."""
-        if time.monotonic() > self.since + program.AGAIN:
+        if program.is_again(self.since):
             raise KeyboardInterrupt
         self.set()
 

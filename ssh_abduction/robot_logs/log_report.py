@@ -134,7 +134,10 @@ def _doubts(solution: Solution) -> str:
     """Make the table of the joins of the first map that are not sure."""
     doubts = doubtful_joins(solution)
     if not doubts:
-        return _paragraph(f"None: the first map has no join with a probability below {SURE:g}.")
+        return _paragraph(
+            "None: each two visits that the first map puts at one place are there with a "
+            f"probability of at least {SURE:g}. Which way they faced may be less sure."
+        )
     places = place_of_steps(solution.maps[0])
     rows = [(first, second, places[second], f"{share:.2f}") for first, second, share in doubts]
     return _table(("step", "and step", "place", "probability"), rows)

@@ -54,11 +54,15 @@ def is_loading(frame: "FrameType | None") -> bool:
 def hear(number: int) -> bool:
     """Note a signal. Return False if it soon follows another one, and so asks for nothing new."""
     heard.append(number)
-    now = time.monotonic()
-    is_new = not _heard_at or now > _heard_at[0] + AGAIN
+    is_new = not _heard_at or is_again(_heard_at[0])
     if is_new:
-        _heard_at[:] = [now]
+        _heard_at[:] = [time.monotonic()]
     return is_new
+
+
+def is_again(since: float) -> bool:
+    """Whether a signal that comes now asks for something new, after one at this monotonic time."""
+    return time.monotonic() > since + AGAIN
 
 
 def forget() -> None:

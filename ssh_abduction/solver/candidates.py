@@ -154,9 +154,11 @@ class Candidates:
         most new dstates is large, but the checker accepts it most often and fastest. So it is tried
         first. Then come the others, the smallest first. With a time limit, stop at the first of
         these that is better than the first sketch. `seconds` are for all sketches, and each may use
-        a share of the time left.
+        a share of the time left. If another thread makes sketches, wait for it for as long.
         """
-        with self._sketching:
+        if not self._sketching.acquire(timeout=min(seconds, threading.TIMEOUT_MAX)):
+            return
+        try:
             if (
                 self._known.best is not None
                 or not self._task.speedups.greedy
@@ -180,6 +182,8 @@ class Candidates:
                     attempt()
                 if seconds < math.inf and attempt is not surest and self._known.best is not before:
                     return
+        finally:
+            self._sketching.release()
 
     def sketch_least(self) -> bool:
         """Offer a map without a search that has only as many dstates as pairwise distinct steps.

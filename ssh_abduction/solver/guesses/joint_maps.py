@@ -91,6 +91,9 @@ class Joining:
         self._problem, self._log = problem, log
         self._bare = problem.theory.replace(displacement="none", weigh="count")
         self.sights = Sights(problem.trace, self._bare, log, misreads=False)
+        # The ways to lay one map on another, and those that fit with their costs in nats.
+        self._ways: _Anchors = {}
+        self._laid: dict[_Pair, list[tuple[float, _Anchor]]] = {}
 
     def maps(self, standing: Sequence[Part] = ()) -> Iterator[SSHMap]:
         """Yield a map in which no drives are joined, and last the cheapest map found.
@@ -119,9 +122,10 @@ class Joining:
         if len(best) < len(alone):
             yield from self._beside(alone)
         dearer = []
-        for pair in combinations(best, 2):
-            ways = [] if pair[1] in standing else self._anchors(*pair)
-            if (both := self._joined(*pair, ways, math.inf)) is not None:
+        for two in combinations(best, 2):
+            pair = two[::-1] if two[::-1] in self._laid else two
+            both = None if pair[1] in standing else self._joined(*pair, math.inf)
+            if both is not None:
                 dearer.append([*(part for part in best if part not in pair), both])
         if dearer:
             yield from self._beside(min(dearer, key=self._nats_of))
@@ -131,8 +135,8 @@ class Joining:
         """Join maps: first the pair `start`, then pairs with the best anchor (way to lay them)."""
         pair = start
         while anchors:
-            ways = anchors.pop(pair)
-            if (joined := self._joined(*pair, ways, sum(map(self._nats, pair)))) is not None:
+            del anchors[pair]
+            if (joined := self._joined(*pair, sum(map(self._nats, pair)))) is not None:
                 parts = [part for part in parts if part not in pair]
                 anchors = {two: ways for two, ways in anchors.items() if not {*two} & {*pair}}
                 anchors |= {(joined, part): self._anchors(joined, part) for part in parts}
@@ -151,8 +155,7 @@ class Joining:
         for part, second in permutations(parts, 2):
             most = self._nats_of([part, second])
             for other in others.get(part, ()):
-                ways = self._anchors(second, other)
-                if (both := self._joined(second, other, ways, most)) is not None:
+                if (both := self._joined(second, other, most)) is not None:
                     yield [*(kept for kept in parts if kept not in (part, second)), both]
 
     def _beside(self, parts: Sequence[Part]) -> Iterator[SSHMap]:
@@ -179,6 +182,8 @@ class Joining:
 
     def _anchors(self, first: Part, second: Part) -> list[_Anchor]:
         """List the anchors (ways to lay one map on the other) of two maps, the best first."""
+        if (first, second) in self._ways:
+            return self._ways[first, second]
         look_at_clock()
         changes = np.array(
             [[self.sights.merged(seen, other) for other in second.sights] for seen in first.sights]
@@ -188,7 +193,8 @@ class Joining:
             *self._by_dstates(first, second, changes, near),
             *self._by_places(first, second, changes == 0, near),
         ]
-        return sorted(found, reverse=True)
+        self._ways[first, second] = sorted(found, reverse=True)
+        return self._ways[first, second]
 
     def _by_dstates(
         self, first: Part, second: Part, changes: Array, near: float
@@ -240,22 +246,19 @@ class Joining:
         least = 1 if same.sum() == 1 else 2
         return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
 
-    def _joined(
-        self, first: Part, second: Part, ways: Sequence[_Anchor], most: float
-    ) -> Part | None:
+    def _joined(self, first: Part, second: Part, most: float) -> Part | None:
         """Join two maps in the cheapest way that breaks no axiom and costs less than `most` nats.
 
         None if there is no such way.
         """
-        found: list[Part] = []
         overlay = Overlay(first, second, self._problem, self.sights)
-        for way in ways:
-            look_at_clock()
-            begun = overlay.merge(way.old, way.new, way.turn if way.by_places else None)
-            if begun and self._nats(part := overlay.part()) < most:
-                found.append(part)
-        found.sort(key=self._nats)
-        return next((joined for joined in found if self._map(joined)), None)
+        if (first, second) not in self._laid:
+            ways = self._anchors(first, second)
+            laid = [(self._nats(part), way) for way in ways if (part := _laid(overlay, way))]
+            self._laid[first, second] = sorted(laid, key=lambda told: told[0])
+        cheap = (way for nats, way in self._laid[first, second] if nats < most)
+        joined = (_laid(overlay, way) for way in cheap)
+        return next((part for part in joined if part and self._map(part)), None)
 
     def _nats_of(self, parts: Sequence[Part]) -> float:
         """Compute the cost of parts as separate pieces, in nats."""
@@ -287,6 +290,13 @@ class Joining:
             kept[-1] = replace(kept[-1], action=None)
             trace = replace(trace, steps=tuple(kept), closures=())
         return trace, [part.labels[t] for t in steps]
+
+
+def _laid(overlay: Overlay, way: _Anchor) -> Part | None:
+    """Lay one map on another in one way, and merge what coincides; None if it does not fit."""
+    look_at_clock()
+    fits = overlay.merge(way.old, way.new, way.turn if way.by_places else None)
+    return overlay.part() if fits else None
 
 
 def _voted(

@@ -237,7 +237,11 @@ class Weighed:
         if self.unsure and doubted <= DOUBTED <= self.unsure[2] <= 1 - DOUBTED:
             first, second, probability = self.unsure
             sure = probability_in_words(probability)
-            return f"{text}; steps {first} and {second} may be one dstate or two ({sure})"
+            two = "two dstates of one place" if self.rivals[0].places else "two dstates"
+            return (
+                f"{text}; steps {first} and {second} are one dstate with probability {sure}, "
+                f"else {two}"
+            )
         if not self.joins:
             return f"{text}; the best map joins no two visits"
         first, second, probability = self.joins[0]
