@@ -6,6 +6,7 @@ import builtins
 import json
 import os
 import re
+import shlex
 import stat
 import subprocess
 import sys
@@ -456,6 +457,40 @@ def test_full_standard_output_is_an_error(tmp_path: Path) -> None:
     assert done.stderr.decode().endswith(
         "standard output: cannot be written: No space left on device; make room\n"
     )
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs limits on the size of files")
+def test_old_answer_stays_if_the_new_one_is_too_large(tmp_path: Path) -> None:
+    """The answer is still printed, and no draft is left."""
+    trace, answer = tmp_path / "trace.jsonl", tmp_path / "answer.json"
+    Trace.from_steps(range(300), ["travel"] * 299).save(trace)
+    answer.write_text("old", encoding="utf-8")
+    solving = (
+        f"{shlex.quote(sys.executable)} -m ssh_abduction solve {trace} --theory causal -o {answer}"
+    )
+    done = subprocess.run(
+        ["bash", "-c", f"ulimit -f 4; exec {solving}"], capture_output=True, check=False
+    )
+    assert done.returncode == 1
+    assert b"dstates" in done.stdout
+    assert done.stderr.decode().endswith(
+        f"{answer}: cannot write the solution: File too large; allow larger files (ulimit -f), or "
+        "take another disk\n"
+    )
+    assert answer.read_text(encoding="utf-8") == "old"
+    assert {path.name for path in tmp_path.iterdir()} == {"trace.jsonl", "answer.json"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a shell that closes streams")
+@pytest.mark.parametrize("words", ["solve -", "import - -o trace.jsonl", "check - -"])
+def test_closed_standard_input_is_an_error(words: str, tmp_path: Path) -> None:
+    program = f"{shlex.quote(sys.executable)} -m ssh_abduction {words} <&-"
+    done = subprocess.run(["bash", "-c", program], capture_output=True, check=False, cwd=tmp_path)
+    assert done.returncode == 1
+    err = done.stderr.decode()
+    assert err.startswith("ssh-abduction: standard input: expected a ")
+    assert err.endswith(" got a closed stream; name a file\n")
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("name", ["", "a\0b"])

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
 import io
 import os
 import sys
@@ -58,20 +57,10 @@ from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Parser, Verbs
 from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.data.errors import AbductionError, named, printable
-from ssh_abduction.data.files import json_line
+from ssh_abduction.data.files import json_line, mend_of
 from ssh_abduction.runtime import program
 
 EXIT_ERROR = 1
-MENDS = {
-    errno.ENOSPC: "make room",
-    errno.ENOENT: "make the folder first",
-    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "take a place that you may write to"),
-    errno.EDQUOT: "make room",
-    errno.ENAMETOOLONG: "take a shorter name",
-    errno.EEXIST: "take another name",
-    errno.EISDIR: "take another name",
-    errno.ENOTDIR: "take another name",
-}
 # The verbs, grouped by purpose as the help lists them.
 VERBS: Mapping[str, tuple[ModuleType, ...]] = {
     "map: find the maps of a trace or a log": (solve, map_logs, import_log, cluster),
@@ -131,10 +120,8 @@ def parser() -> Parser:
 
 def unwritten(error: OSError, output: object) -> str:
     """Say that a file cannot be written: the one that the error names, or else `output`."""
-    mend = MENDS.get(error.errno or 0, "check the path")
-    return (
-        f"{named(error.filename or output)}: cannot be written: {error.strerror or error}; {mend}"
-    )
+    what = named(error.filename or output)
+    return f"{what}: cannot be written: {error.strerror or error}; {mend_of(error)}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

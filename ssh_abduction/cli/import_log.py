@@ -189,6 +189,8 @@ def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Rob
             "-: expected lines of CARMEN on standard input, got another format or a topic; save "
             "the log to a file, and name that"
         )
+    if sys.stdin is None:
+        raise AbductionError("standard input: expected a log, got a closed stream; name a file")
     asked = {name: getattr(options, name) for name in ("fov", "mount", "no_return", "zero_is")}
     items = live_log(sys.stdin.buffer, **asked, tell=tell)
     numbers = count()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -31,6 +32,18 @@ _LONG_NUMBER = re.compile(rf"\d{{{LONGEST_NUMBER + 1}}}")
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 # Control characters that JSON need not escape, and that steer a terminal.
 _UNSEEN = re.compile("[\x7f-\x9f\u2028\u2029]")
+# What to do if a file cannot be written, by the number of the error.
+_MENDS = {
+    errno.ENOSPC: "make room",
+    errno.ENOENT: "make the folder first",
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "take a place that you may write to"),
+    errno.EDQUOT: "make room",
+    errno.EFBIG: "allow larger files (ulimit -f), or take another disk",
+    errno.ENAMETOOLONG: "take a shorter name",
+    errno.EEXIST: "take another name",
+    errno.EISDIR: "take another name",
+    errno.ENOTDIR: "take another name",
+}
 
 
 class NotFinite(ValueError):  # noqa: N818 - part of an error message, which the caller completes
@@ -161,6 +174,11 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> None:
             draft.unlink(missing_ok=True)
 
 
+def mend_of(error: OSError) -> str:
+    """Say what to do if a file cannot be written."""
+    return _MENDS.get(error.errno or 0, "check the path")
+
+
 def save_file(
     path: str | os.PathLike[str], data: bytes, what: str, error: type[AbductionError]
 ) -> None:
@@ -169,7 +187,8 @@ def save_file(
         write_file(path, data)
     except OSError as found:
         why = found.strerror or found
-        raise error(f"{named(path)}: cannot write the {what}: {why}; check the folder") from None
+        mend = mend_of(found)
+        raise error(f"{named(path)}: cannot write the {what}: {why}; {mend}") from None
     except ValueError as found:
         where = brief(str(path))
         raise error(f"{where}: cannot write the {what}: {found}; name a file") from None

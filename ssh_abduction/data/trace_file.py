@@ -99,14 +99,14 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
     if b"\0" in raw:
         raise TraceError(
             f"{where}: line: expected text in UTF-8, got a null byte at column "
-            f"{raw.index(0) + 1}; is this a binary file?"
+            f"{raw.index(0) + 1}; save it as UTF-8, or is this a binary file?"
         )
     try:  # only the first line may begin with a byte order mark
         record = parse_json(raw.rstrip().decode("utf-8-sig" if is_first else "utf-8"))
     except UnicodeDecodeError as error:
         raise TraceError(
             f"{where}: line: expected text in UTF-8, got the byte 0x{raw[error.start]:02x} "
-            f"at column {error.start + 1}; is this a binary file?"
+            f"at column {error.start + 1}; save it as UTF-8, or is this a binary file?"
         ) from None
     except json.JSONDecodeError as error:
         raise TraceError(
