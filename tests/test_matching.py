@@ -198,7 +198,10 @@ def test_walls_far_from_a_scan_count_if_the_match_needs_them(
     assert (covariance == other).all()
 
 
-def test_covariance_of_a_point_sums_all_increments() -> None:
+@pytest.mark.parametrize("block", [1, 2, 3, 4, 7, 8, 9])
+def test_covariance_of_a_point_sums_all_increments(
+    monkeypatch: pytest.MonkeyPatch, block: int
+) -> None:
     """Each increment is an arm that ends at the point; the sum is computed one by one."""
     rng = np.random.default_rng(1)
     poses = np.column_stack([np.cumsum(rng.normal(0, 1, (9, 2)), axis=0), rng.normal(0, 1, 9)])
@@ -211,7 +214,8 @@ def test_covariance_of_a_point_sums_all_increments() -> None:
         arm = np.array([[cos, -sin, -y], [sin, cos, x], [0.0, 0.0, 1.0]])
         expected += arm @ track.covariances[i] @ arm.T
     assert uncertainty(track, 2, 7, end) == pytest.approx(expected)
-    assert uncertainty(track, 7, 2, end) == pytest.approx(expected)
+    monkeypatch.setattr("perception.places.track.BLOCK", block)
+    assert uncertainty(replace(track, factor=2.0), 7, 2, end) == pytest.approx(2 * expected)
 
 
 def test_visit_is_matched_with_a_limited_number_of_earlier_ones(

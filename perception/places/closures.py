@@ -258,4 +258,4 @@ def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
     # arm that begins there.
     first, last = min(first, last), max(first, last)
     arm = np.array([[1.0, 0.0, -end[1]], [0.0, 1.0, end[0]], [0.0, 0.0, 1.0]])
-    return np.asarray(arm @ (track.spreads[last] - track.spreads[first]) @ arm.T)
+    return np.asarray(arm @ (track.spread(last) - track.spread(first)) @ arm.T)

@@ -156,12 +156,12 @@ class GrowingTrack:
 
     @property
     def track(self) -> Track:
-        """The track up to the last scan."""
-        rows = np.array(self._rows).reshape(-1, ROW)
+        """The track up to the last scan. It is not copied: while it is in use, add no scan."""
+        rows = np.asarray(self._rows).reshape(-1, ROW)
         return Track(
-            rows[:, :3].copy(),
-            rows[:, 3:12].reshape(-1, 3, 3).copy(),
-            rows[:, 12].copy(),
+            rows[:, :3],
+            rows[:, 3:12].reshape(-1, 3, 3),
+            rows[:, 12],
             tuple(self.cuts),
             tuple(self._breaks),
         )

@@ -323,9 +323,7 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 def calibrated(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> Track:
     """Return a track with covariances that agree with the closures between visits, if any."""
-    factor = factor_of(track, visits, closings)
-    vars(track).pop("spreads", None)  # They are not used again, and need much memory.
-    return replace(track, covariances=track.covariances * factor)
+    return replace(track, factor=factor_of(track, visits, closings))
 
 
 def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> float:

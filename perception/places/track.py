@@ -15,8 +15,8 @@ from perception.readers.scans import Pose
 
 Array = NDArray[np.float64]
 
-# Number of increments of a track whose covariances are added up at once.
-BLOCK = 4096
+# The sums of covariances are kept for each BLOCK-th scan.
+BLOCK = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,13 +26,14 @@ class Track:
     Attributes:
         poses: (n, 3) x, y in metres and heading in radians, in the frame of the first scan.
         covariances: (n, 3, 3) covariance of the motion from the previous scan to each scan, in the
-            frame of the robot at the previous scan; zeros for the first scan.
+            frame of the robot at the previous scan, by scan matching; zeros for the first scan.
         shares: (n,) share of the points of each scan that lie on known walls; 1 for the first scan,
             NaN for a later scan whose beams meet nothing. Empty if nothing was matched.
         cuts: Indices of scans before which the motion is unknown because the odometer jumped. No
             displacement crosses a cut.
         breaks: The scans in `cuts` after which the robot may be anywhere, because the scan shows
             nothing that was seen before. Neither a path nor a place crosses a break.
+        factor: Number by which the covariances have to be multiplied.
         is_reliable: Whether scans match, and agree with the odometry, as in good logs. True if
             nothing was judged.
     """
@@ -42,6 +43,7 @@ class Track:
     shares: Array = field(default_factory=lambda: np.ones(0))
     cuts: tuple[int, ...] = ()
     breaks: tuple[int, ...] = ()
+    factor: float = 1.0
     is_reliable: bool = True
 
     def pose(self, scan: int) -> Pose:
@@ -54,27 +56,40 @@ class Track:
         """The distance travelled up to each scan: (n,), metres."""
         return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.poses[:, :2], axis=0).T))])
 
-    @cached_property
-    def spreads(self) -> Array:
-        """The sums of the covariances of all increments up to each scan: (n, 3, 3).
+    def corrected(self, begin: int, end: int) -> Array:
+        """The corrected covariances of the motions to scans begin … end - 1: (n, 3, 3)."""
+        return self.covariances[begin:end] * self.factor
+
+    def spread(self, scan: int) -> Array:
+        """The sum of the corrected covariances of all increments up to a scan: (3, 3).
 
         The covariance of each increment is first expressed as an error at the origin of the frame.
         """
-        total = np.zeros_like(self.covariances)
-        # Blocks of increments need less memory than all at once.
-        for begin in range(1, len(total), BLOCK):
-            block = slice(begin, begin + BLOCK)
-            x, y, _ = self.poses[block].T
-            heading = self.poses[begin - 1 :][: len(x), 2]
-            cos, sin = np.cos(heading), np.sin(heading)
-            arms = np.zeros((len(x), 3, 3))
-            arms[:, 0] = np.stack([cos, -sin, y], axis=1)
-            arms[:, 1] = np.stack([sin, cos, -x], axis=1)
-            arms[:, 2, 2] = 1.0
-            steps = arms @ self.covariances[block] @ arms.transpose(0, 2, 1)
-            steps[0] += total[begin - 1]
-            np.cumsum(steps, axis=0, out=total[block])
-        return total
+        if scan not in self._spreads:
+            begin = (scan - 1) // BLOCK * BLOCK
+            self._spreads[scan] = self._added(begin, scan, self._spreads[begin])
+        return self._spreads[scan]
+
+    @cached_property
+    def _spreads(self) -> dict[int, Array]:
+        """The spreads at each BLOCK-th scan, and at scans that were asked for."""
+        known = {0: np.zeros((3, 3))}
+        for begin in range(0, len(self.poses) - BLOCK, BLOCK):
+            known[begin + BLOCK] = self._added(begin, begin + BLOCK, known[begin])
+        return known
+
+    def _added(self, begin: int, end: int, before: Array) -> Array:
+        """The spread at scan `end`, from the spread at scan `begin`."""
+        x, y, _ = self.poses[begin + 1 : end + 1].T
+        heading = self.poses[begin:end, 2]
+        cos, sin = np.cos(heading), np.sin(heading)
+        arms = np.zeros((len(x), 3, 3))
+        arms[:, 0] = np.stack([cos, -sin, y], axis=1)
+        arms[:, 1] = np.stack([sin, cos, -x], axis=1)
+        arms[:, 2, 2] = 1.0
+        steps = arms @ self.corrected(begin + 1, end + 1) @ arms.transpose(0, 2, 1)
+        steps[0] += before
+        return np.asarray(np.cumsum(steps, axis=0)[-1].copy())
 
     @cached_property
     def spans(self) -> tuple[tuple[int, int], ...]:
