@@ -11,6 +11,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
@@ -397,6 +398,17 @@ def test_server_refuses_a_request_with_a_wrong_length(server: PageServer, length
         )
         connection.sendall(head.encode())
         assert connection.recv(100).startswith(b"HTTP/1.0 403")
+
+
+def test_server_lets_many_connections_wait() -> None:
+    """All connect at once, before the server takes the first one."""
+    theory = Theory.causal()
+    with (
+        PageServer(Listing.of(solve(CORRIDOR, theory)), CORRIDOR, theory) as served,
+        ExitStack() as clients,
+    ):
+        for _ in range(60):
+            clients.enter_context(socket.create_connection(("127.0.0.1", served.port), timeout=5))
 
 
 def test_server_stops_a_question_whose_client_is_gone(

@@ -62,6 +62,7 @@ class PageServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
+    request_queue_size = 128  # with Python's 5, many requests at once would wait for a minute
 
     @renamed_parameters("limit", "maps")
     def __init__(
