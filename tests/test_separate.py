@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import random
+from pathlib import Path
 
 import pytest
 from brute_force import consistent_maps
 
 from ssh_abduction import Theory, Trace, check, solve
+from ssh_abduction.cli import main, outcome
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.guesses.separate import separate_map
 from ssh_abduction.theory.settle import settle
@@ -50,7 +52,9 @@ def test_turns_around_that_show_new_views_have_a_quick_map() -> None:
     assert search._parts.known.best.dstate_at == (0, 1, 2, 3)
 
 
-def test_clash_of_a_whole_visit_is_found_after_the_limit() -> None:
+def test_clash_of_a_whole_visit_is_found_after_the_limit(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A travel puts many turns around on one path, but they saw different things."""
     turns = ["right", *["around"] * 16]
     done = [*["travel"] * 40, *turns, "travel", *["travel"] * 40]
@@ -58,3 +62,10 @@ def test_clash_of_a_whole_visit_is_found_after_the_limit() -> None:
     trace = Trace.from_steps(views, done)
     found = solve(trace, Theory(star="none"), time_limit=0.2, max_maps=1)
     assert found.status is Status.UNSATISFIABLE
+    trace.save(tmp_path / "trace.jsonl")
+    words = ["solve", str(tmp_path / "trace.jsonl"), "--set", "star=none", "--time-limit", "0.2"]
+    monkeypatch.setattr(outcome, "EXPLAINING", 0.0)
+    assert main(words) == 20
+    told = capsys.readouterr().out
+    assert told.startswith("unsatisfiable: no map satisfies the axioms: in steps ")
+    assert " some clash\nlook at what was seen and done from " in told

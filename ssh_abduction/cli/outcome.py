@@ -49,7 +49,10 @@ def exit_code(solution: Solution) -> int:
 
 
 def why_no_map(search: Search) -> Explanation | None:
-    """Explain why there is no map; None if there is a map, or no time to find out."""
+    """Explain why there is no map; None if there is a map, or no time to find out.
+
+    If the time is only enough to find the steps that clash, no axioms are named.
+    """
     if search.status is not Status.UNSATISFIABLE or search.theory.jumped:
         return None
     watch = Watch(EXPLAINING, clock=time.thread_time)
@@ -61,7 +64,8 @@ def why_no_map(search: Search) -> Explanation | None:
     try:
         return explain(search.trace, search.theory, over, search.clash)
     except Interrupted:
-        return None
+        clash = search.clash
+        return Explanation(clash.start, clash.stop - 1, ()) if clash else None
 
 
 def answer_opening(search: Search) -> dict[str, Any]:

@@ -365,10 +365,12 @@ def _lines(
             yield from explanation.sentences
             first, last = search.trace.at(explanation.first), search.trace.at(explanation.last)
             where = f"at {last}" if first == last else f"from {first} to {last}"
-            yield (
-                f"look at what was seen and done {where}, or leave one of these axioms out: "
-                "--set without=NAME"
+            mend = (
+                "leave one of these axioms out: --set without=NAME"
+                if explanation.clashes
+                else "explain a trace of these steps alone: ssh-abduction explain"
             )
+            yield f"look at what was seen and done {where}, or {mend}"
         return
     if solution.cost is None:
         if solution.partial:

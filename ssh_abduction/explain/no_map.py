@@ -58,7 +58,8 @@ class Explanation:
     Attributes:
         first: The first step of the stretch.
         last: The last step of the stretch.
-        clashes: The axioms that clash, each with its steps.
+        clashes: The axioms that clash, each with its steps. Empty if the time was too short to find
+            them.
         sentences: If displacements take part in the clash (axiom `one_pose`), sentences about the
             returns (two steps at one place or dstate) that displacements reject. At most three
             for each last step of a return, the clearest first. Otherwise empty.
@@ -81,7 +82,8 @@ class Explanation:
         ]
         many = f"steps {self.first} to {self.last}"
         where = f"step {self.last}" if self.first == self.last else many
-        return f"no map satisfies the axioms: in {where} these clash: {', '.join(parts)}"
+        clash = f"these clash: {', '.join(parts)}" if parts else "some clash"
+        return f"no map satisfies the axioms: in {where} {clash}"
 
     def to_dict(self) -> dict[str, object]:
         """Return the explanation as plain data, as `solve --json` prints it."""
