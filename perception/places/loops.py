@@ -35,7 +35,7 @@ def agreeing(
     equals it is the one with the lowest score. `found` is sorted by later visits.
     """
     loops = _ClosureLoops(track, visits)
-    votes = np.zeros((len(found), len(found)))
+    votes = np.zeros((len(found), len(found)), np.int8)  # small, as it grows with the square
     ends = [float(track.way[visits[closure.last].scan]) for closure in found]
     for i, one in enumerate(found):
         for k in range(bisect_left(ends, ends[i] - LOOP), i):
