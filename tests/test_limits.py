@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import aces
 import clingo
 import pytest
 from in_processes import answer_and_end, sleep, stay, vanish
@@ -54,7 +55,7 @@ import sys, clingo
 from ssh_abduction.cli import guard as patience
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.outcome import on_ctrl_c
-patience.DEAF, patience.LATE, patience.LARGE = 0.2, (1.1, 0.1), (1.1, 60.0)
+patience.DEAF, patience.LATE = 0.2, (1.1, 0.1)
 limit, memory = (float(word) or None for word in sys.argv[1:])
 with on_ctrl_c(lambda: None), Guard(
     lambda: None, lambda why: (f"known: {why}", 10), limit, memory
@@ -438,7 +439,7 @@ def test_limit_during_ranking_leaves_the_list_complete() -> None:
     [
         lambda solution: solve(solution.trace),
         find_backbone,
-        lambda solution: explain_pair(solution.trace, 0, 1),
+        lambda solution: explain_pair(solution.trace, 0, 4),
         lambda solution: explain_trace(solution.trace),
         lambda _: explain(CLASH),
         lambda _: check_rules(Theory.causal().replace(rules=[Rules("own.lp", EXAMPLE)])),
@@ -448,7 +449,7 @@ def test_ctrl_c_while_clingo_deletes_a_program_is_raised_later(
     ask: Callable[[Solution], object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Python only prints what is raised where an object is deleted."""
-    solution = solve(rectangle(8), max_maps=1)
+    solution = aces.solution(max_maps=1)
     delete, left = clingo.Control.__del__, [KeyboardInterrupt]
 
     def interrupted(control: clingo.Control) -> None:
