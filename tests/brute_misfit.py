@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import combinations, product
 
@@ -20,6 +21,8 @@ from scipy.sparse.csgraph import connected_components
 
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.theory import Theory
 
 STARTS = 4
 
@@ -177,6 +180,17 @@ def layings(trace: Trace, positions: Sequence[Hashable]) -> int:
         if len({positions[t] for t in pair}) == 1
     ]
     return len({*groups_of_drives(trace, [])}) - len({*groups_of_drives(trace, equal)})
+
+
+def price_of_laying(trace: Trace, theory: Theory) -> float:
+    """The price of laying drives on each other, which is higher if few views and no stars help."""
+    told = settle(trace, theory).theory
+    group = groups_of_drives(replace(trace, closures=()), [])
+    pairs = [(t, u) for t, u in combinations(range(len(trace)), 2) if group[t] != group[u]]
+    alike = [pair for pair in pairs if len({trace.views[t] for t in pair}) == 1]
+    if told.star != "none" or not alike:
+        return told.price_of_laying
+    return told.price_of_laying * max(1.0, 3 / math.log((len(pairs) + 400) / len(alike)))
 
 
 def groups_of_drives(trace: Trace, equal: Iterable[tuple[int, int]]) -> list[int]:

@@ -15,6 +15,7 @@ from together import of_mazes
 
 from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
 from ssh_abduction.checker.checker import violations
+from ssh_abduction.checker.cost_claims import false_costs
 from ssh_abduction.data import Action, Closure, Odometry, Step, together
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.star import Gateway, Star
@@ -323,6 +324,29 @@ def test_search_joins_six_drives() -> None:
     assert joining is not None
     *_, ssh_map = candidates.maps_of(joining)
     assert truth.is_true(ssh_map, known)
+
+
+@pytest.mark.parametrize(
+    ("views", "price", "pieces"),
+    [("abcdefghij", 32.0, 1), ("a" * 40, 32 * 3 / math.log(640 / 240), 2)],
+    ids=["rare", "alike"],
+)
+def test_laying_costs_more_where_most_steps_look_alike(
+    views: str, price: float, pieces: int
+) -> None:
+    trace, theory = along(views, views[:6]), Theory(boundary="none")
+    assert settle(trace, theory).overlap.price == pytest.approx(price)
+    free, joint = (
+        solve(trace, theory.replace(same=pairs), time_limit=5) for pairs in ((), ((0, len(views)),))
+    )
+    assert len(free.maps[0].pieces) == pieces
+    assert free.weighed is not None
+    assert ("too much alike" in (free.weighed.doubt or "")) == (pieces == 2)
+    assert len(joint.maps[0].pieces) == 1
+    answer = joint.to_dict()
+    assert [*false_costs(trace, answer, joint.maps, joint.theory)] == []
+    answer["weighed"]["nats"] -= price - 16
+    assert [*false_costs(trace, answer, joint.maps, joint.theory)] != []
 
 
 def test_explain_states_the_price_of_laying_drives() -> None:

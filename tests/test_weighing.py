@@ -14,7 +14,7 @@ from unittest.mock import Mock, patch
 import pytest
 import truth
 from brute_force import Key, consistent_maps, key
-from brute_misfit import LeastSquares, layings
+from brute_misfit import LeastSquares, layings, price_of_laying
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
@@ -44,7 +44,7 @@ PLAUSIBLE = 300.0  # the chi-square of a map that may be true
 def cheapest(trace: Trace, theory: Theory) -> tuple[float, set[Key]]:
     """The least cost and the maps that have it. Of maps with the same dstates and places, take
     those with the fewest paths."""
-    squares = LeastSquares(trace)
+    squares, laying = LeastSquares(trace), price_of_laying(trace, theory)
     found: dict[tuple[object, object], tuple[float, int, set[Key]]] = {}
     toys = [toy for toy in TOYS if toy.rules in theory.rules]
     for one, counts in consistent_maps(trace, theory):
@@ -55,7 +55,7 @@ def cheapest(trace: Trace, theory: Theory) -> tuple[float, set[Key]]:
         prices = zip(theory.prices, (counts.dstates, counts.places, counts.paths), strict=True)
         nats = sum(price * count for price, count in prices)
         nats += squares.misfit(labels, positions) / 2
-        nats += theory.price_of_laying * layings(trace, [positions[s] for s in labels])
+        nats += laying * layings(trace, [positions[s] for s in labels])
         if theory.level == "topological":
             nats += theory.price_of_laying * squares.crowding(labels, positions)
         known = found.get((labels, places))

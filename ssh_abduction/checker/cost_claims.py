@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from itertools import accumulate, combinations, pairwise
 from typing import Any, TypeAlias
 
@@ -130,12 +131,13 @@ def false_costs(
         name = f"weighed.rivals[{i}]"
         courses.append((name, rival.get("nats"), rival["dstates"], at, there, of_rival))
     paths = theory.prices[2] * len(maps[0].paths)
+    laying = theory.price_of_laying * (_laying_factor(trace) if theory.star == "none" else 1.0)
     for name, claimed, dstates, at, count, faults in courses:
         square, position = _least(trace, dstates, at, faults)
         true = theory.prices[0] * len(set(dstates)) + theory.prices[1] * count + square / 2
         tenths = [theory.fault_tenths(kind, trace.steps[step]) for kind, step in faults]
         true += theory.prices[0] * sum(tenths) / 10
-        true += theory.price_of_laying * _layings(trace, at)
+        true += laying * _layings(trace, at)
         if theory.level == "topological" and not theory.lifts and not theory.jumped:
             true += theory.price_of_laying * _crowding(trace, dstates, at, position)
         true += paths if name == "weighed.nats" else 0.0
@@ -153,6 +155,22 @@ def _layings(trace: Trace, places: Sequence[int]) -> int:
     tied = [{drive[closure.first], drive[closure.last]} for closure in trace.closures]
     shared = [{drive[t] for t, p in enumerate(places) if p == place} for place in set(places)]
     return len(_groups(drive, tied)) - len(_groups(drive, tied + shared))
+
+
+def _laying_factor(trace: Trace) -> float:
+    """Compute how many times as much laying drives costs if only views tell places apart.
+
+    Of the pairs of steps of different drives, and of 400 further pairs that differ, a share q has
+    equal views. The factor is 3 / log(1/q), at least 1.
+    """
+    views: dict[int, Counter[Hashable]] = defaultdict(Counter)
+    for drive, view in zip(_drives(trace), trace.views, strict=True):
+        views[drive][view] += 1
+    alike = pairs = 0
+    for one, other in combinations(views.values(), 2):
+        pairs += one.total() * other.total()
+        alike += sum(one[view] * other[view] for view in one)
+    return max(3 / -math.log(alike / (pairs + 400)), 1.0) if alike else 1.0
 
 
 def _crowding(

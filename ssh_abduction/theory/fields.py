@@ -40,6 +40,11 @@ PRICES = (8.0, 8.0, 0.0)
 # look alike by chance. With star=alike, which compares bearings, it costs as much as one dstate and
 # its place (docs/measurements/truth.md).
 LAID = 2
+# Without stars, only views tell places apart. If steps of two drives look alike with probability q,
+# each step tells log(1/q) nats. If these are fewer than TOLD, laying costs TOLD / log(1/q) times as
+# much. So that few steps do not mislead, q counts UNLIKE more pairs that differ
+# (docs/measurements/truth.md).
+TOLD, UNLIKE = 3.0, 400
 DEAREST_PRICE = 1e6
 # The axioms that a fault of each kind may break. Speed-ups cannot rely on them.
 EXCUSED = {

@@ -4,11 +4,12 @@ and of different places at one position.
 Nothing is known of where a drive starts. So it can be laid on a map of other drives in very many
 ways, and in some of these ways a place or two look the same by chance. Closures (matches of local
 maps) connect some drives to groups. A map pays the price each time that common places connect two
-groups. So drives share places only if they have more in common than chance explains.
+groups. So drives share places only if they have more in common than chance explains. The price is
+higher if no stars are compared, and most steps of two drives look alike.
 
 Two places cannot be at one position. If drives are laid on each other by chance, many of their
-places are. So each two places that no drive (or group) saw both pay this price again if they are at
-one position, and less of it the farther they are apart.
+places are. So each two places that no drive (or group) saw both pay a price if they are at one
+position, and less of it the farther they are apart.
 """
 
 from __future__ import annotations
@@ -19,11 +20,14 @@ from collections import Counter
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations, pairwise
 
-from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.drives import drives_of, starts_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.fields import TOLD, UNLIKE
 from ssh_abduction.theory.theory import Theory
 
+# The views of drives tell nothing if laying these costs more than AMBIGUOUS times the usual price.
+AMBIGUOUS = 2.0
 # Two places are not at one position if they are farther apart than this share of the shortest
 # travel. A move is a travel if it is longer than TRAVEL of the longest one.
 NEAR, TRAVEL = 0.4, 0.1
@@ -33,7 +37,8 @@ class Overlap:
     """Computes the price of laying the drives of one trace on each other.
 
     Attributes:
-        price: The price of joining two groups of drives, and of two places at one position.
+        price: The price of joining two groups of drives.
+        crowded_price: The price of two places at one position.
         near: Places that are nearer than this, in metres, are at one position. 0 if positions are
             not known well enough.
     """
@@ -45,7 +50,8 @@ class Overlap:
             theory: The theory, which sets the price.
         """
         starts = starts_of(trace)
-        self.price = theory.price_of_laying
+        self.crowded_price = theory.price_of_laying
+        self.price = self.crowded_price * (_ambiguity(trace) if theory.star == "none" else 1.0)
         self._drive = [bisect_right(starts, t) for t in range(len(trace))]
         closures = ((self._drive[c.first], self._drive[c.last]) for c in trace.closures)
         self._tied = _joined(range(len(starts) + 1), closures)  # a group for each drive
@@ -56,6 +62,15 @@ class Overlap:
         self.near = 0.0
         if has_frames and len({*self._tied}) > 1 and None not in moved:
             self.near = NEAR * min((way for way in ways if way > TRAVEL * longest), default=0.0)
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether views tell so little that drives may share places without a sign of it."""
+        return self.price > AMBIGUOUS * self.crowded_price
+
+    def keeps_apart(self, ssh_map: SSHMap) -> bool:
+        """Whether some drives share no place with others in a map of the whole trace."""
+        return self.of_map(ssh_map) < self.price * (len({*self._tied}) - 1)
 
     @property
     def unit_of_step(self) -> list[int]:
@@ -79,7 +94,7 @@ class Overlap:
             places: The place of each dstate.
             at: The position of each dstate, in metres.
         """
-        return self.price * sum(share for *_, share in self.crowded(labels, places, at))
+        return self.crowded_price * sum(share for *_, share in self.crowded(labels, places, at))
 
     def share(self, here: Sequence[float], there: Sequence[float]) -> float:
         """Return the share of the price that two places at these positions, in metres, cost."""
@@ -152,6 +167,15 @@ class Overlap:
         """Return the price of a common place of two pieces of a map, given by their steps."""
         groups = [{self._tied[self._drive[t]] for t in steps} for steps in (some, others)]
         return 0.0 if groups[0] & groups[1] else self.price
+
+
+def _ambiguity(trace: Trace) -> float:
+    """Return how many times as much laying drives on each other costs, by their views."""
+    drives = [Counter(trace.views[drive.first : drive.stop]) for drive in drives_of(trace)]
+    every = sum(drives, Counter())
+    pairs = (every.total() ** 2 - sum(drive.total() ** 2 for drive in drives)) / 2
+    alike = sum(n * n - sum(drive[view] ** 2 for drive in drives) for view, n in every.items()) / 2
+    return max(TOLD / math.log((pairs + UNLIKE) / max(alike, 1)), 1.0)
 
 
 def groups_of(at: Iterable[Hashable], drive: Iterable[int], tied: Sequence[int]) -> int:

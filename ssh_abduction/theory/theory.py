@@ -209,7 +209,10 @@ class Theory:
 
     @property
     def price_of_laying(self) -> float:
-        """The price in nats of the claim that a drive shares places with other drives."""
+        """The price in nats of the claim that a drive shares places with other drives.
+
+        Without stars, the price of a trace may be higher (`Overlap`).
+        """
         dstate, place, _ = self.prices
         number = 1 if self.star == "alike" else LAID
         return number * (dstate + place if self.level == "topological" else dstate)

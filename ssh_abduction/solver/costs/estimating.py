@@ -97,9 +97,12 @@ def may_join_more(problem: Problem, rivals: Sequence[Rival]) -> bool:
 def doubt_of(problem: Problem, best: SSHMap) -> str | None:
     """Say why the costs of maps cannot be trusted; None if there is no such reason.
 
-    Two places cannot be at one position. If two drives have such places, they overlap by chance.
+    Two places cannot be at one position. If two drives have such places, they overlap by chance. If
+    views look alike nearly everywhere, drives that stay apart may share places all the same.
     """
     overlap = problem.overlap
+    if overlap.is_ambiguous and overlap.keeps_apart(best):
+        return "the views of the drives are too much alike to tell whether they share places"
     if not overlap.near or not overlap.of_map(best):
         return None
     if best.fit is None:

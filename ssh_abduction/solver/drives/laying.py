@@ -124,7 +124,7 @@ def _nats(ssh_map: SSHMap, problem: Problem) -> float:
     """Compute the cost in nats of a map that has a fit."""
     assert ssh_map.fit is not None
     overlap = problem.overlap
-    crowding = overlap.price * sum(share for *_, share in overlap.crowded_in(ssh_map))
+    crowding = overlap.crowded_price * sum(share for *_, share in overlap.crowded_in(ssh_map))
     nats = nats_of(Cost.of(ssh_map), problem.theory) + overlap.of_map(ssh_map) + crowding
     return nats + ssh_map.fit.chi2 / 2
 

@@ -116,7 +116,9 @@ class Joining:
         starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
         joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
         best = min(joined, key=self._nats_of, default=alone)
-        others = {part: rest for part, *rest in found}
+        # Without stars, so many ways to join maps would make some look good by chance.
+        has_stars = self._bare.star != "none"
+        others = {part: rest for part, *rest in found} if has_stars else {}
         while mended := [*self._joined_by_others(best, others)]:
             best = min(mended, key=self._nats_of)
         if len(best) < len(alone):

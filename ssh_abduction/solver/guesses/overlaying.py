@@ -345,7 +345,7 @@ class Overlay:
         if not places or {*before.sights[places[0]]} & {*before.sights[places[1]]}:
             return 0.0
         here, there = (before.mean[k : k + 2].tolist() for k in self._both.position[[*places]])
-        return self._overlap.price * self._overlap.share(here, there)
+        return self._overlap.crowded_price * self._overlap.share(here, there)
 
     def _merge_coinciding(self, places: set[int]) -> None:
         """Merge the coinciding dstates at some places, unless some of them cannot be one."""
