@@ -28,6 +28,7 @@ from ssh_abduction.data import Trace, drives_of, together
 from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.evaluation import evaluate_visits
+from ssh_abduction.output.layout import layout
 from ssh_abduction.robot_logs import log_report
 from ssh_abduction.robot_logs.log_maps import map_log
 from ssh_abduction.robot_logs.log_picture import ASIDE, colour_of, laid_over
@@ -229,6 +230,28 @@ def test_joint_track_lays_drives_over_each_other(
     beside = laid_over(track, imported, None)
     left, right = np.array(beside[:start]), np.array(beside[start:])
     assert right[:, 0].min() == pytest.approx(left[:, 0].max() + ASIDE)
+
+
+def test_report_turns_drives_as_the_drawing_of_the_map_does(
+    joint: tuple[RobotLog, Imported, list[Imported]], folder: Path
+) -> None:
+    log, imported, _ = joint
+    ssh_map = Solution.load(folder / "maps.json").maps[0]
+    poses = [tuple(pose) for pose in imported.track.poses.tolist()]
+    turned = [moved((3.0, -7.0, 1.2), pose) for pose in poses]
+    laid = laid_over(poses, imported, ssh_map)
+    off = np.subtract(laid, laid_over(turned, imported, ssh_map))
+    np.testing.assert_allclose(off[:, :2], np.broadcast_to(off[0, :2], (len(log), 2)), atol=1e-6)
+    drawn = layout(ssh_map).places
+    first, far = ssh_map.place_of(0), max(drawn, key=lambda p: math.dist(drawn[p], (0.0, 0.0)))
+    ends = []
+    for place in (first, far):
+        step = next(t for t in range(len(imported.trace)) if ssh_map.place_of(t) == place)
+        visit = imported.visits[imported.trace[step].extra["visit"]]
+        ends.append(laid[visit.scan])
+    way = np.subtract(ends[1], ends[0])[:2]
+    onward = np.subtract(drawn[far], drawn[first])
+    assert abs(np.angle(complex(*way) / complex(*onward))) < 0.2
 
 
 def test_map_together_refuses_equal_names_and_several_jobs(

@@ -106,6 +106,21 @@ def test_picture_draws_dstates_at_their_poses(theory: str) -> None:
     assert scale > 5
 
 
+def test_picture_of_a_map_without_paths_shows_ways_between_places() -> None:
+    steps = [(5.0, 0.0, 0.0)] * 2
+    trace = Trace.from_steps("abc", ["travel"] * 2, displacements=steps)
+    ssh_map = solve(trace, Theory(boundary="none")).maps[0]
+    whole = to_svg(ssh_map)
+    bare = to_svg(
+        replace(
+            ssh_map,
+            paths=(),
+            dstates=tuple(replace(s, path=None, direction=None) for s in ssh_map.dstates),
+        )
+    )
+    assert whole.count('opacity="0.4"') == bare.count('opacity="0.4"') == 2
+
+
 def test_picture_scale_bar_has_its_stated_length() -> None:
     ssh_map = grid(4, apart=8.0)
     picture = to_svg(ssh_map)

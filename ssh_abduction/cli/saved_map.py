@@ -21,7 +21,16 @@ from ssh_abduction.data.words import meant
 from ssh_abduction.rivals.listing import Listing
 
 # Directions on the map as it is drawn, in degrees counterclockwise from east.
-COMPASS = {"east": 0.0, "north": 90.0, "west": 180.0, "south": 270.0}
+COMPASS = {
+    "east": 0.0,
+    "northeast": 45.0,
+    "north": 90.0,
+    "northwest": 135.0,
+    "west": 180.0,
+    "southwest": 225.0,
+    "south": 270.0,
+    "southeast": 315.0,
+}
 
 
 @dataclass(frozen=True)
@@ -195,7 +204,13 @@ class SavedMap:
             s.id: (way + unit * (here.heading - s.heading)) % 360
             for s in self.map.dstates
             if s.place == here.place and s.heading is not None and here.heading is not None
-        } or {label: way}
+        }
+        if not ways and self.map.fit:  # as in maps of logs
+            drawn = self._drawn(here.place)
+            ways = {
+                s: round(way + drawn[s] - drawn[label]) % 360.0 for s in drawn if label in drawn
+            }
+        ways = ways or {label: way}
         return tuple(
             (step_name(self.drives, t), ways[s])
             for t, s in enumerate(self.map.dstate_at)

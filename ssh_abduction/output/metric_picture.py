@@ -95,7 +95,7 @@ class _Picture:
             for mark in self.ellipse(spots[site], self.poses[members[0].id].spread)
         ]
         arrows = [self.arrow(s) for s in self.map.dstates]
-        lines = self.paths(spots) if self.map.places else self.links()
+        lines = self.links() if not self.map.places else self.paths(spots) or self.edges(spots)
         bands, around = region_marks(self.map, spots, 2 * END * self.unit)
         self.points += around
         # Draw the first place last, on top of the others.
@@ -187,6 +187,17 @@ class _Picture:
                 broad = {"stroke_linecap": "round", "opacity": 0.4}
                 travels.append(_line(spots[p], spots[q], colour, 8 * u, **broad))
         return orders + travels
+
+    def edges(self, spots: Mapping[int, Point]) -> list[str]:
+        """Draw a line between two places if an action leads from one to the other."""
+        pairs = {
+            tuple(sorted(_site(self.map.dstates[s]) for s in ends)) for ends in link_names(self.map)
+        }
+        style = {"stroke_linecap": "round", "opacity": 0.4}
+        colour, width = COLOURS[0], 8 * self.unit
+        return [
+            _line(spots[p], spots[q], colour, width, **style) for p, q in sorted(pairs) if p != q
+        ]
 
     def curves(self) -> list[tuple[Point, Point, Point, str]]:
         """Find the curve (start, bend, end, actions) of each link, for a map without places."""

@@ -5,8 +5,9 @@ together are one edge. Where edges run together, there is one line. Places show 
 gateways. Places that the robot only passed, always between the same two neighbours, are drawn as
 dots. Each of several drives has its colour.
 
-Each drive of a joint map has a frame of its own. It is moved and turned so that the places that it
-shares with earlier drives coincide. A drive that shares no place is put beside the others.
+The first dstate faces right, as in all drawings of a map. Each drive of a joint map has a frame of
+its own. It is moved and turned so that the places that it shares with earlier drives coincide. A
+drive that shares no place is put beside the others.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from perception.readers.stored import in_turn
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.data.odometry import moved
+from ssh_abduction.data.star import Star
 from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, svg_text, titled
 from ssh_abduction.output.region_marks import band, banded
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
@@ -85,9 +87,9 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
         caption = (
             f"The first map over the scans, at {poses}. Numbers are places, ticks their gateways, "
             "and lines the edges along the robot's course, drawn once where several run together. "
-            f"{colours}Dots are places at which the robot only passed through. Bands are regions "
-            "that, as far as known, have only one entrance. Red shows the probability of a "
-            "doubtful join."
+            f"{colours}North, in corrections, is up. Dots are places at which the robot only "
+            "passed through. Bands are regions that, as far as known, have only one entrance. "
+            "Red shows the probability of a doubtful join."
         )
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
@@ -127,7 +129,7 @@ class _Sheet:
 
     Attributes:
         poses: The pose of each scan.
-        turns: For each visit, the angle in radians from the frame of the track to that of `poses`.
+        headings: The heading of each step, in radians.
         spots: The middle of the place of each visit, by its own pose.
         walls: (n, 2) points of walls.
         unit: Units of the page in a metre.
@@ -136,7 +138,7 @@ class _Sheet:
     """
 
     poses: Sequence[Pose]
-    turns: Sequence[float]
+    headings: Sequence[float]
     spots: Sequence[Point]
     walls: Array
     unit: float
@@ -150,15 +152,14 @@ class _Sheet:
         is_corrected = len(corrected) == len(log)
         poses = laid_over(corrected if is_corrected else track, imported, ssh_map)
         walls = _walls(log, poses)
-        spots, turns = [], []
-        for visit in imported.visits:
-            x, y = visit.middle
-            middle = displacement_between(track[visit.scan], (float(x), float(y), 0.0))
-            spots.append(moved(poses[visit.scan], middle)[:2])
-            turns.append(poses[visit.scan][2] - track[visit.scan][2])
+        seen = _spots(poses, imported)
+        first = {visit: t for t, visit in reversed([*enumerate(_visit_of(imported))])}
+        spots = [seen[first[visit]][:2] for visit in range(len(imported.visits))]
+        headings = [heading for _, _, heading in seen]
         extent = np.ptp(np.concatenate([walls, [pose[:2] for pose in poses]]), axis=0).max()
         unit = min(METRE, LARGEST / max(float(extent), 1.0))
-        return cls(poses, turns, spots, walls, unit, is_corrected, (0, *imported.starts, len(log)))
+        bounds = (0, *imported.starts, len(log))
+        return cls(poses, headings, spots, walls, unit, is_corrected, bounds)
 
     def drive_of(self, scan: int) -> int:
         """The index of the drive of a scan."""
@@ -190,7 +191,7 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     """Draw the edges and places of the first map."""
     ssh_map = solution.maps[0]
     places = place_of_steps(ssh_map)
-    visit_of = [int(step.extra["visit"]) for step in imported.trace.steps]
+    visit_of = _visit_of(imported)
     visits: dict[int, list[int]] = defaultdict(list)
     for place, visit in zip(places, visit_of, strict=True):
         if place is not None and visit not in visits[place]:
@@ -301,17 +302,17 @@ def drawn_once(courses: Sequence[Array]) -> Iterator[Array]:
 
 
 def _place(sheet: _Sheet, imported: Imported, at: Point, visits: Sequence[int]) -> Iterator[str]:
-    """Draw the disc of a place, and a tick for each gateway that was sure at its last visit."""
-    visit = imported.visits[visits[-1]]
-    radius = max(visit.radius * sheet.unit, 11.0)
+    """Draw the disc of a place, and a tick for each open gateway at its last visit."""
+    radius = max(imported.visits[visits[-1]].radius * sheet.unit, 11.0)
     x, y = at
     yield (
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{EDGE}" fill-opacity=".12" '
         f'stroke="{EDGE}" stroke-opacity=".5"/>'
     )
-    for way in visit.ways:
-        if way.sure:
-            angle = way.bearing + sheet.turns[visits[-1]]
+    step = _visit_of(imported).index(visits[-1])
+    for way in Star.of(imported.trace.steps[step].star or ()).gateways:
+        if way.open:
+            angle = sheet.headings[step] - math.radians(way.bearing)
             cos, sin = math.cos(angle), -math.sin(angle)
             ends = [(x + r * cos, y + r * sin) for r in (radius - 3, radius + 4)]
             yield f'<path d="{_line(ends)}" stroke="#222" stroke-width="2.5" fill="none"/>'
@@ -378,24 +379,36 @@ def _pose(row: Array) -> Pose:
 def laid_over(poses: Sequence[Pose], imported: Imported, ssh_map: SSHMap | None) -> list[Pose]:
     """Move the poses of each drive into the frame of the first one, by the places that they share.
 
-    Without a map, no places are shared.
+    At its first step, a drive faces along x, unless it is laid over others. Without a map, no
+    places are shared.
     """
     drives = drives_of(imported.trace)
     own = [np.array(poses[a:b]) for a, b in pairwise([0, *imported.starts, len(poses)])]
     spots = _spots(poses, imported)
-    laid: dict[int, Array] = {0: own[0]}
-    while len(laid) < len(drives):
-        k, pairs = _next(drives, ssh_map, list(laid))
-        if pairs:
-            move = _fitted(spots, pairs, ssh_map)
-        else:
-            right = max(part[:, 0].max() for part in laid.values()) + ASIDE
-            lowest = min(part[:, 1].min() for part in laid.values())
-            move = (right - own[k][:, 0].min(), lowest - own[k][:, 1].min(), 0.0)
-        laid[k] = np.array([moved(move, pose) for pose in own[k].tolist()])
+
+    def move(k: int, by: Pose) -> None:
+        own[k] = np.array([moved(by, pose) for pose in own[k].tolist()])
         for t in range(drives[k].first, drives[k].stop):
-            spots[t] = moved(move, spots[t])
-    return [(x, y, heading) for k in range(len(drives)) for x, y, heading in laid[k].tolist()]
+            spots[t] = moved(by, spots[t])
+
+    for k, drive in enumerate(drives):
+        move(k, (0.0, 0.0, -spots[drive.first][2]))
+    laid = [0]
+    while len(laid) < len(drives):
+        k, pairs = _next(drives, ssh_map, laid)
+        if pairs:
+            move(k, _fitted(spots, pairs, ssh_map))
+        else:
+            right = max(own[other][:, 0].max() for other in laid) + ASIDE
+            lowest = min(own[other][:, 1].min() for other in laid)
+            move(k, (right - own[k][:, 0].min(), lowest - own[k][:, 1].min(), 0.0))
+        laid.append(k)
+    return [(x, y, heading) for part in own for x, y, heading in part.tolist()]
+
+
+def _visit_of(imported: Imported) -> list[int]:
+    """The visit of each step."""
+    return [int(step.extra["visit"]) for step in imported.trace.steps]
 
 
 def _spots(poses: Sequence[Pose], imported: Imported) -> list[Pose]:
