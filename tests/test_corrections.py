@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -343,6 +344,10 @@ def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixt
         assert main(["correct", maps, "--closed", way]) == 1
         assert "it contradicts the trace: the robot" in capsys.readouterr().err
         assert not file.exists()
+    # A bearing near the way of the robot is this gateway, too.
+    near = Corrections.for_drives(ROUND).with_gateway(False, [("round:1", 172.0)])
+    with pytest.raises(MapError, match="the robot came to round:1 through it"):
+        near.corrected(ROUND)
     # A file that a person wrote is refused, too.
     save_corrections(Corrections.for_drives(ROUND).with_gateway(False, [("round:1", 180.0)]), file)
     assert main(solving(folder, "round")) == 1
@@ -574,6 +579,27 @@ def test_north_in_a_correction_is_north_of_the_drawing(
     ):
         assert main(["correct", maps, "--open", wrong]) == 1
         assert told in capsys.readouterr().err
+
+
+def test_gateway_is_corrected_at_all_dstates_of_a_place_without_stars(tmp_path: Path) -> None:
+    """The robot comes from the west, turns left, goes north, and comes back."""
+    quarter = math.pi / 2
+    moves = [(5.0, 0.0, 0.0), (0.0, 0.0, quarter), (5.0, 0.0, 0.0), (0.0, 0.0, math.pi)]
+    trace = Trace.from_steps(
+        "abcdef",
+        ["travel", "left", "travel", "around", "travel"],
+        displacements=[*moves, (5.0, 0.0, 0.0)],
+        stars=[(0.0, 180.0)] * 6,
+        name="round",
+    )
+    trace.save(tmp_path / "round.jsonl")
+    maps = str(tmp_path / "maps.json")
+    main(["solve", str(tmp_path / "round.jsonl"), "--set", "star=none", "-o", maps])
+    assert main(["correct", maps, "--open", "round:1 90"]) == 0
+    (said,) = load_corrections(tmp_path).gateways
+    ssh_map = Solution.load(maps).maps[0]
+    assert ssh_map.place_of(1) == ssh_map.place_of(2) == ssh_map.place_of(5)
+    assert dict(said.seen) == {"round:1": 90.0, "round:2": 180.0, "round:5": 0.0}
 
 
 def test_correction_can_leave_a_star_without_gateways() -> None:

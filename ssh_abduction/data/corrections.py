@@ -31,7 +31,7 @@ from ssh_abduction.data.errors import MapError, TraceError, brief, is_writable
 from ssh_abduction.data.map_parts import NAMED, Name, thing_named
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.regions import region_of
-from ssh_abduction.data.star import star_to_json, with_gateway
+from ssh_abduction.data.star import near_quarter, star_to_json, with_gateway
 from ssh_abduction.data.trace import Trace, checked_trace
 
 FORMAT, VERSION = "ssh-corrections", 1
@@ -381,9 +381,9 @@ class Corrections:
         if said.is_open:
             return
         action, before = trace.steps[t].action, trace.steps[t - 1].action if t else None
-        if way == 0 and action is not None and action.kind == "travel":
+        if near_quarter(way) == 0 and action is not None and action.kind == "travel":
             raise self._contradicted(said, f"the robot left {name} through it; say it is open")
-        if way == 180 and before is not None and before.kind == "travel":
+        if near_quarter(way) == 2 and before is not None and before.kind == "travel":
             raise self._contradicted(said, f"the robot came to {name} through it; say it is open")
 
 
