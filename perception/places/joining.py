@@ -128,7 +128,7 @@ def _joint_track(tracks: Sequence[Track], begins: Sequence[int]) -> tuple[Track,
         np.concatenate([track.shares for track in tracks]),
         joint([track.cuts for track in tracks]),
         joint([track.breaks for track in tracks]),
-        all(track.is_reliable for track in tracks),
+        is_reliable=all(track.is_reliable for track in tracks),
     ), shifts
 
 
