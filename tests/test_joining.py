@@ -24,7 +24,7 @@ from ssh_abduction.solver.costs.estimating import doubt_of, may_join_more, rival
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.weighing import Weighing
 from ssh_abduction.solver.guesses.joint_maps import Joining
-from ssh_abduction.solver.guesses.separations import Separations
+from ssh_abduction.solver.guesses.kept_apart import KeptApart
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.weighed import groups_of_drives
@@ -204,11 +204,11 @@ def test_near_places_between_which_the_robot_travels_stay_two_in_a_joint_map() -
     assert best.labels == (0, 1, 2, 3, 4, 5, 6, 7, 1, 2, 3, 4, 5, 6, 7)
 
 
-def test_separations_hold_for_all_that_is_merged() -> None:
-    apart = Separations({0: 0, 1: 1, 2: 2, 4: 3}, [(0, 2), (0, 3)])  # step 3 has no number
-    assert apart.separate([0, 1, 1, 3], 0, 1)
-    assert apart.separate([0, 1, 1, 3], 1, 0)
-    assert not apart.separate([0, 1, 1, 3], 0, 3)
+def test_kept_apart_holds_for_all_that_is_merged() -> None:
+    apart = KeptApart({0: 0, 1: 1, 2: 2, 4: 3}, [(0, 2), (0, 3)])  # step 3 has no number
+    assert apart.includes([0, 1, 1, 3], 0, 1)
+    assert apart.includes([0, 1, 1, 3], 1, 0)
+    assert not apart.includes([0, 1, 1, 3], 0, 3)
 
 
 def test_drives_without_common_views_are_not_joined() -> None:

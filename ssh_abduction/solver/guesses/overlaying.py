@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.geometry.equations import spreads_of
+from ssh_abduction.solver.guesses.kept_apart import KeptApart
 from ssh_abduction.solver.guesses.reckoning import BLUR, Hypothesis, conditioned
-from ssh_abduction.solver.guesses.separations import Separations
 from ssh_abduction.solver.guesses.sights import Sight, Sights
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
@@ -216,8 +216,8 @@ class Overlay:
             frozenset(both.places[s] for s in both.kept),
         )
         at = {t: both.places[s] for t, s in both.labels.items()}
-        self._dstates_apart = Separations.of_dstates(problem, both.labels)
-        self._places_apart = Separations.of_places(problem, at)
+        self._dstates_apart = KeptApart.of_dstates(problem, both.labels)
+        self._places_apart = KeptApart.of_places(problem, at)
         # The cost of changed gateways if two places are one; inf if they cannot be.
         self._costs = np.full(2 * (len(both.sights),), math.inf)
         for (p, seen), (q, others) in combinations(enumerate(both.sights), 2):
@@ -368,7 +368,7 @@ class Overlay:
             s, x = sorted(state.dstate[i] for i in pairs.pop())
             if s == x:
                 continue
-            if not self._look_alike(s, x) or self._dstates_apart.separate(state.dstate, s, x):
+            if not self._look_alike(s, x) or self._dstates_apart.includes(state.dstate, s, x):
                 raise _ClashError
             state.kept = _merged(state.kept, s, x)
             for action, there in state.links[x].items():
@@ -390,7 +390,7 @@ class Overlay:
         """Merge two places, and perhaps two headings there. Raises _ClashError."""
         state, position = self._state, self._both.position
         changes = self._sights.merged(state.sights[p], state.sights[q])
-        if math.isinf(changes) or self._places_apart.separate(state.place, p, q):
+        if math.isinf(changes) or self._places_apart.includes(state.place, p, q):
             raise _ClashError
         if heading is None and not self._may_face(p, q):
             raise _ClashError

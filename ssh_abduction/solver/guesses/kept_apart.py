@@ -10,7 +10,7 @@ from ssh_abduction.theory.pairs import pairs_in
 from ssh_abduction.theory.settle import Problem
 
 
-class Separations:
+class KeptApart:
     """Pairs of numbers (of dstates or places) of which two steps say that they are not one."""
 
     def __init__(self, labels: Mapping[int, int], pairs: Iterable[tuple[int, int]]) -> None:
@@ -22,12 +22,12 @@ class Separations:
                 self._apart[labels[t], labels[u]] = self._apart[labels[u], labels[t]] = True
 
     @staticmethod
-    def of_dstates(problem: Problem, labels: Mapping[int, int]) -> Separations:
+    def of_dstates(problem: Problem, labels: Mapping[int, int]) -> KeptApart:
         """List the dstates that the evidence about pairs of steps keeps apart."""
-        return Separations(labels, pairs_in(problem.pairs.apart))
+        return KeptApart(labels, pairs_in(problem.pairs.apart))
 
     @staticmethod
-    def of_places(problem: Problem, labels: Mapping[int, int]) -> Separations:
+    def of_places(problem: Problem, labels: Mapping[int, int]) -> KeptApart:
         """List the places that are apart by evidence, or as a travel leads from one to the other.
 
         Travels are ignored if they may stay at a place, or if actions may have slipped.
@@ -36,9 +36,9 @@ class Separations:
         leaves = theory.level == "topological" and "travel_leaves" in theory.hard
         travels = [(t, t + 1) for t, action in actions if action.kind == "travel"]
         known = travels if leaves and not theory.slipped else []
-        return Separations(labels, [*pairs_in(problem.pairs.elsewhere), *known])
+        return KeptApart(labels, [*pairs_in(problem.pairs.elsewhere), *known])
 
-    def separate(self, merged: Sequence[int], first: int, second: int) -> bool:
+    def includes(self, merged: Sequence[int], first: int, second: int) -> bool:
         """Whether any number merged into `first` is apart from any that is merged into `second`.
 
         `merged` has, for each number, the number that it is merged into.
