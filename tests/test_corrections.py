@@ -602,6 +602,19 @@ def test_gateway_is_corrected_at_all_dstates_of_a_place_without_stars(tmp_path: 
     assert dict(said.seen) == {"round:1": 90.0, "round:2": 180.0, "round:5": 0.0}
 
 
+@pytest.mark.parametrize("verb", [["name", "p0", "kitchen"], ["correct", "--open", "p0 north"]])
+def test_file_of_corrections_in_place_of_maps_is_an_error(
+    verb: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(solving(folder, "round")) == 0
+    building = folder / "building"
+    assert main(["name", str(building), "p0", "hall"]) == 0
+    file = building / "corrections.yaml"
+    capsys.readouterr()
+    assert main([verb[0], str(file), *verb[1:]]) == 1
+    assert f"got a file of corrections; name the folder: {building}" in capsys.readouterr().err
+
+
 def test_correction_can_leave_a_star_without_gateways() -> None:
     assert with_gateway((1, None, 0, 0), 90.0, is_open=True) == (1, 1, 0, 0)
     bearings = (0.0, Gateway(120.0, opposite=2), Gateway(240.0, opposite=1))

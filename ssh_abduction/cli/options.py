@@ -370,6 +370,11 @@ def read_maps(file: str, mend: str = "name the maps first, and then the trace") 
     try:
         return read_json(file)
     except MapError:
+        if Path(file).suffix in (".yaml", ".yml"):
+            raise MapError(
+                f"{named(file)}: expected a file of maps or its folder, got a file of corrections; "
+                f"name the folder: {Path(file).parent}"
+            ) from None
         if file == "-" or not _is_trace(file):
             raise
         raise MapError(f"{named(file)}: expected a file of maps, got a trace; {mend}") from None
