@@ -24,36 +24,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ssh_abduction.data.groups import NodeClasses
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
-
-
-class Groups:
-    """Groups of steps, which grow by joining two groups."""
-
-    def __init__(self, steps: int) -> None:
-        self._first = list(range(steps))  # an earlier step of the group; itself for the first one
-
-    def join(self, i: int, j: int) -> bool:
-        """Join the groups of two steps. Return whether they were different groups."""
-        i, j = self.first(i), self.first(j)
-        self._first[max(i, j)] = min(i, j)
-        return i != j
-
-    def first(self, step: int) -> int:
-        """Return the first step of a group."""
-        while (before := self._first[step]) != step:
-            self._first[step] = step = self._first[before]
-        return step
-
-    def numbers(self) -> list[int]:
-        """Return the number of the group of each step. Groups are numbered by their first steps."""
-        number: dict[int, int] = {}
-        return [number.setdefault(self.first(t), len(number)) for t in range(len(self._first))]
 
 
 def has_no_frames(theory: Theory) -> bool:
@@ -67,13 +45,13 @@ def separate_map(trace: Trace, theory: Theory) -> SSHMap | None:
     The caller has to check the map. Returns None if two steps that must share a dstate look
     different, or if a path would be a circle.
     """
-    same = Groups(len(trace))
+    same = NodeClasses[int]()
     for i, j in theory.same:
-        same.join(i, j)
+        same.merge(i, j)
     while True:
         look_at_clock()
         _follow(same, trace)
-        labels = same.numbers()
+        labels = numbered(map(same.of, range(len(trace))))
         if not _look_alike(labels, trace, theory):
             return None
         ssh_map = completed(trace, theory, labels, _places(labels, trace, theory), ())
@@ -81,36 +59,44 @@ def separate_map(trace: Trace, theory: Theory) -> SSHMap | None:
             return ssh_map
 
 
-def _follow(same: Groups, trace: Trace) -> None:
+def _follow(same: NodeClasses[int], trace: Trace) -> None:
     """Join steps to which the same action leads from one dstate."""
     grows = True
     while grows:
         grows, links = False, dict[tuple[int, str], int]()
         for t, action in enumerate(trace.actions):
             if not action.starts:
-                there = links.setdefault((same.first(t), action.name), t + 1)
-                grows = same.join(there, t + 1) or grows
+                there = links.setdefault((same.of(t), action.name), t + 1)
+                grows = _joined(same, there, t + 1) or grows
 
 
-def _join_courses(same: Groups, ssh_map: SSHMap) -> bool:
+def _join_courses(same: NodeClasses[int], ssh_map: SSHMap) -> bool:
     """Join steps at one place that are along one path in one direction. Return whether any were."""
     grows, along = False, dict[tuple[int | None, int, int | None], int]()
     for t, label in enumerate(ssh_map.dstate_at):
         s = ssh_map.dstates[label]
         if s.path is not None:
-            grows = same.join(along.setdefault((s.place, s.path, s.direction), t), t) or grows
+            first = along.setdefault((s.place, s.path, s.direction), t)
+            grows = _joined(same, first, t) or grows
     return grows
+
+
+def _joined(same: NodeClasses[int], i: int, j: int) -> bool:
+    """Join two steps. Return whether they were apart."""
+    were_apart = not same.are_one(i, j)
+    same.merge(i, j)
+    return were_apart
 
 
 def _places(labels: Sequence[int], trace: Trace, theory: Theory) -> list[int]:
     """Number the place of each dstate: turns stay at their place, and so do asserted steps."""
-    place = Groups(max(labels) + 1)
+    place = NodeClasses[int]()
     for i, j in theory.same_place:
-        place.join(labels[i], labels[j])
+        place.merge(labels[i], labels[j])
     for here, action, there in zip(labels, trace.actions, labels[1:], strict=False):
         if action.turn is not None and not action.unlinked:
-            place.join(here, there)
-    return place.numbers()
+            place.merge(here, there)
+    return numbered(map(place.of, range(max(labels) + 1)))
 
 
 def _look_alike(labels: Sequence[int], trace: Trace, theory: Theory) -> bool:
