@@ -116,9 +116,7 @@ class Joining:
         starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
         joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
         best = min(joined, key=self._nats_of, default=alone)
-        # Without stars, so many ways to join maps would make some look good by chance.
-        has_stars = self._bare.star != "none"
-        others = {part: rest for part, *rest in found} if has_stars else {}
+        others = {part: rest for part, *rest in found}
         while mended := [*self._joined_by_others(best, others)]:
             best = min(mended, key=self._nats_of)
         if len(best) < len(alone):
@@ -169,7 +167,11 @@ class Joining:
             yield ssh_map
 
     def _alone(self, drive: Drive) -> list[Part]:
-        """Map a drive alone. Return its cheapest maps, the best first; none if none is found."""
+        """Map a drive alone. Return its cheapest maps, the best first; none if none is found.
+
+        Without stars there is one, as so many ways to join maps would make some look good by
+        chance.
+        """
         trace = self._problem.trace[drive.first : drive.stop]
         theory = self._problem.theory.of_steps(drive.first, len(trace))
         theory = replace(theory, several_drives=False, changed=0.0)
@@ -177,7 +179,7 @@ class Joining:
         beam = Beam(problem, Log(trace, theory, problem.pairs), ALONE)
         if next(beam.maps(), None) is None:
             return []
-        found = beam.hypotheses[: 1 + OTHERS]
+        found = beam.hypotheses[: 1 if theory.star == "none" else 1 + OTHERS]
         if beam.refuses:
             self.broken += found[0].nats - beam.nats_without_axioms()
         return [Part.of(one, drive.first, self._log, self.sights) for one in found]

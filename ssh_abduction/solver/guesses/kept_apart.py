@@ -11,7 +11,7 @@ from ssh_abduction.theory.settle import Problem
 
 
 class KeptApart:
-    """Pairs of numbers (of dstates or places) of which two steps say that they are not one."""
+    """The dstates (or the places) of a map that are two, because two of their steps are apart."""
 
     def __init__(self, labels: Mapping[int, int], pairs: Iterable[tuple[int, int]]) -> None:
         """Read pairs of steps that are apart. `labels` numbers steps; other steps are left out."""
