@@ -257,5 +257,13 @@ def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
     # An error of an increment rotates and shifts all later poses. The point moves as the end of an
     # arm that begins there.
     first, last = min(first, last), max(first, last)
+    return at_end(end, track.spread(last) - track.spread(first))
+
+
+def at_end(end: Array, covariance: Array) -> Array:
+    """Compute the covariance, (3, 3), of the end of an arm from that of its beginning.
+
+    The rotation at the beginning moves the end, which is at (x, y) metres from there.
+    """
     arm = np.array([[1.0, 0.0, -end[1]], [0.0, 1.0, end[0]], [0.0, 0.0, 1.0]])
-    return np.asarray(arm @ (track.spread(last) - track.spread(first)) @ arm.T)
+    return np.asarray(arm @ covariance @ arm.T)

@@ -18,8 +18,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from perception.places.closures import GATE, INFLATED, NOISE, VisitMatch, uncertainty
-from perception.places.track import Array, Track, points_turned, wrapped
+from perception.places.closures import GATE, INFLATED, NOISE, VisitMatch, at_end, uncertainty
+from perception.places.track import Array, Track, covariance_turned, points_turned, wrapped
 from perception.places.visits import Visit
 
 # Two closures are compared if their loop has less than this many metres of the track.
@@ -72,12 +72,9 @@ class _ClosureLoops:
         off = np.array([*(here + onward - other.match.shift), wrapped(turn - other.match.turn)])
         first = self._spread(other.first, one.first, at[other.first] + here + onward)
         last = self._spread(one.last, other.last, at[other.last])
-        cos, sin = math.cos(turn), math.sin(turn)
-        turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         # The error of the rotation of the first match moves the end of the second stretch.
-        arm = np.array([[1.0, 0.0, -onward[1]], [0.0, 1.0, onward[0]], [0.0, 0.0, 1.0]])
         noise = np.diag(NOISE) ** 2
-        spread = first + turned @ last @ turned.T + noise + arm @ noise @ arm.T
+        spread = first + covariance_turned(turn, last) + noise + at_end(onward, noise)
         return float(off @ np.linalg.solve(spread, off))
 
     def _spread(self, first: int, last: int, end: Array) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 
 from perception.places.closures import NOISE, VisitMatch, uncertainty
 from perception.places.local_map import CELL, PackedPatch
-from perception.places.track import Array, Track, points_turned, rotation, wrapped
+from perception.places.track import Array, Track, covariance_turned, points_turned, wrapped
 from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.closure import Closure
@@ -217,10 +217,7 @@ def _millimetres(metres: float) -> float:
 def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> Covariance:
     """The covariance of the displacement between two steps, in the frame of the first step."""
     total = uncertainty(track, begin, end, np.array(last[:2]))
-    turned = np.eye(3)
-    turned[:2, :2] = rotation(-first[2])
-    found = turned @ total @ turned.T
-    found += np.diag(FLOOR) ** 2
+    found = covariance_turned(-first[2], total) + np.diag(FLOOR) ** 2
     found = (found + found.T) / 2
     return tuple(tuple(round(float(v), 8) for v in row) for row in found)  # type: ignore[return-value]
 

@@ -122,6 +122,13 @@ def rotation(angle: float) -> Array:
     return np.array([[cos, -sin], [sin, cos]])
 
 
+def covariance_turned(angle: float, covariance: Array) -> Array:
+    """Rotate the covariance, (3, 3), of x, y and a heading counterclockwise by an angle."""
+    turned = np.eye(3)
+    turned[:2, :2] = rotation(angle)
+    return np.asarray(turned @ covariance @ turned.T)
+
+
 def points_turned(angle: float, points: Array) -> Array:
     """Rotate points or directions, (n, 2), counterclockwise by an angle in radians."""
     return np.asarray(points @ rotation(angle).T)
