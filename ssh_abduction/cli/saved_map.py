@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from ssh_abduction.cli.options import maps_path, read_maps, trace_beside, trace_of_maps
@@ -205,11 +206,9 @@ class SavedMap:
             for s in self.map.dstates
             if s.place == here.place and s.heading is not None and here.heading is not None
         }
-        if not ways and self.map.fit:  # as in maps of logs
-            drawn = self._drawn(here.place)
-            ways = {
-                s: round(way + drawn[s] - drawn[label]) % 360.0 for s in drawn if label in drawn
-            }
+        drawn = self._drawn(here.place) if self.map.fit and not ways else {}
+        if label in drawn:  # as in maps of logs
+            ways = {s: round(way + drawn[s] - drawn[label]) % 360.0 for s in drawn}
         ways = ways or {label: way}
         return tuple(
             (step_name(self.drives, t), ways[s])
@@ -219,14 +218,20 @@ class SavedMap:
 
     def _drawn(self, place: int | None) -> dict[int, float]:
         """The drawn headings of the dstates at a place, in degrees counterclockwise from east."""
-        from ssh_abduction.output.layout import layout  # loads scipy
-
-        drawn = layout(self.map).dstates
         return {
             s.id: math.degrees(heading)
             for s in self.map.dstates
-            if s.place == place and place is not None and (heading := drawn[s.id][2]) is not None
+            if s.place == place
+            and place is not None
+            and (heading := self._layout[s.id][2]) is not None
         }
+
+    @cached_property
+    def _layout(self) -> Sequence[tuple[float, float, float | None]]:
+        """The position and heading of each dstate as it is drawn."""
+        from ssh_abduction.output.layout import layout  # loads scipy
+
+        return layout(self.map).dstates
 
     def _rounded(self, degrees: float, text: str) -> float:
         """Round a direction to whole degrees or, if stars have four directions, to one of these."""

@@ -184,8 +184,7 @@ class _Picture:
                 dotted = {"stroke_dasharray": "2 5", "opacity": 0.7}
                 orders.append(_line(spots[p], spots[q], colour, 2 * u, **dotted))
             for p, q in travelled(self.map, path):
-                broad = {"stroke_linecap": "round", "opacity": 0.4}
-                travels.append(_line(spots[p], spots[q], colour, 8 * u, **broad))
+                travels.append(self.broad(spots[p], spots[q], colour))
         return orders + travels
 
     def edges(self, spots: Mapping[int, Point]) -> list[str]:
@@ -193,11 +192,11 @@ class _Picture:
         pairs = {
             tuple(sorted(_site(self.map.dstates[s]) for s in ends)) for ends in link_names(self.map)
         }
-        style = {"stroke_linecap": "round", "opacity": 0.4}
-        colour, width = COLOURS[0], 8 * self.unit
-        return [
-            _line(spots[p], spots[q], colour, width, **style) for p, q in sorted(pairs) if p != q
-        ]
+        return [self.broad(spots[p], spots[q], COLOURS[0]) for p, q in sorted(pairs) if p != q]
+
+    def broad(self, start: Point, end: Point, colour: str) -> str:
+        """Draw a broad line where the robot travelled."""
+        return _line(start, end, colour, 8 * self.unit, stroke_linecap="round", opacity=0.4)
 
     def curves(self) -> list[tuple[Point, Point, Point, str]]:
         """Find the curve (start, bend, end, actions) of each link, for a map without places."""

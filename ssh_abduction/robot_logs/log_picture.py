@@ -225,7 +225,8 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
         if place in hidden:
             yield _dot(at[place], 4, EDGE, ssh_map.called("place", place))
     for place in shown:
-        yield from _place(sheet, imported, at[place], visits[place])
+        step = visit_of.index(visits[place][-1])
+        yield from _place(sheet, imported, at[place], step)
     # Numbers and names come last, so that nothing covers them.
     for place in shown:
         yield from _number(at[place], str(place), doubts.get(place))
@@ -301,16 +302,16 @@ def drawn_once(courses: Sequence[Array]) -> Iterator[Array]:
         drawn = np.concatenate([drawn, *parts])
 
 
-def _place(sheet: _Sheet, imported: Imported, at: Point, visits: Sequence[int]) -> Iterator[str]:
-    """Draw the disc of a place, and a tick for each open gateway at its last visit."""
-    radius = max(imported.visits[visits[-1]].radius * sheet.unit, 11.0)
+def _place(sheet: _Sheet, imported: Imported, at: Point, step: int) -> Iterator[str]:
+    """Draw the disc of a place, and a tick for each open gateway, both by the visit of a step."""
+    seen = imported.trace.steps[step]
+    radius = max(imported.visits[int(seen.extra["visit"])].radius * sheet.unit, 11.0)
     x, y = at
     yield (
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{EDGE}" fill-opacity=".12" '
         f'stroke="{EDGE}" stroke-opacity=".5"/>'
     )
-    step = _visit_of(imported).index(visits[-1])
-    for way in Star.of(imported.trace.steps[step].star or ()).gateways:
+    for way in Star.of(seen.star or ()).gateways:
         if way.open:
             angle = sheet.headings[step] - math.radians(way.bearing)
             cos, sin = math.cos(angle), -math.sin(angle)
