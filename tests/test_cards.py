@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,9 +98,11 @@ def test_card_of_an_unknown_answer_shows_the_map_of_a_prefix() -> None:
     text = shown(search.solution())[1]
     assert text.startswith("unknown: no map of 23 steps yet")
     assert "the best map of the first 10 steps:" in text
-    tree, text = shown(Search(ACES).solution())
-    assert text.startswith("unknown: no map of 23 steps yet")
-    assert not list(tree.iter(f"{SVG}svg"))
+    unknown = Search(ACES).solution()
+    for stopped, said in ((None, "unknown:"), ("time limit", "unknown (time limit):")):
+        tree, text = shown(replace(unknown, stopped=stopped))
+        assert text.startswith(f"{said} no map of 23 steps yet")
+        assert not list(tree.iter(f"{SVG}svg"))
 
 
 def test_card_of_a_solution_starts_no_search(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -573,7 +573,11 @@ def test_north_in_a_correction_is_north_of_the_drawing(
     for wrong, told in (
         ("p0", "expected a place and a direction"),
         ("p9 north", "expected a place of the map"),
-        ("p0 up", "northwest, west, southwest, south, southeast after a place, got 'up'; take"),
+        (
+            "p0 up",
+            "expected east, northeast, north, northwest, west, southwest, south, southeast after a "
+            "place, got 'up'; take one",
+        ),
         ("p0 left", "or name a step, such as 'round:0 left'"),
         ("round:0 up", "expected ahead, right, back, left"),
     ):

@@ -17,14 +17,14 @@ from coarse import every_second_beam
 from perception.errors import LogError
 from perception.places.importing import Imported, import_log
 from perception.places.joining import closures_between, join_logs, scenes_of
-from perception.readers.scans import RobotLog
+from perception.readers.scans import Pose, RobotLog
 from perception.readers.writers import write_carmen
 from simulator.tours import record
 from simulator.world import World
 from ssh_abduction.cli import main
 from ssh_abduction.cli.run_folders import digest, distinct
 from ssh_abduction.cli.simulate import scans_of
-from ssh_abduction.data import Trace, drives_of, together
+from ssh_abduction.data import SSHMap, Trace, drives_of, together
 from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.evaluation import evaluate_visits
@@ -204,12 +204,19 @@ def test_map_together_obeys_corrections(
     assert capsys.readouterr().out.count("expected no corrections, got") == 2
 
 
-def test_joint_track_lays_drives_over_each_other(
+@pytest.fixture
+def mapped(
     joint: tuple[RobotLog, Imported, list[Imported]], folder: Path
+) -> tuple[Imported, list[Pose], SSHMap]:
+    """The import of both drives, the poses of its track, and the map."""
+    track = [tuple(pose) for pose in joint[1].track.poses.tolist()]
+    return joint[1], track, Solution.load(folder / "maps.json").maps[0]
+
+
+def test_joint_track_lays_drives_over_each_other(
+    mapped: tuple[Imported, list[Pose], SSHMap],
 ) -> None:
-    log, imported, _ = joint
-    ssh_map = Solution.load(folder / "maps.json").maps[0]
-    track = [tuple(pose) for pose in imported.track.poses.tolist()]
+    imported, track, ssh_map = mapped
     (start,) = imported.starts
     shared = range(start - 2 * SHARED, start)
     twins = [(scan, scan + 2 * SHARED) for scan in shared]  # each scan is in both drives
@@ -221,7 +228,7 @@ def test_joint_track_lays_drives_over_each_other(
     laid = laid_over(track, imported, ssh_map)
     assert apart(laid) < 0.5
     # The drives keep their shapes.
-    for first, last in ((0, start - 1), (start, len(log) - 1)):
+    for first, last in ((0, start - 1), (start, len(track) - 1)):
         np.testing.assert_allclose(
             displacement_between(laid[first], laid[last]),
             displacement_between(track[first], track[last]),
@@ -233,15 +240,13 @@ def test_joint_track_lays_drives_over_each_other(
 
 
 def test_report_turns_drives_as_the_drawing_of_the_map_does(
-    joint: tuple[RobotLog, Imported, list[Imported]], folder: Path
+    mapped: tuple[Imported, list[Pose], SSHMap],
 ) -> None:
-    log, imported, _ = joint
-    ssh_map = Solution.load(folder / "maps.json").maps[0]
-    poses = [tuple(pose) for pose in imported.track.poses.tolist()]
-    turned = [moved((3.0, -7.0, 1.2), pose) for pose in poses]
-    laid = laid_over(poses, imported, ssh_map)
+    imported, track, ssh_map = mapped
+    turned = [moved((3.0, -7.0, 1.2), pose) for pose in track]
+    laid = laid_over(track, imported, ssh_map)
     off = np.subtract(laid, laid_over(turned, imported, ssh_map))
-    np.testing.assert_allclose(off[:, :2], np.broadcast_to(off[0, :2], (len(log), 2)), atol=1e-6)
+    np.testing.assert_allclose(off[:, :2], np.broadcast_to(off[0, :2], (len(track), 2)), atol=1e-6)
     drawn = layout(ssh_map).places
     first, far = ssh_map.place_of(0), max(drawn, key=lambda p: math.dist(drawn[p], (0.0, 0.0)))
     ends = []
