@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 from pathlib import Path
 from typing import BinaryIO
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import PerceptionError
+from ssh_abduction.data.files import save_file
+from ssh_abduction.data.sidecar import images_file
 from ssh_abduction.data.trace import Trace
 
 # Limit in bytes of an unpacked file, since a small archive may unpack to more than the memory.
@@ -67,14 +70,25 @@ def images_held(trace: Trace) -> list[NDArray[np.float64] | None]:
     return rows
 
 
+def save_images(path: Path, images: NDArray[np.float64]) -> None:
+    """Write images, (n, d), to a sidecar file, an .npz archive. Raises PerceptionError.
+
+    Whole numbers from 0 to 255, such as those of a camera, are stored as bytes.
+    """
+    pixels = images.astype(np.uint8)
+    packed = io.BytesIO()
+    np.savez_compressed(packed, images=pixels if np.array_equal(pixels, images) else images)
+    save_file(path, packed.getvalue(), "images", PerceptionError)
+
+
 def _sidecar(trace: Trace) -> NDArray[np.float64]:
     """Read the images in the sidecar file of a trace, (m, d). Raises PerceptionError."""
-    if trace.images is None:
+    path = images_file(trace)
+    if path is None:
         raise PerceptionError(
             f"{trace.at(0)}: image: expected the header to name a file of images for the "
             "indices, got none; add images"
         )
-    path = Path(trace.source or ".").parent / trace.images
     try:
         # numpy leaves a damaged file open, so open it here.
         with path.open("rb") as file:

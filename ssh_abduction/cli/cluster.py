@@ -1,24 +1,31 @@
-"""ssh-abduction cluster TRACE: cluster images into views."""
+"""ssh-abduction cluster TRACE…: cluster images into views."""
 
 from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ssh_abduction.cli.options import add_output, check_picture, picture_file, seed, write
+from ssh_abduction.cli.options import check_picture, output, picture_file, seed, write
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
+from ssh_abduction.cli.run_folders import check_folder
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.data.errors import AbductionError
+from ssh_abduction.data.errors import AbductionError, named
+from ssh_abduction.data.sidecar import with_images_named_from
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.learning.runner_up import SECONDS, runner_up, second_map, with_runner_up
+from ssh_abduction.learning.runner_up import SECONDS, runner_up, second_map
 from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory
+
+if TYPE_CHECKING:
+    from ssh_abduction.learning.traces import Traces
+
+IMAGES = "images.npz"  # the common sidecar file of traces that are clustered together
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -26,13 +33,24 @@ def add_parser(verbs: Verbs) -> None:
         "cluster",
         run,
         "cluster images into views",
-        "Cluster the images of a trace into views, and write the trace with its views. The number "
+        "Cluster the images of a trace into views, and write the trace with its views. With "
+        "--together, cluster the images of several traces as one table, so that a view means the "
+        "same in all of them. The number "
         "of views k is chosen by M, the smallest distance between clusters divided by the largest "
         "distance within a cluster: the largest M wins. If another number of views is about as "
         "good, the trace also keeps those views, and a warning says whether they give another map.",
     )
-    parser.add("trace", "trace file with images, or - for standard input")
-    add_output(parser)
+    parser.add(
+        "traces", "trace file with images, or - for standard input", nargs="+", metavar="trace"
+    )
+    parser.add("--together", "the traces are drives through one building: give them common views")
+    parser.add(
+        "-o --output FILE",
+        "trace file to write, or - for standard output; with --together, the folder to write, "
+        "where each trace keeps its file name",
+        type=output,
+        required=True,
+    )
     parser.add(
         "--k K",
         "number of views (default: the number that the measure M of the paper rates best)",
@@ -56,38 +74,33 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from perception.appearance import features_of
     from perception.confidence import warn_of_doubts
-    from perception.images import images_of
     from perception.quality import uncertainty_coefficient
     from perception.views import ViewClusterer
+    from ssh_abduction.learning.traces import Traces
 
     check_picture(options.plot)
-    trace = Trace.load(options.trace)
-    logged, features = images_of(trace), features_of(trace)
+    files = _files(options)
+    traces = Traces(tuple(Trace.load(file) for file in files))
+    sources = ", ".join(named(file) for file in files)
+    logged, features = traces.images, traces.features
     try:
         images = features.fit_transform(logged)
         clusterer = ViewClusterer(
             k=options.k, k_max=options.k_max, random_state=options.seed, by=options.by
         ).fit(images)
     except AbductionError as error:
-        raise AbductionError(f"{options.trace}: {error}") from None
+        raise AbductionError(f"{sources}: {error}") from None
     except ValueError as error:  # the message of scikit-learn says why it cannot cluster them
         raise AbductionError(
-            f"{options.trace}: images: {error}; log more images, or different ones"
+            f"{sources}: images: {error}; log more images, or different ones"
         ) from None
-    truth = true_dstate_names(trace)
+    truth = true_dstate_names(traces.each)
     by_k = {} if truth is None else clusterer.labels_by_k_
     uncertainty = {k: uncertainty_coefficient(labels, truth or ()) for k, labels in by_k.items()}
-    beside = trace.images and os.path.relpath(
-        Path(trace.source or ".").parent / trace.images, Path(options.output).parent
+    clustered = traces.with_views(
+        images, clusterer.labels_, clusterer.runner_up_labels_, clusterer.confidence_
     )
-    other = clusterer.runner_up_labels_
-    clustered = replace(
-        trace.with_views(clusterer.labels_.tolist(), clusterer.confidence_.round(4).tolist()),
-        images=beside,
-    )
-    clustered = with_runner_up(clustered, None if other is None else other.tolist())
     columns = {"M": clusterer.quality_, "trimmed": clusterer.trimmed_}
     columns |= {"U": uncertainty} if uncertainty else {}
     words = {clusterer.k_: "chosen", clusterer.runner_up_: "runner-up"}
@@ -101,7 +114,7 @@ def run(options: argparse.Namespace) -> int:
     ]
     chosen = table(["k", *columns, ""], rows)
     said = f"{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}"
-    write(clustered, options.output, f"{chosen}\n{said}")
+    _write(clustered, files, options, f"{chosen}\n{said}")
     warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
     warn(runner_up_doubts(clustered))
     if options.plot:
@@ -112,25 +125,75 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def runner_up_doubts(trace: Trace) -> list[str]:
+def _files(options: argparse.Namespace) -> dict[str, str]:
+    """Return the file to write for each file to read. Raise AbductionError if two are the same."""
+    if not options.together:
+        if len(options.traces) > 1:
+            raise AbductionError(
+                "traces: expected one trace, or --together, got several; add --together if their "
+                "views shall have the same meaning, or cluster each alone"
+            )
+        return {options.traces[0]: options.output}
+    if "-" in [*options.traces, options.output]:
+        raise AbductionError(
+            "--together: expected files to read and a folder to write, got -; name them"
+        )
+    folder = Path(options.output)
+    check_folder(folder)
+    files: dict[str, str] = {}
+    for file in options.traces:
+        target = str(folder / Path(file).name)
+        if target in files.values():
+            raise AbductionError(
+                f"{named(file)}: expected traces with different file names, as each is written to "
+                f"{named(options.output)} under its name, got two; rename one of them"
+            )
+        files[file] = target
+    return files
+
+
+def _write(traces: Traces, files: dict[str, str], options: argparse.Namespace, said: str) -> None:
+    """Write each trace to its file, and print a message.
+
+    With --together, images in sidecar files go to one file, so that the traces can be joined.
+    """
+    if not options.together:
+        (trace,) = traces.each
+        write(with_images_named_from(trace, Path(options.output).parent), options.output, said)
+        return
+    from perception.images import save_images
+
+    folder = Path(options.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(trace.images for trace in traces.each):
+        save_images(folder / IMAGES, traces.images)
+        traces = traces.with_images_in(IMAGES)
+    for trace, target in zip(traces.each, files.values(), strict=True):
+        trace.save(target)
+    print(f"{said} in {named(options.output)}")
+
+
+def runner_up_doubts(traces: Traces) -> list[str]:
     """Return a warning if the second best number of views (the runner-up) gives another map.
 
     The theory is the topological one, or the causal one if some action is of unknown kind.
     Without a reason to warn, the list is empty.
     """
-    theory = (
-        Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()
-    )
     found = None
-    with suppress(AbductionError):  # the trace lacks what the theory needs; `solve` reports that
+    with suppress(AbductionError):  # the traces lack what the theory needs; `solve` reports that
+        trace = traces.joint
+        known = all(action.kind for action in trace.actions)
+        theory = Theory.topological() if known else Theory.causal()
         if runner_up(trace):
             found = second_map(trace, solve(trace, theory, time_limit=SECONDS).maps, theory)
     return [found.sentence] if found else []
 
 
-def true_dstate_names(trace: Trace) -> list[str] | None:
+def true_dstate_names(traces: Sequence[Trace]) -> list[str] | None:
     """The name of the true dstate of each step; None if some step has none."""
     found = [
-        step.truth.get("dstate") if isinstance(step.truth, dict) else None for step in trace.steps
+        step.truth.get("dstate") if isinstance(step.truth, dict) else None
+        for trace in traces
+        for step in trace.steps
     ]
     return [str(name) for name in found] if all(name is not None for name in found) else None

@@ -286,17 +286,12 @@ def _camera(options: argparse.Namespace) -> Camera | None:
 
 def _with_table(trace: Trace, target: str) -> Trace:
     """Move the panoramas of a trace to an .npz file beside it. Images are then indices into it."""
-    import io
     from dataclasses import replace
     from pathlib import Path
 
-    import numpy as np
-
-    from ssh_abduction.data.files import save_file
+    from perception.images import images_of, save_images
 
     path = Path(target).with_suffix(".npz")
-    packed = io.BytesIO()
-    np.savez_compressed(packed, images=np.array([step.image for step in trace.steps], np.uint8))
-    save_file(path, packed.getvalue(), "images", AbductionError)
+    save_images(path, images_of(trace))
     steps = tuple(replace(step, image=i) for i, step in enumerate(trace.steps))
     return replace(trace, steps=steps, images=path.name)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli.guard import Guard
@@ -46,6 +47,7 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.floors import floors_in_words
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.sidecar import with_images_named_from
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.loggers import PROGRESS
@@ -170,7 +172,8 @@ def run(options: argparse.Namespace) -> int:
         )
     trace = _joint(options.traces) if options.together else Trace.load(options.traces[0])
     if options.joint_trace is not None:
-        trace.save(options.joint_trace)
+        folder = Path(options.joint_trace).parent
+        with_images_named_from(trace, folder).save(options.joint_trace)
     return _solve(options, trace)
 
 

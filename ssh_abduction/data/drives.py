@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -32,6 +33,7 @@ from ssh_abduction.data.errors import TraceError, brief
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.sidecar import images_file
 from ssh_abduction.data.star import is_four
 from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace, checked_trace
@@ -277,7 +279,7 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
     return Trace(
         tuple(steps),
         name=" + ".join(called),
-        images=next((trace.images for trace in parts if trace.images), None),
+        images=next((images for trace in parts if (images := _sidecar(trace))), None),
         odometry=next((trace.odometry for trace in parts if trace.odometry), None),
         drive=called[0],
         closures=tuple(closures),
@@ -468,8 +470,9 @@ def _header(name: str) -> Callable[[Trace], object]:
 
 
 def _sidecar(trace: Trace) -> str | None:
-    """The file that images are in, if the steps name them by numbers."""
-    return trace.images if any(isinstance(step.image, int) for step in trace.steps) else None
+    """The file that images are in, from the working folder, if the steps name them by numbers."""
+    path = images_file(trace) if any(isinstance(s.image, int) for s in trace.steps) else None
+    return None if path is None else os.path.relpath(path)
 
 
 # What all traces must have alike: its name, a function that reads it (None if a trace does not
@@ -478,7 +481,7 @@ _RECORDED: tuple[tuple[str, Callable[[Trace], object], str], ...] = (
     ("star", _stars, "record stars in one way, or leave them out (Trace.without_stars)"),
     ("displacement", _displacements, "add them, or leave them out (Trace.without_displacements)"),
     ("odometry", _systematic, "give all traces one odometry"),
-    ("images", _sidecar, "put the images of all traces into one file"),
+    ("images", _sidecar, "put them into one file (the command 'cluster --together' does so)"),
     ("beams", _header("beams"), "take images of one laser"),
     ("panorama", _header("panorama"), "take images of one camera"),
 )

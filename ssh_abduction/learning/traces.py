@@ -16,7 +16,7 @@ from perception.confidence import nearest_views
 from perception.errors import PerceptionError
 from perception.images import images_of
 from ssh_abduction.data.drives import together
-from ssh_abduction.data.errors import TraceError, brief
+from ssh_abduction.data.errors import TraceError, brief, named
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.runner_up import with_runner_up
 
@@ -67,8 +67,8 @@ class Traces:
         for i, table in enumerate(tables):
             if table.shape[1] != tables[0].shape[1]:
                 raise PerceptionError(
-                    f"trace {i}: image: expected {tables[0].shape[1]} ranges, as trace 0 has, "
-                    f"got {table.shape[1]}; take traces of one laser"
+                    f"{self._called(i)}: image: expected {tables[0].shape[1]} ranges, as "
+                    f"{self._called(0)} has, got {table.shape[1]}; take traces of one laser"
                 )
         return np.concatenate(tables)
 
@@ -79,10 +79,14 @@ class Traces:
         for i, kind in enumerate(kinds):
             if (type(kind), kind.get_params()) != (type(kinds[0]), kinds[0].get_params()):
                 raise PerceptionError(
-                    f"trace {i}: image: expected one of the kind that trace 0 has, got {kind}, "
-                    f"not {kinds[0]}; take traces of one sensor"
+                    f"{self._called(i)}: image: expected one of the kind that {self._called(0)} "
+                    f"has, got {kind}, not {kinds[0]}; take traces of one sensor"
                 )
         return kinds[0]
+
+    def _called(self, number: int) -> str:
+        """Return the file of a trace, or its number."""
+        return named(self.each[number].source or "") or f"trace {number}"
 
     @property
     def joint(self) -> Trace:
@@ -100,6 +104,23 @@ class Traces:
     def parts(self, of_all: NDArray[Any]) -> list[NDArray[Any]]:
         """Split an array with one row for each step, (n, …), into one array for each trace."""
         return np.split(of_all, np.cumsum([len(trace) for trace in self.each])[:-1])
+
+    def with_images_in(self, file: str) -> Traces:
+        """Copy these traces, with image i of all n steps in row i of a sidecar file."""
+        rows = self.parts(np.arange(len(self.images)))
+        return Traces(
+            tuple(
+                replace(
+                    trace,
+                    images=file,
+                    steps=tuple(
+                        replace(step, image=int(i))
+                        for step, i in zip(trace.steps, part, strict=True)
+                    ),
+                )
+                for trace, part in zip(self.each, rows, strict=True)
+            )
+        )
 
     def with_views(
         self,
