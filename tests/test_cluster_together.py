@@ -60,10 +60,16 @@ def test_drives_that_are_clustered_together_get_common_views(
     assert len(set(zip(_true_dstates(drives), together, strict=True))) == 8
     for name in NAMES:
         assert main(["cluster", name, "--k", "4", "-o", f"alone-{name}"]) == 0
-    alone = _views(*(f"alone-{name}" for name in NAMES))
-    assert not _agree(together, alone)  # a view of one day is another one on the other day
+    separate = [f"alone-{name}" for name in NAMES]
+    assert not _agree(together, _views(*separate))  # a view is another one on the other day
     capsys.readouterr()
+    assert main(["solve", *separate, "--together"]) == 0
+    assert (
+        "alone-monday.jsonl and alone-tuesday.jsonl seem to have different views of the same names"
+        in capsys.readouterr().err
+    )
     assert main(["solve", *written, "--together", "-o", "maps.json"]) == 0
+    assert "different views" not in capsys.readouterr().err
     (ssh_map,) = Solution.load("maps.json").maps
     assert _agree([label for part in ssh_map.labels for label in part], _true_dstates(drives))
 

@@ -229,7 +229,12 @@ def _joint(paths: Sequence[str]) -> Trace:
     """Load several traces and join them. Print warnings about them on stderr."""
     with warnings.catch_warnings(record=True) as odd:
         warnings.simplefilter("always")
-        trace = together([Trace.load(path) for path in paths])
+        traces = [Trace.load(path) for path in paths]
+        trace = together(traces)
+        if all(step.image is not None for step in trace.steps):
+            from ssh_abduction.learning.traces import Traces  # loads scikit-learn
+
+            Traces(tuple(traces)).warn_of_unrelated_views()
     warn([str(warning.message) for warning in odd])
     return trace
 

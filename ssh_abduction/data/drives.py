@@ -347,7 +347,10 @@ def _warn_of_repeats(traces: Sequence[Trace]) -> None:
 
 
 def _warn_of_other_names(traces: Sequence[Trace]) -> None:
-    """Warn if traces have different names for travels or turns that are alike in all else."""
+    """Warn if traces have different names for travels or turns that are alike in all else.
+
+    A trace with several such names uses them for something, such as the angles of its turns.
+    """
     known: dict[Action, tuple[int, set[str]]] = {}
     for i, trace in enumerate(traces):
         named: dict[Action, set[str]] = {}
@@ -355,7 +358,7 @@ def _warn_of_other_names(traces: Sequence[Trace]) -> None:
             named.setdefault(replace(action, name="?", extra={}), set()).add(action.name)
         for alike, names in named.items():
             first, others = known.setdefault(alike, (i, names))
-            if not names & others:
+            if not names & others and len(names) == len(others) == 1:
                 pair = " and ".join(brief(min(some)) for some in (others, names))
                 warnings.warn(
                     f"action: traces {first + 1} and {i + 1}{_names_of(traces, first, i)} have "

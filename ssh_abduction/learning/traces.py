@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from perception.appearance import features_of
 from perception.confidence import nearest_views
@@ -21,6 +24,9 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.runner_up import with_runner_up
 
 Integers = NDArray[np.intp]
+# Two traces have common views if at least this share of images look most like their own view in
+# the other trace.
+ALIKE = 0.5
 
 
 @dataclass(frozen=True)
@@ -101,6 +107,31 @@ class Traces:
             warnings.filterwarnings("ignore", ".* have the same steps", UserWarning)
             return together(map(_without_images, self.each), names)
 
+    def warn_of_unrelated_views(self) -> None:
+        """Warn of the first two traces in which one name means views that look different.
+
+        The images of each trace are compared with the mean images of the views of the other. If
+        most are nearest to a view of another name, the traces were clustered one by one.
+        Traces without images or views are not compared.
+        """
+        seen = [step for trace in self.each for step in trace.steps]
+        if any(step.image is None or step.view is None for step in seen):
+            return
+        with suppress(PerceptionError):
+            images = self.parts(self.features.fit_transform(self.images))
+            views = [np.array(trace.views, dtype=object) for trace in self.each]
+            for i, j in combinations(range(len(views)), 2):
+                alike = _alike(images[i], views[i], images[j], views[j])
+                if len(alike) and np.mean(alike) < ALIKE:
+                    warnings.warn(
+                        f"views: {self._called(i)} and {self._called(j)} seem to have different "
+                        f"views of the same names: {alike.sum()} of {len(alike)} images look most "
+                        "like the view of the same name in the other trace; cluster the traces "
+                        "with cluster --together, or make the map from logs with map --together",
+                        stacklevel=2,
+                    )
+                    return
+
     def parts(self, of_all: NDArray[Any]) -> list[NDArray[Any]]:
         """Split an array with one row for each step, (n, …), into one array for each trace."""
         return np.split(of_all, np.cumsum([len(trace) for trace in self.each])[:-1])
@@ -148,6 +179,25 @@ class Traces:
         return Traces(
             tuple(with_runner_up(t, other) for t, other in zip(seen, others, strict=True))
         )
+
+
+def _alike(
+    images: NDArray[np.float64],
+    views: NDArray[np.object_],
+    others: NDArray[np.float64],
+    other_views: NDArray[np.object_],
+) -> NDArray[np.bool_]:
+    """For each of `others` with a view that both have: is the nearest view its own view?
+
+    The views are compared by their mean image in `images`.
+    """
+    shared = np.array(sorted({*views} & {*other_views}, key=str), dtype=object)
+    if len(shared) < 2:
+        return np.zeros(0, dtype=bool)
+    means = np.array([images[views == view].mean(axis=0) for view in shared])
+    compared = np.isin(other_views, shared)
+    nearest = cdist(others[compared], means).argmin(axis=1)
+    return np.asarray(shared[nearest] == other_views[compared], dtype=bool)
 
 
 def _without_images(trace: Trace) -> Trace:
