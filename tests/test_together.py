@@ -195,7 +195,7 @@ def test_together_warns_of_other_action_names_and_units() -> None:
     ):
         together([MONDAY, go])
     # The turns of a log are named after their angles.
-    turns = [{"name": f"turn {angle}", "kind": "turn"} for angle in (30, 60, 90)]
+    turns = [Action(f"turn {angle}", "turn", turn="left") for angle in (30, 60, 90)]
     log = Trace.from_steps("aaa", turns[:2], name="log")
     together([log, Trace.from_steps("aa", turns[2:], name="other log")])  # no warning
     millimetres = Trace.from_steps("ab", ["travel"], displacements=[(1000, 0, 0)], name="mm")
