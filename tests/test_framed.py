@@ -195,7 +195,7 @@ def test_framed_mapper_maps_a_maze_step_by_step() -> None:
                 )
                 assert set(answer.maps) == set(expected.maps)
             assert isinstance(mapper._keeper, MapKeeper)
-            search = mapper._keeper.solver.search
+            search = mapper._keeper.search
             engine = search and search._parts.prefixes.engine
             if isinstance(engine, FramedEngine):
                 paths.add((engine._visits.program.batch, len(engine._sides._said)))

@@ -216,7 +216,6 @@ def test_layout_uses_given_poses() -> None:
     assert found.places == {p: (3.0 * p, 0.5) for p in square.places}
     assert found.dstates[3] == (0.0, 0.5, pytest.approx(0.3))
     assert layout(replace(square, fit=Fit(1.0, 1, 0.5))).metric is False
-    assert found.to_dict()["places"][1] == [1, [3.0, 0.5]]
 
 
 def test_layout_places_unconnected_parts_side_by_side() -> None:

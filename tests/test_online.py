@@ -72,7 +72,7 @@ def limit_steps(mapper: OnlineMapper, limit: float | None) -> None:
     """Give each further step this many seconds."""
     keeper = mapper._keeper
     assert isinstance(keeper, MapKeeper)
-    keeper.solver.options = replace(keeper.solver.options, time_limit=limit)
+    keeper._options = replace(keeper._options, time_limit=limit)
 
 
 def sketched(mapper: OnlineMapper) -> SSHMap:
@@ -258,7 +258,8 @@ def test_online_mapper_without_time_has_a_map_and_proves_it_later(data: st.DataO
     for i, answer in enumerate(answers):
         if answer.status is Status.UNSATISFIABLE:  # a short clash is found in no time
             assert (answer.complete, answer.stopped, answer.count) == (True, None, 0)
-            assert solve(trace.prefix(i + 1), theory).status is Status.UNSATISFIABLE
+            part = theory.of_steps(0, i + 1)
+            assert solve(trace.prefix(i + 1), part).status is Status.UNSATISFIABLE
             continue
         assert answer.status in (Status.FEASIBLE, Status.UNKNOWN)
         assert (answer.complete, answer.stopped, answer.count) == (
@@ -269,7 +270,7 @@ def test_online_mapper_without_time_has_a_map_and_proves_it_later(data: st.DataO
         for ssh_map in answer.maps:
             assert check(trace.prefix(i + 1), ssh_map, theory) == ()
     limit_steps(mapper, None)
-    mapper._keeper.solver.make_due()
+    mapper._keeper._next_search = 0
     action = trace.actions[0] if len(trace) > 1 else Action("travel", "travel")
     star = trace.steps[-1].star
     answer = mapper.observe(action, "a", star=star)

@@ -25,7 +25,7 @@ from ssh_abduction.checker.checker import unchecked
 from ssh_abduction.cli import main
 from ssh_abduction.data import TheoryError
 from ssh_abduction.explain.no_map import explain
-from ssh_abduction.online.replay import ReplayedMap
+from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.solver import Search, Status, choosing, prefixes
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
@@ -543,14 +543,14 @@ def follow(mapper: OnlineMapper, views: str) -> None:
 def test_inconsistent_replayed_map_is_an_internal_error() -> None:
     """Replays are checked, too, as long as that takes a tenth of the time at most."""
     mapper = OnlineMapper("a", Theory.causal(), time_limit=None)
-    right = ReplayedMap.map
+    right = ExtendedMap.explained
 
-    def wrong(self: ReplayedMap) -> SSHMap:
+    def wrong(self: ExtendedMap) -> SSHMap:
         found = right(self)
         return replace(found, dstate_at=(0,) * len(found.labels))
 
     with (
-        patch.object(ReplayedMap, "map", wrong),
+        patch.object(ExtendedMap, "explained", wrong),
         pytest.raises(InternalError, match="internal error: a map that was found breaks"),
     ):
         follow(mapper, "bababa")

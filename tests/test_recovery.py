@@ -19,7 +19,7 @@ from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
-from ssh_abduction.online.hypotheses import ExtendedMap, Scale
+from ssh_abduction.online.hypotheses import ExtendedMap, shares_of_rivals
 from ssh_abduction.solver import Status
 from ssh_abduction.theory.rules import Rules
 
@@ -242,13 +242,13 @@ def test_rivals_are_weighed_by_faults_and_assumptions() -> None:
     step = trace.steps[1]
     wrong, slipped, new = lead.ways_on("right", replace(step, view="v2"), ("v2", None), theory)
     assert [rival.cost[0] for rival in (lead, wrong, slipped, new)] == [40, 55, 70, 80]
-    shares = Scale.of(theory, 0.01, dstates=4, views=4).shares([wrong, slipped, new])
+    shares = shares_of_rivals([wrong, slipped, new], theory, 0.01, dstates=4, views=4)
     assert shares[1] == pytest.approx(
         0.01 * shares[0]
     )  # twice the price, and as many dstates as views
     assert sum(shares) == pytest.approx(1)
     again = next(new.ways_on("travel", step, ("v3", None), theory))
-    shares = Scale.of(theory, 0.01, dstates=4, views=4).shares([new, again])
+    shares = shares_of_rivals([new, again], theory, 0.01, dstates=4, views=4)
     assert shares[1] == pytest.approx(shares[0] / 4)  # a link more, to one of four dstates
 
 

@@ -251,8 +251,8 @@ class MapQuestion(FileQuestion):
         )
         if joins := joins_in_words(solution.by_minimality, solution.count):
             how += f"; {joins}"
-        if done.joined:
-            how += f"; {done.joined}"
+        if solution.joined:
+            how += f"; {solution.joined}"
         total, visits = sum(done.seconds.values()), counted(len(done.imported.visits), "visits")
         line = (
             f"{' + '.join(map(named, paths))}: {found}; {how}; {visits} in "

@@ -8,7 +8,7 @@ from typing import Any
 
 from ssh_abduction.cli.options import add_map, add_maps
 from ssh_abduction.cli.parsing import Verbs
-from ssh_abduction.cli.text import course, table
+from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import MapError, printable, said_of
 from ssh_abduction.data.files import json_line
 
@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> int:
                 "" if move.dstate is None else move.dstate,
                 "not known" if move.view is None else move.view,
                 "" if move.place is None else chosen.numbered("place", move.place),
-                course(move.path, move.direction),
+                move.course,
                 *([] if move.metres is None else [f"{move.metres:.2f}"]),
                 "" if move.known else "never tried",
             ]

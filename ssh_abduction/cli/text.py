@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted as counted  # noqa: PLC0414 - the verbs have it from here
 from ssh_abduction.explain.no_map import Explanation
+from ssh_abduction.output.cards import table_of_dstates
 from ssh_abduction.solver import Backbone, Cost, Solution, Status, stretches
 from ssh_abduction.theory import Theory
 from ssh_abduction.theory.evidence import evidence_of
@@ -165,22 +165,7 @@ def describe(ssh_map: SSHMap) -> str:
         parts += [
             f"  side_of_branch is not applied to paths {h} and {g}" for h, g in ssh_map.excused
         ]
-    leads = gathered((source, f"{action} → {target}") for source, action, target in ssh_map.links)
-    rows = [
-        [
-            s.id,
-            s.shown,
-            "" if s.place is None else ssh_map.numbered("place", s.place),
-            s.course,
-            ", ".join(leads.get(s.id, [])),
-        ]
-        for s in ssh_map.dstates
-    ]
-    if any(s.place is not None for s in ssh_map.dstates):
-        parts.append(table(["dstate", "view", "place", "path", "links"], rows))
-    else:
-        parts.append(table(["dstate", "view", "links"], [[row[0], row[1], row[4]] for row in rows]))
-    return "\n".join(parts)
+    return "\n".join([*parts, table(*table_of_dstates(ssh_map))])
 
 
 def describe_backbone(backbone: Backbone, trace: Trace) -> str:
@@ -283,8 +268,3 @@ def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
 def steps_in_words(steps: Sequence[int]) -> str:
     """Write step numbers in words, such as "step 40" or "steps 12–15 and 40"."""
     return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"
-
-
-def course(path: int | None, direction: int | None) -> str:
-    """Write a path and a direction along it, such as "2+" or "2-"; "" without a path."""
-    return "" if path is None else f"{path}{'+' if direction == 1 else '-'}"

@@ -47,9 +47,19 @@ class DState:
         return "?" if self.view is None else self.view
 
     @property
+    def site(self) -> int:
+        """The number of its place; without a place, a negative number of its own."""
+        return -1 - self.id if self.place is None else self.place
+
+    @property
     def course(self) -> str:
         """The path with the sign of the direction, such as "2+"; "" without a path."""
-        return "" if self.path is None else f"{self.path}{'+' if self.direction == 1 else '-'}"
+        return signed_path(self.path, self.direction)
+
+
+def signed_path(path: int | None, direction: int | None) -> str:
+    """Write a path with the sign of a direction, such as "2+"; "" without a path."""
+    return "" if path is None else f"{path}{'+' if direction == 1 else '-'}"
 
 
 @dataclass(frozen=True, slots=True)

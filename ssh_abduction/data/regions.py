@@ -17,6 +17,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
+from ssh_abduction.data.map_parts import signed_path
+
 # What makes places a region: ("beside", path, direction), ("between", place) or ("behind", place).
 Reason: TypeAlias = tuple[str, int] | tuple[str, int, int]
 
@@ -173,7 +175,7 @@ def named_by_number(kind: str, number: int) -> str:
 
 def course_named(course: tuple[int, int]) -> str:
     """Name a directed path: "path 2+" is path 2 in direction +1."""
-    return f"path {course[0]}{'+' if course[1] == 1 else '-'}"
+    return f"path {signed_path(*course)}"
 
 
 def list_in_words(parts: Iterable[object]) -> str:

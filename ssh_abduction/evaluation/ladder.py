@@ -163,7 +163,7 @@ def ladder(
         the last one.
     """
     checked_trace(trace)
-    theory = checked_theory(theory)
+    start = checked_theory(theory)
     check_limit("time_limit", "seconds", time_limit)
     a_count_of_maps(max_maps, SolverError)
     a_flag("stars", stars, TheoryError)
@@ -174,27 +174,19 @@ def ladder(
         an_instance(
             "under_way", under_way, UnderWay, SolverError, mend="give an UnderWay, or leave it out"
         )
-    return _solved(trace, theory, time_limit, max_maps, stars, known, under_way or UnderWay())
+    work = under_way or UnderWay()
 
+    def climbed() -> Iterator[Rung]:
+        has_truth = tells_names(trace)
+        for name, chosen in rungs(trace, start, stars):
+            solution = (
+                known
+                if known and known.theory == settle(trace, chosen).theory
+                else work.solve(trace, chosen, time_limit=time_limit, max_maps=max_maps)
+            )
+            is_judged = has_truth and solution.maps and not work.interrupted
+            yield Rung(name, solution, evaluate(solution.maps, trace) if is_judged else None)
+            if work.interrupted:
+                return
 
-def _solved(
-    trace: Trace,
-    theory: Theory,
-    limit: float | None,
-    maps: int | None,
-    stars: bool,
-    known: Solution | None,
-    under_way: UnderWay,
-) -> Iterator[Rung]:
-    """Solve the rungs. The arguments are those of `ladder`, already checked."""
-    has_truth = tells_names(trace)
-    for name, chosen in rungs(trace, theory, stars):
-        solution = (
-            known
-            if known and known.theory == settle(trace, chosen).theory
-            else under_way.solve(trace, chosen, time_limit=limit, max_maps=maps)
-        )
-        is_judged = has_truth and solution.maps and not under_way.interrupted
-        yield Rung(name, solution, evaluate(solution.maps, trace) if is_judged else None)
-        if under_way.interrupted:
-            return
+    return climbed()  # the arguments are checked before the first rung is asked for

@@ -37,7 +37,7 @@ from scipy.optimize import linear_sum_assignment
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
 from ssh_abduction.data.maps import SSHMap, check_labels, checked_map, checked_maps
 from ssh_abduction.data.trace import Trace, View, checked_trace
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import attributes_of, counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,11 +137,8 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dict from names to values, as `evaluate --json` prints it."""
-        own = {
-            name: getattr(self, name)
-            for name in ("rank", "steps", "true_dstates", "true_places", "true_paths", "ambiguity")
-        }
-        return {"count": len(self.maps), **own, "maps": [found.to_dict() for found in self.maps]}
+        truth = ("true_dstates", "true_places", "true_paths", "ambiguity")
+        return {"count": len(self.maps), **attributes_of(self, "rank", "steps", *truth, "maps")}
 
 
 def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:

@@ -157,20 +157,11 @@ class VisitsEvaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dict from names to values, as `evaluate --json` prints it."""
-        own: dict[str, Any] = {
-            "near": self.near,
-            "turned": self.turned,
-            "visits": self.visits,
-            "places": asdict(self.places),
-            "dstates": asdict(self.dstates),
-        }
-        maps = [
-            {"places": found.places and found.places.to_dict(), "dstates": found.dstates.to_dict()}
-            for found in self.maps
-        ]
+        own = attributes_of(self, "near", "turned", "visits")
+        own |= {"places": asdict(self.places), "dstates": asdict(self.dstates)}
         if self.by_both is not None:
             own |= {"by_both": self.by_both[0], "alike": self.by_both[1]}
-        return {**own, "maps": maps}
+        return {**own, "maps": [attributes_of(one, "places", "dstates") for one in self.maps]}
 
 
 def evaluate_visits(

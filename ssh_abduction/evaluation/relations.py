@@ -20,7 +20,6 @@ this way is, the larger is the error of the result.
 
 from __future__ import annotations
 
-import bisect
 import math
 import os
 from collections.abc import Iterable, Sequence
@@ -31,12 +30,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from ssh_abduction.data.errors import TraceError, brief, named
-from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.odometry import Displacement, Pose, displacement_between, moved
-from ssh_abduction.evaluation.trajectory import is_trajectory
+from ssh_abduction.evaluation.trajectory import indices_around, is_trajectory, text_of
 
-# Files of more bytes than this are rejected.
-LARGEST = 2**28
 FIELDS = ("time1", "time2", "x", "y", "z", "roll", "pitch", "yaw")
 # A moment that is not between two related times may be this many seconds from the nearest time.
 # Robots that map buildings drive at most one metre per second.
@@ -99,13 +95,7 @@ class Relations:
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Relations:
         """Read a file of relations. Raises OSError, or TraceError, which names the line."""
-        try:
-            text = read_at_most(path, LARGEST).decode("utf-8")
-        except ValueError as error:  # also for bytes that are no text
-            raise TraceError(
-                f"{named(path)}: expected a text of relations, got another file ({error}); "
-                "give one of numbers"
-            ) from None
+        text = text_of(path, "a text of relations", "give one of numbers")
         lines = [
             (number, fields)
             for number, line in enumerate(text.splitlines(), 1)
@@ -175,10 +165,8 @@ class Relations:
         """
         if time is None:
             return None
-        after = bisect.bisect_left(self.times, time)
-        around = [i for i in (after - 1, after) if 0 <= i < len(self.times)]
-        node = min(around, key=lambda i: abs(self.times[i] - time))
-        (other,) = [i for i in around if i != node] or [node]
+        node, *others = indices_around(self.times, time)
+        other = others[0] if others else node
         if (whole := self._to.get((node, other))) is not None:
             share = (time - self.times[node]) / (self.times[other] - self.times[node])
             return node, (

@@ -25,7 +25,7 @@ from typing import Any
 from ssh_abduction.data.checks import a_number, numbers
 from ssh_abduction.data.errors import TraceError, brief, named
 from ssh_abduction.data.files import read_at_most
-from ssh_abduction.data.odometry import Pose, displacement_between, moved
+from ssh_abduction.data.odometry import Pose, moved
 from ssh_abduction.data.trace import Step, Trace
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
@@ -87,13 +87,8 @@ class Trajectory:
         the first pose are skipped.
         """
         source = os.fspath(path)
-        try:
-            text = read_at_most(path, LARGEST).decode("utf-8-sig")
-        except ValueError as error:  # also for bytes that are no text
-            raise TraceError(
-                f"{named(source)}: expected a trajectory in TUM format, got another file "
-                f"({error}); give a text of lines: time x y z qx qy qz qw"
-            ) from None
+        mend = "give a text of lines: time x y z qx qy qz qw"
+        text = text_of(source, "a trajectory in TUM format", mend)
         found: list[tuple[float, Pose]] = []
         heights: list[float] = []
         upright = 0
@@ -117,24 +112,19 @@ class Trajectory:
         """
         if time is None:
             return None
-        after = bisect.bisect_left(self.times, time)
-        around = [i for i in (after - 1, after) if 0 <= i < len(self.times)]
-        nearest = min(around, key=lambda i: abs(self.times[i] - time))
+        nearest, *_ = around = indices_around(self.times, time)
+        first, last = min(around), max(around)
         if abs(self.times[nearest] - time) > NEAREST:
             return None
-        first, last = around[0], around[-1]
         if first == last or self.times[last] - self.times[first] > 2 * NEAREST:
             return self.poses[nearest]
         # Interpolate; turn the shorter way.
         share = (time - self.times[first]) / (self.times[last] - self.times[first])
-        (x, y, heading), (dx, dy, turned) = (
-            self.poses[first],
-            displacement_between((0.0, 0.0, 0.0), self.poses[last]),
-        )
-        turned = math.remainder(turned - heading, math.tau)
+        (x, y, heading), (u, v, other) = self.poses[first], self.poses[last]
+        turned = math.remainder(other - heading, math.tau)
         return (
-            x + share * (dx - x),
-            y + share * (dy - y),
+            x + share * (u - x),
+            y + share * (v - y),
             math.remainder(heading + share * turned, math.tau),
         )
 
@@ -191,6 +181,26 @@ class Trajectory:
             f"{where}: time: expected steps within {NEAREST:g} s of poses of {named(self.source)}, "
             f"which are from {spans[0]}, got none: steps are from {spans[1]}; {mend}"
         )
+
+
+def text_of(path: str | os.PathLike[str], expected: str, mend: str) -> str:
+    """Read a text file. Raise TraceError, which says what was `expected`, for another file."""
+    try:
+        return read_at_most(path, LARGEST).decode("utf-8-sig")
+    except ValueError as error:  # also for bytes that are no text
+        raise TraceError(
+            f"{named(path)}: expected {expected}, got another file ({error}); {mend}"
+        ) from None
+
+
+def indices_around(times: Sequence[float], time: float) -> list[int]:
+    """Find the last of the sorted times before a moment, and the first after; the nearer first.
+
+    There is only one index if the moment is before or after all times.
+    """
+    after = bisect.bisect_left(times, time)
+    around = [i for i in (after - 1, after) if 0 <= i < len(times)]
+    return sorted(around, key=lambda i: abs(times[i] - time))
 
 
 def is_trajectory(lines: Iterable[Sequence[str]]) -> bool:

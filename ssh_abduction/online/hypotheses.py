@@ -30,10 +30,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import DState, Fault, SSHMap
 from ssh_abduction.data.trace import Step, Trace
-from ssh_abduction.solver import Cost, observation
+from ssh_abduction.solver import Cost, Judging, observation
+from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.theory import Theory
 
 # As `observation` returns it: the view, and the star (the openings seen) or None.
@@ -67,11 +68,11 @@ class ExtendedMap:
     def of(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> ExtendedMap:
         """Make the hypothesis that a map of the trace, or of its first steps, is true."""
         wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
-        looks: dict[int, Seen] = {}
-        for t, label in enumerate(ssh_map.dstate_at):
-            if t not in wrong:
-                looks.setdefault(label, observation(trace.steps[t], theory))
-        shows = tuple(looks.get(s.id, (s.view, None)) for s in ssh_map.dstates)
+        first = firsts((s, t) for t, s in enumerate(ssh_map.dstate_at) if t not in wrong)
+        shows = tuple(
+            observation(trace.steps[first[s.id]], theory) if s.id in first else (s.view, None)
+            for s in ssh_map.dstates
+        )
         links = {(s, action): x for s, action, x in ssh_map.links}
         cost = Cost.of(ssh_map).preferred_by(theory)
         return cls(ssh_map, ssh_map.dstate_at, shows, links, ssh_map.faults, cost)
@@ -110,6 +111,18 @@ class ExtendedMap:
         there = self.links.get((self.here, action))
         return None if there is None or self.shows[there] == seen else there
 
+    def predicting(self, action: str, seen: Seen) -> ExtendedMap | None:
+        """Extend this map by a step that it predicts; None if it does not predict the step."""
+        there = self.links.get((self.here, action))
+        return None if there is None or self.shows[there] != seen else self._to(there)
+
+    def is_allowed(self, trace: Trace, pairs: Pairs, judging: Judging) -> bool:
+        """Whether the evidence allows the last step of a trace, as it allowed the earlier ones."""
+        t = len(trace) - 1
+        return pairs.allow(t, self.labels, self.places) and judging.allows_grown(
+            trace, self.explained(), t
+        )
+
     def is_unknown(self, action: str) -> bool:
         """Whether the map has no link for an action at the dstate where the robot is."""
         return (self.here, action) not in self.links
@@ -147,8 +160,8 @@ class ExtendedMap:
                     yield self._to(s, link=action)
                 yield self._to(len(self.shows), link=action, new=seen)
             return
-        if self.shows[there] == seen:
-            yield self._to(there)
+        if longer := self.predicting(action, seen):
+            yield longer
             return
         if theory.misread:
             view, star = self.shows[there]
@@ -192,45 +205,30 @@ class ExtendedMap:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Scale:
-    """Computes the weights of rivals, by the formula in the docstring of this module.
+def shares_of_rivals(
+    rivals: Sequence[ExtendedMap], theory: Theory, chance: float, dstates: int, views: int
+) -> list[float]:
+    """Compute the probability of each rival, given that one of them is true.
 
-    Attributes:
-        odds: Negative natural logarithm of the probability of the cheapest kind of fault.
-        price: The cost of such a fault, in tenths of dstates.
-        dstates: Number N of dstates, at least 2.
-        views: Number V of views, at least 2.
+    The formula is in the docstring of this module.
+
+    Args:
+        theory: A theory with faults.
+        chance: The probability of the cheapest kind of fault, at each step.
+        dstates: The number N of dstates. It counts as at least 2.
+        views: The number V of views. It counts as at least 2.
     """
-
-    odds: float
-    price: int
-    dstates: int
-    views: int
-
-    @classmethod
-    def of(cls, theory: Theory, chance: float, dstates: int, views: int) -> Scale:
-        """Make the scale for a theory with faults.
-
-        At each step, the cheapest kind of fault has the probability `chance`.
-        """
-        cheapest = min(round(10 * price) for price in (theory.misread, theory.slipped) if price)
-        return cls(-math.log(chance), cheapest, max(dstates, 2), max(views, 2))
-
-    def improbability(self, rival: ExtendedMap) -> float:
-        """Compute the negative natural logarithm of the weight of a rival."""
+    cheapest = min(round(10 * price) for price in (theory.misread, theory.slipped) if price)
+    per_dstate, per_view = math.log(max(dstates, 2)), math.log(max(views, 2))
+    improbable = []  # the negative logarithm of each weight
+    for rival in rivals:
         kinds = Counter(fault.kind for fault in rival.faults)
-        ways = (len(rival.links) + kinds["slipped"]) * math.log(self.dstates)
-        return (
-            self.odds * rival.cost[0] / self.price
-            + ways
-            + (kinds["misread"] + kinds["misseen"]) * math.log(self.views)
+        improbable.append(
+            -math.log(chance) * rival.cost[0] / cheapest
+            + (len(rival.links) + kinds["slipped"]) * per_dstate
+            + (kinds["misread"] + kinds["misseen"]) * per_view
         )
-
-    def shares(self, rivals: Sequence[ExtendedMap]) -> list[float]:
-        """Compute the probability of each rival, given that one of them is true."""
-        improbable = [self.improbability(rival) for rival in rivals]
-        least = min(improbable, default=0.0)
-        weights = [math.exp(least - nats) for nats in improbable]
-        total = sum(weights)
-        return [weight / total for weight in weights]
+    least = min(improbable, default=0.0)
+    weights = [math.exp(least - nats) for nats in improbable]
+    total = sum(weights)
+    return [weight / total for weight in weights]

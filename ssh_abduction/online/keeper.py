@@ -69,6 +69,12 @@ class MapKeeper:
         problem: The steps so far, and the theory: it allows no faults, and no field is "auto".
         options: The time limit and the other options of a step.
         before: The keeper of fewer steps that this one replaces; None for the first.
+
+    Attributes:
+        minimal: The minimal maps.
+        drafts: Maps that were made without a search.
+        searches: The number of searches by clingo so far.
+        search: The last search, which the next one continues; None before the first.
     """
 
     standing = None  # only `Recovery`, for theories with faults, has a standing
@@ -81,9 +87,10 @@ class MapKeeper:
         self._judging = Judging(problem)
         self.minimal = MinimalMaps(trace, theory, self._judging)
         self.drafts = Drafts(problem, self._judging)
-        self.solver: IncrementalSolver = IncrementalSolver(
-            options, before.solver.searches if before else 0
-        )
+        self.searches: int = before.searches if before else 0
+        self.search: Search | None = None
+        self._found: Solution | None = None  # the solution of this search, without its maps
+        self._next_search = 0  # no search before the trace has this many steps
         self._spent = 0.0  # seconds that all steps took
 
     @property
@@ -96,11 +103,6 @@ class MapKeeper:
         """The theory, in which no field is "auto"."""
         return self._problem.theory
 
-    @property
-    def searches(self) -> int:
-        """The number of searches by clingo so far."""
-        return self.solver.searches
-
     def restarted(self, problem: Problem) -> MapKeeper:
         """Make a keeper for the theory of `problem`, which changed with the last step.
 
@@ -110,7 +112,7 @@ class MapKeeper:
         trace = problem.trace
         keeper = MapKeeper(problem, self._options, before=self)
         if self.theory.displacement == "use":
-            for ssh_map in [m.map() for m in self.minimal.maps[:DRAFTS]] + self.drafts.maps():
+            for ssh_map in [m.explained() for m in self.minimal.maps[:DRAFTS]] + self.drafts.maps():
                 keeper.drafts.add(ssh_map, trace)
         return keeper
 
@@ -125,9 +127,9 @@ class MapKeeper:
         untried = self.minimal.follow(action, trace, problem.pairs)
         self.drafts.follow(action, trace.steps[-1])
         if was_proven and self.minimal.status is Status.UNKNOWN:
-            self.solver.make_due()
-        for replayed in untried[:DRAFTS]:
-            self.drafts.add(replayed.map(), trace)
+            self._next_search = 0
+        for rival in untried[:DRAFTS]:
+            self.drafts.add(rival.explained(), trace)
 
     def answer(self, began: float) -> Solution:
         """Search for minimal maps of the steps so far if needed, and return what is known.
@@ -138,7 +140,7 @@ class MapKeeper:
         if (
             not minimal.is_impossible
             and not minimal.is_settled(self._options.max_maps)
-            and self.solver.is_due(self.trace)
+            and len(self.trace) >= self._next_search
         ):
             self._ask()
         return self._solution(began)
@@ -146,13 +148,27 @@ class MapKeeper:
     def _ask(self) -> None:
         """Search for minimal maps with clingo and keep them.
 
+        If a minimal map is known, only the others are searched for.
         If maps are replayed, maps without a proof do not replace the known ones. The best of them
         becomes a draft, which later steps extend.
         """
-        known = self.minimal.maps[0].map() if self.minimal.status is Status.OPTIMAL else None
-        found = self.solver.maps(self.trace, self.theory, known)
-        said = self.solver.solution
-        assert said is not None
+        options, steps = self._options, len(self.trace)
+        is_proven = self.minimal.status is Status.OPTIMAL
+        search = Search.continuing(
+            self.search,
+            self.trace,
+            self.theory,
+            time_limit=options.time_limit,
+            max_maps=options.max_maps,
+            speedups=options.speedups,
+            minimal=self.minimal.maps[0].explained() if is_proven else None,
+        )
+        # The maps are not ranked, as ranking takes longer than a step may.
+        found = tuple(search.unranked())
+        said = search.solution()
+        self.search, self._found, self.searches = search, said, self.searches + 1
+        was_stopped = search.stopped in ("time limit", "interrupted")
+        self._next_search = max(steps + PAUSE, int(RETRY * steps)) if was_stopped else 0
         proves = said.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
         if proves or not self.minimal.replays:
             self.minimal.replace(found, said.status, said.complete, said.cost)
@@ -162,11 +178,11 @@ class MapKeeper:
 
     def _solution(self, began: float) -> Solution:
         """The solution so far: the minimal maps, else one consistent map, else no map."""
-        asked = self.solver.solution
+        asked = self._found
         assert asked is not None
         minimal, steps = self.minimal, len(self.trace)
         status, cost = minimal.status, minimal.cost
-        maps = tuple(m.map() for m in minimal.maps)
+        maps = tuple(m.explained() for m in minimal.maps)
         if status is Status.UNKNOWN and (best := self.drafts.best(self.trace, self._problem.pairs)):
             maps, status, cost = (best,), Status.FEASIBLE, Cost.of(best)
         self._spent += time.perf_counter() - began
@@ -197,59 +213,6 @@ class MapKeeper:
             stopped=None if minimal.complete else asked.stopped,
             support=asked.support,
         )
-
-
-class IncrementalSolver:
-    """Searches for minimal maps of a growing trace. Each search continues the last one.
-
-    Args:
-        options: The time limit and the other options of a step.
-        searches: The number from which to count searches.
-
-    Attributes:
-        searches: Number of searches so far.
-        search: The last search; None before the first.
-        solution: The last solution, without its maps; None before the first search.
-    """
-
-    def __init__(self, options: StepOptions, searches: int = 0) -> None:
-        self.options = options
-        self.searches = searches
-        self.search: Search | None = None
-        self.solution: Solution | None = None
-        self._next_search = 0  # no search before the trace has this many steps
-
-    def is_due(self, trace: Trace) -> bool:
-        """Whether the trace has grown enough to search again, after a search ran out of time."""
-        return len(trace) >= self._next_search
-
-    def make_due(self) -> None:
-        """Make the next search due at once, whatever the last search found."""
-        self._next_search = 0
-
-    def maps(self, trace: Trace, theory: Theory, known: SSHMap | None) -> tuple[SSHMap, ...]:
-        """Search for the minimal maps of a trace.
-
-        In the theory no field is "auto". If a minimal map is `known`, only the others are searched
-        for. Return the minimal maps, or the best map found in time, as `solution.status` says.
-        """
-        self.searches += 1
-        search = Search.continuing(
-            self.search,
-            trace,
-            theory,
-            time_limit=self.options.time_limit,
-            max_maps=self.options.max_maps,
-            speedups=self.options.speedups,
-            minimal=known,
-        )
-        # The maps are not ranked, as ranking takes longer than a step may.
-        found = tuple(search.unranked())
-        self.search, self.solution = search, search.solution()
-        was_stopped = search.stopped in ("time limit", "interrupted")
-        steps = len(trace)
-        self._next_search = max(steps + PAUSE, int(RETRY * steps)) if was_stopped else 0
-        return found
 
 
 @dataclass(slots=True)

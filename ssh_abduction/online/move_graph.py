@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from collections.abc import Set as AbstractSet
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import networkx as nx
 
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.map_parts import thing_named
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.words import meant
 from ssh_abduction.output.layout import drawable_poses
-
-if TYPE_CHECKING:
-    from ssh_abduction.data.maps import Pose
 
 # The number of a dstate (distinctive state: a place and a heading). Or a course (place, path,
 # direction) that no dstate of the map faces.
@@ -98,14 +95,9 @@ class MoveGraph:
             f"{meant(name, names, 3) or ';'} ssh-abduction show lists them"
         )
 
-    def nodes_in(self, places: AbstractSet[int]) -> set[Node]:
+    def nodes_in(self, places: AbstractSet[int | None]) -> set[Node]:
         """Find all nodes that are at these places."""
         return {node for node in self._graph if self.course(node)[0] in places}
-
-    def nodes_at_places_of(self, nodes: AbstractSet[Node]) -> set[Node]:
-        """Find all nodes that are at the same places as the given nodes."""
-        places = {self._place(node) for node in nodes}
-        return {node for node in self._graph if self._place(node) in places}
 
     def shortest(
         self, here: AbstractSet[Node], there: AbstractSet[Node], closed: AbstractSet[Node]
@@ -159,14 +151,19 @@ class MoveGraph:
             return None
         if self._floor(source) != self._floor(target):
             return 0.0
-        a, b = (self._pose(node, self._poses) for node in (source, target))
+        a, b = (self._poses[s.id] for node in (source, target) if (s := self._dstate(node)))
         return math.hypot(a.x - b.x, a.y - b.y)
+
+    def _dstate(self, node: Node) -> DState | None:
+        """Return the dstate of a node; for a course, the first dstate at its place, if any."""
+        if isinstance(node, int):
+            return self.map.dstates[node]
+        return next((s for s in self.map.dstates if s.place == node[0]), None)
 
     def _floor(self, node: Node) -> int | None:
         """Return the floor of a node; None if the map has no floors."""
-        if not isinstance(node, tuple):
-            return self.map.dstates[node].floor
-        return next((s.floor for s in self.map.dstates if s.place == node[0]), None)
+        here = self._dstate(node)
+        return here.floor if here else None
 
     def _of_links(self) -> nx.DiGraph[Any]:
         """Make the graph of all dstates and the links between them."""
@@ -287,15 +284,8 @@ class MoveGraph:
         return {s.id for s in self.map.dstates if s.place in places}
 
     def _place(self, node: Node) -> int:
-        """Return the place of a node. A dstate without a place gets its own negative number."""
-        place = self.course(node)[0]
-        return -1 - int(node) if place is None and isinstance(node, int) else int(place or 0)
-
-    def _pose(self, node: Node, poses: tuple[Pose, ...]) -> Pose:
-        """Return the pose of a dstate. A course has the pose of the first dstate at its place."""
-        if isinstance(node, int):
-            return poses[node]
-        return poses[next(s.id for s in self.map.dstates if s.place == node[0])]
+        """Return the place of a node, or the `DState.site` of a dstate without a place."""
+        return self.map.dstates[node].site if isinstance(node, int) else node[0]
 
 
 def _closed_gateways(ssh_map: SSHMap) -> list[tuple[int | None, int | None, int | None]]:

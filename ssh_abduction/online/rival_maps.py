@@ -12,7 +12,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.chances import Chances
-from ssh_abduction.online.hypotheses import ExtendedMap, Scale, Seen
+from ssh_abduction.online.hypotheses import ExtendedMap, Seen, shares_of_rivals
 from ssh_abduction.solver import Bound, Judging, Solution, Status, observation
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
@@ -191,12 +191,7 @@ class RivalMaps:
         if self._has_evidence:
             trace = self._trace.prefix(t + 1)
             pairs = self._problem.changed(trace, self._theory.of_steps(0, t + 1)).pairs
-            new = [
-                rival
-                for rival in new
-                if pairs.allow(t, rival.labels, rival.places)
-                and self._judging.allows_grown(trace, rival.explained(), t)
-            ]
+            new = [rival for rival in new if rival.is_allowed(trace, pairs, self._judging)]
         return self._ranked(new)
 
     def _ranked(self, rivals: list[ExtendedMap]) -> list[ExtendedMap]:
@@ -224,7 +219,7 @@ class RivalMaps:
     def _shares(self, rivals: list[ExtendedMap]) -> list[float]:
         """Compute the probability of each rival. They sum to 1."""
         dstates = len(min(rivals, key=lambda rival: rival.cost).shows)
-        return Scale.of(self._theory, RARE, dstates, len(self._views)).shares(rivals)
+        return shares_of_rivals(rivals, self._theory, RARE, dstates, len(self._views))
 
     def _sentence(self, t: int, lead: ExtendedMap, there: int, seen: Seen) -> str:
         """Describe step t, which contradicts the best map: the map expected dstate `there`."""

@@ -38,6 +38,7 @@ from typing import Any, Literal, NoReturn
 
 from ssh_abduction.data.checks import a_list, one_of
 from ssh_abduction.data.errors import MapError, printable
+from ssh_abduction.data.map_parts import signed_path
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import Region, course_named, named_by_number, right_of
 from ssh_abduction.data.trace import View
@@ -72,6 +73,11 @@ class Move:
     path: int | None
     direction: int | None
     metres: float | None = None
+
+    @property
+    def course(self) -> str:
+        """The path at the end with the sign of the direction, such as "2+"; "" without a path."""
+        return signed_path(self.path, self.direction)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the move as a dict for JSON, with its attributes as keys."""
@@ -153,16 +159,11 @@ class Route:
         elif self.maps > 1:
             parts.append(f"{len(self.agree)} of {self.maps} maps expect the same views")
         if not self.moves:
-            return (
-                f"dstate {self.start} is {self.goal}: there is nothing to do"
-                if self.goal == f"dstate {self.start}"
-                else f"dstate {self.start} is {self._within} {self.goal}"
-            )
+            if self.goal == f"dstate {self.start}":
+                return f"dstate {self.start} is {self.goal}: there is nothing to do"
+            within = "in" if self.goal.startswith("region") else "at"
+            return f"dstate {self.start} is {within} {self.goal}"
         return f"from dstate {self.start} to {self.goal}: {', '.join(parts)}"
-
-    @property
-    def _within(self) -> str:
-        return "in" if self.goal.startswith("region") else "at"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the route as a dict for JSON, as `route --json` prints it.
@@ -213,7 +214,7 @@ def route(
     here, _ = graph.nodes(ssh_map.dstate_at[-1] if start is None else start, "from")
     there, goal_named = graph.nodes(goal, "to")
     if not goal_named.startswith("dstate"):
-        there = graph.nodes_at_places_of(there)
+        there = graph.nodes_in({graph.course(node)[0] for node in there})
     closed = _closed(graph, avoid)
     for nodes, name in ((here, "from"), (there, "to")):
         if nodes <= closed:
@@ -261,7 +262,7 @@ def action_in_words(move: Move) -> str:
         return printable(move.action)
     if move.path is None:
         return "(turn)"
-    return f"(turn to path {move.path}{'+' if move.direction == 1 else '-'})"
+    return f"(turn to path {move.course})"
 
 
 def _closed(graph: MoveGraph, avoid: Iterable[int | str]) -> set[Node]:

@@ -39,25 +39,28 @@ def map_card(ssh_map: SSHMap) -> str:
     if fit := ssh_map.fit:
         freedom = f"{fit.dof} degrees of freedom (p = {fit.p:.2g})"
         parts.append(paragraph(f"chi-square {fit.chi2:.1f} for {freedom}"))
-    leads = gathered((source, f"{action} → {target}") for source, action, target in ssh_map.links)
-    # A map without places has fewer columns.
-    topological = bool(ssh_map.places)
-    head = ("dstate", "view", *(("place", "path") if topological else ()), "links")
-
-    def number(place: int | None) -> str:
-        return "" if place is None else ssh_map.numbered("place", place)
-
-    rows = [
-        (
-            s.id,
-            s.shown,
-            *((number(s.place), s.course) if topological else ()),
-            ", ".join(leads.get(s.id, ())),
-        )
-        for s in ssh_map.dstates
-    ]
+    head, rows = table_of_dstates(ssh_map)
     dstates = folded(counted(len(rows), "dstates"), html_table(head, rows, "dstates"))
     return card(repr(ssh_map)[1:-1], *parts, dstates)
+
+
+def table_of_dstates(ssh_map: SSHMap) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
+    """Make the head and the rows of a table of dstates, each with its place and its links.
+
+    A map without places has fewer columns.
+    """
+    leads = gathered((source, f"{action} → {target}") for source, action, target in ssh_map.links)
+    columns: dict[str, list[object]] = {
+        "dstate": [s.id for s in ssh_map.dstates],
+        "view": [s.shown for s in ssh_map.dstates],
+    }
+    if any(s.place is not None for s in ssh_map.dstates):
+        columns["place"] = [
+            "" if s.place is None else ssh_map.numbered("place", s.place) for s in ssh_map.dstates
+        ]
+        columns["path"] = [s.course for s in ssh_map.dstates]
+    columns["links"] = [", ".join(leads.get(s.id, ())) for s in ssh_map.dstates]
+    return (*columns,), [*zip(*columns.values(), strict=True)]
 
 
 def trace_card(trace: Trace) -> str:

@@ -24,6 +24,11 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7
 ALARM = "#b00020"  # of faults
 
 
+def colour_of(number: int) -> str:
+    """Return the colour of a path or a drive, by its number."""
+    return COLOURS[number % len(COLOURS)]
+
+
 def element(tag: str, content: str = "", /, **attributes: object) -> str:
     """Make an SVG element with content of SVG.
 

@@ -51,21 +51,6 @@ class Layout:
     dstates: tuple[tuple[float, float, float | None], ...] = field(repr=False)
     metric: bool = False
 
-    def to_dict(self) -> dict[str, Any]:
-        """The layout for JSON: `places` are [id, [x, y]], and `dstates` [x, y, heading or None].
-
-        `metric` says whether the positions are in metres.
-        """
-        return {
-            "metric": self.metric,
-            "places": [
-                [place, [round(x, 4), round(y, 4)]] for place, (x, y) in self.places.items()
-            ],
-            "dstates": [
-                [None if number is None else round(number, 4) for number in s] for s in self.dstates
-            ],
-        }
-
 
 def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
     """Choose positions for drawing a map: its poses if it can be drawn at them, else computed ones.
@@ -228,13 +213,13 @@ def untravelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
 class _Drawing:
     """Computes the layout of a map without poses.
 
-    A spot is the id of a place, or a negative number for a dstate without a place. `degrees` has,
-    for each action's name, the degrees clockwise that it turns, and their weight.
+    Spots are those of `DState.site`. `degrees` has, for each action's name, the degrees clockwise
+    that it turns, and their weight.
     """
 
     def __init__(self, ssh_map: SSHMap, degrees: Mapping[str, tuple[float, float]]) -> None:
         self.map = ssh_map
-        self.spot = [s.place if s.place is not None else -1 - s.id for s in ssh_map.dstates]
+        self.spot = [s.site for s in ssh_map.dstates]
         self.spots = list(dict.fromkeys([*ssh_map.places, *self.spot]))
         self.turns = list(turns_between(ssh_map, degrees, self.spot))
         ends = [(ssh_map.dstates[s], ssh_map.dstates[x]) for s, _, x in ssh_map.links]

@@ -19,6 +19,7 @@ from ssh_abduction.output.drawing import (
     Point,
     at,
     circle,
+    colour_of,
     element,
     fault_mark,
     faults_in_words,
@@ -57,8 +58,7 @@ def metric_svg(ssh_map: SSHMap, poses: Sequence[Pose]) -> str:
 class _Picture:
     """The page while it is drawn.
 
-    Points of the page have x to the right and y down. A site is the id of a place, or a negative
-    number for a dstate without a place.
+    Points of the page have x to the right and y down. Sites are those of `DState.site`.
 
     Attributes:
         map: The map.
@@ -99,7 +99,7 @@ class _Picture:
         bands, around = region_marks(self.map, spots, 2 * END * self.unit)
         self.points += around
         # Draw the first place last, on top of the others.
-        first = _site(self.map.dstates[self.map.dstate_at[0]])
+        first = self.map.dstates[self.map.dstate_at[0]].site
         dots = [
             self.dot(*spots[site], site) for site in sorted(spots, key=lambda site: site == first)
         ]
@@ -132,7 +132,7 @@ class _Picture:
 
     def dot(self, x: float, y: float, site: int) -> str:
         """Draw the dot of a site at a point. The robot's first site is white, others are black."""
-        is_first = site == _site(self.map.dstates[self.map.dstate_at[0]])
+        is_first = site == self.map.dstates[self.map.dstate_at[0]].site
         fill, width = "white" if is_first else "#222", f"{1.8 * self.unit:.1f}"
         title = place_title(self.map, site) if site >= 0 else f"dstate {-1 - site}"
         return titled(title, circle(x, y, DOT * self.unit, fill, "#222", width))
@@ -179,7 +179,7 @@ class _Picture:
         """
         orders, travels, u = [], [], self.unit
         for path in self.map.paths:
-            colour = COLOURS[path.id % len(COLOURS)]
+            colour = colour_of(path.id)
             for p, q in untravelled(self.map, path):
                 dotted = {"stroke_dasharray": "2 5", "opacity": 0.7}
                 orders.append(_line(spots[p], spots[q], colour, 2 * u, **dotted))
@@ -190,7 +190,7 @@ class _Picture:
     def edges(self, spots: Mapping[int, Point]) -> list[str]:
         """Draw a line between two places if an action leads from one to the other."""
         pairs = {
-            tuple(sorted(_site(self.map.dstates[s]) for s in ends)) for ends in link_names(self.map)
+            tuple(sorted(self.map.dstates[s].site for s in ends)) for ends in link_names(self.map)
         }
         return [self.broad(spots[p], spots[q], COLOURS[0]) for p, q in sorted(pairs) if p != q]
 
@@ -315,7 +315,7 @@ class _Picture:
                     for side in (1, -1):
                         away = side * (12 + 18 * abs(uy)) * self.unit
                         beside.append((x - uy * away, y + ux * away))
-            name, colour = self.map.called("path", path.id), COLOURS[path.id % len(COLOURS)]
+            name, colour = self.map.called("path", path.id), colour_of(path.id)
             marks += self.label(name, beside, colour, 12)
         return marks
 
@@ -356,18 +356,13 @@ def _line(a: Point, b: Point, colour: str, width: float, **style: object) -> str
     return element("path", d=line(a, b), stroke=colour, stroke_width=f"{width:.1f}", **style)
 
 
-def _site(s: DState) -> int:
-    """The number of the dot for a dstate: its place, or a negative number if it has no place."""
-    return s.place if s.place is not None else -1 - s.id
-
-
 def _sites(ssh_map: SSHMap) -> dict[int, list[DState]]:
-    return gathered((_site(s), s) for s in ssh_map.dstates)
+    return gathered((s.site, s) for s in ssh_map.dstates)
 
 
 def _colour(s: DState) -> str:
     if s.path is not None:
-        return COLOURS[s.path % len(COLOURS)]
+        return colour_of(s.path)
     return COLOURS[0] if s.place is None else "#555"
 
 

@@ -16,6 +16,7 @@ from ssh_abduction.output.drawing import (
     Point,
     at,
     circle,
+    colour_of,
     element,
     fault_mark,
     faults_in_words,
@@ -88,7 +89,7 @@ def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]
 
 def _path(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[str]:
     """Draw a path: broad lines where the robot travelled, dotted ones between other neighbours."""
-    colour, streets = COLOURS[path.id % len(COLOURS)], travelled(ssh_map, path)
+    colour, streets = colour_of(path.id), travelled(ssh_map, path)
     dotted = {"stroke_width": 2, "stroke_dasharray": "2 6", "opacity": 0.7}
     broad = {"stroke_width": 9, "stroke_linecap": "round", "opacity": 0.55}
     return [
@@ -111,7 +112,7 @@ def _path_name(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[
     (ax, ay), (bx, by) = a, b = spots[p], spots[q]
     mx, my, angle = (ax + bx) / 2, (ay + by) / 2, math.degrees(math.atan2(by - ay, bx - ax))
     far = 26 / (math.dist(a, b) or 1.0)
-    colour, name = COLOURS[path.id % len(COLOURS)], ssh_map.called("path", path.id)
+    colour, name = colour_of(path.id), ssh_map.called("path", path.id)
     return [
         element("path", d="M-7,-6 L7,0 L-7,6 Z", fill=colour, transform=placed((mx, my), angle)),
         svg_text(mx - (by - ay) * far, my + (bx - ax) * far, name, colour, halo=True),
@@ -133,7 +134,7 @@ def _dstates(ssh_map: SSHMap, place: int, spot: Point, found: Layout) -> list[st
         dx, dy = math.cos(bearing), math.sin(bearing)
         # Draw the arrow to the right of the line of the path.
         aside = (0.0, 0.0) if s.path is None else (-dy * LANE, dx * LANE)
-        colour = "#555" if s.path is None else COLOURS[s.path % len(COLOURS)]
+        colour = "#555" if s.path is None else colour_of(s.path)
         tip = x + dx * (RADIUS + 6) + aside[0], y + dy * (RADIUS + 6) + aside[1]
         turned = placed(tip, math.degrees(bearing))
         arrow = element("path", d="M-5,-5 L5,0 L-5,5 Z", fill=colour, transform=turned)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import Any
 
 from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import DState, SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.output.drawing import ALARM, COLOURS
+from ssh_abduction.output.drawing import ALARM, colour_of
 from ssh_abduction.output.headings import Turns
-from ssh_abduction.output.layout import Layout, layout, travelled
+from ssh_abduction.output.layout import Layout, layout, travelled, untravelled
 
 # APART is the number of inches between neighbouring places. AHEAD and LANE are shares of the
 # distance of the two nearest places: the mark of a dstate is AHEAD of its place, and LANE beside
@@ -68,14 +67,11 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
 def _draw_paths(axes: Any, ssh_map: SSHMap, found: Layout) -> None:
     """Draw paths: broad lines where the robot travelled, dotted ones between other neighbours."""
     for path in ssh_map.paths:
-        colour, streets = COLOURS[path.id % len(COLOURS)], travelled(ssh_map, path)
+        colour = colour_of(path.id)
         dotted = {"linewidth": 1, "linestyle": ":", "alpha": 0.7}
         broad = {"linewidth": 6, "solid_capstyle": "round", "alpha": 0.55}
-        untravelled = [
-            (p, q) for p, q in pairwise(path.order) if (min(p, q), max(p, q)) not in streets
-        ]
-        for pairs, style in ((untravelled, dotted), (streets, broad)):
-            for ends in pairs:
+        for pairs, style in ((untravelled, dotted), (travelled, broad)):
+            for ends in pairs(ssh_map, path):
                 xs, ys = zip(*(found.places[p] for p in ends), strict=True)
                 axes.plot(xs, ys, color=colour, **style)
 
@@ -100,7 +96,7 @@ def _draw_dstate(
         return x, y
     dx, dy = math.cos(heading) * unit, math.sin(heading) * unit
     mark = (x + AHEAD * dx + LANE * dy, y + AHEAD * dy - LANE * dx)
-    colour = "#555" if s.path is None else COLOURS[s.path % len(COLOURS)]
+    colour = "#555" if s.path is None else colour_of(s.path)
     triangle = (3, 0, math.degrees(heading) - 90)
     axes.plot(*mark, marker=triangle, color=colour, markersize=6, linestyle="none")
     axes.text(mark[0] + 0.09 * dx, mark[1] + 0.09 * dy, f"x{s.id}", fontsize=5, **middle)

@@ -65,13 +65,17 @@ class Page:
         write_map(path, self.html, "page")
 
     def widget(self) -> Any:
-        """Make a notebook widget that shows the page.
+        """Make a notebook widget that shows the page in an iframe.
 
         Raises:
             MapError: The package anywidget is not installed.
         """
-
-        return widget_of(self.html)
+        with needed("widget", "anywidget", "'ssh-abduction[notebook]'", MapError):
+            import anywidget
+            import traitlets
+        html = traitlets.Unicode(self.html).tag(sync=True)
+        members = {"_esm": _file("script/widget.js"), "html": html}
+        return type("PageWidget", (anywidget.AnyWidget,), members)()
 
 
 def view_page(
@@ -135,12 +139,3 @@ def _file(name: str) -> str:
 def _digest(text: str) -> str:
     """Compute the digest by which a content security policy allows a script or style."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-
-
-def widget_of(html: str) -> Any:
-    """Make a notebook widget that shows a page in an iframe. Raises MapError without anywidget."""
-    with needed("widget", "anywidget", "'ssh-abduction[notebook]'", MapError):
-        import anywidget
-        import traitlets
-    members = {"_esm": _file("script/widget.js"), "html": traitlets.Unicode(html).tag(sync=True)}
-    return type("PageWidget", (anywidget.AnyWidget,), members)()

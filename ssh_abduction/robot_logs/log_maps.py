@@ -13,7 +13,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from statistics import median
 from typing import Any
@@ -96,25 +96,6 @@ PATHS = (
 BARE = Theory.topological().replace(star="none", boundary="none", without=PATHS, joint=1)
 
 
-@dataclass(frozen=True, slots=True)
-class LoggedDrive:
-    """What was imported from the log of a drive.
-
-    Attributes:
-        name: The name of the drive.
-        scans: The number of its scans.
-        metres: How far the robot drove.
-        visits: The number of its visits to distinctive places.
-        steps: The number of its steps in the trace.
-    """
-
-    name: str
-    scans: int
-    metres: float
-    visits: int
-    steps: int
-
-
 @dataclass(frozen=True, eq=False)
 class LogMap:
     """The minimal maps of a robot's log, and how they were made.
@@ -141,27 +122,20 @@ class LogMap:
     notes: tuple[str, ...] = ()
     interrupted: bool = False
 
-    @property
-    def drives(self) -> tuple[LoggedDrive, ...]:
-        """The drives, in order."""
+    def _drives(self) -> list[dict[str, Any]]:
+        """What was imported from the log of each drive, as plain data."""
         trace, visits = self.imported.trace, self.imported.visits
-        begins = (0, *self.imported.starts)
-        stops = (*self.imported.starts, len(self.log))
-        return tuple(
-            LoggedDrive(
-                drive.name,
-                stop - begin,
-                round(float(np.ptp(self.imported.track.way[begin:stop])), 1),
-                sum(begin <= visit.scan < stop for visit in visits),
-                drive.stop - drive.first,
-            )
-            for drive, begin, stop in zip(drives_of(trace), begins, stops, strict=True)
-        )
-
-    @property
-    def joined(self) -> str:
-        """Which drives the first map joins, in words; empty for a single drive or without a map."""
-        return self.solution.joined
+        bounds = itertools.pairwise([0, *self.imported.starts, len(self.log)])
+        return [
+            {
+                "name": drive.name,
+                "scans": stop - begin,
+                "metres": round(float(np.ptp(self.imported.track.way[begin:stop])), 1),
+                "visits": sum(begin <= visit.scan < stop for visit in visits),
+                "steps": drive.stop - drive.first,
+            }
+            for drive, (begin, stop) in zip(drives_of(trace), bounds, strict=True)
+        ]
 
     @property
     def drove(self) -> float | None:
@@ -197,7 +171,7 @@ class LogMap:
             "seconds": dict(self.seconds),
             "limit": round(self.limit, 1),
             "drove": self.drove,
-            **({"drives": [asdict(drive) for drive in self.drives]} if self.joined else {}),
+            **({"drives": self._drives()} if solution.joined else {}),
         }
 
     def files(self) -> dict[str, bytes]:

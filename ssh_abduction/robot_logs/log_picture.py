@@ -12,6 +12,7 @@ drive that shares no place is put beside the others.
 
 from __future__ import annotations
 
+import cmath
 import math
 from bisect import bisect
 from collections import defaultdict
@@ -31,7 +32,7 @@ from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import moved
 from ssh_abduction.data.star import Star
-from ssh_abduction.output.drawing import ALARM, COLOURS, escaped, page, svg_text, titled
+from ssh_abduction.output.drawing import ALARM, colour_of, escaped, page, svg_text, titled
 from ssh_abduction.output.region_marks import band, banded
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.robot_logs.edges import STEP, edges_of, resampled
@@ -92,11 +93,6 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
             "Red shows the probability of a doubtful join."
         )
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
-
-
-def colour_of(drive: int) -> str:
-    """Return the colour of a drive, by its index."""
-    return COLOURS[drive % len(COLOURS)]
 
 
 def legend(drives: Sequence[Drive]) -> str:
@@ -210,7 +206,7 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     lines: dict[str, list[Array]] = defaultdict(list)
     for step, course in edges:
         path = path_of[ssh_map.dstate_at[step]] or 0
-        colour = COLOURS[path % len(COLOURS)] if colourful else EDGE
+        colour = colour_of(path) if colourful else EDGE
         if len(sheet.bounds) > 2:
             colour = colour_of(sheet.drive_of(imported.visits[visit_of[step]].scan))
         lines[colour].append(course)
@@ -450,21 +446,19 @@ def _fitted(
     spots: Sequence[Pose], pairs: Sequence[tuple[int, int]], ssh_map: SSHMap | None
 ) -> Pose:
     """Fit the rigid motion that moves the second step of each pair to the pose of the first."""
-    here, there = [], []
+    # The points as complex numbers, and points a metre ahead of them.
+    here: list[complex] = []
+    there: list[complex] = []
     for first, second in pairs:
-        x, y, heading = spots[first]
-        u, v, other = spots[second]
-        heading += _turned(ssh_map, first, second)
-        there += [(x, y), (x + math.cos(heading), y + math.sin(heading))]
-        here += [(u, v), (u + math.cos(other), v + math.sin(other))]
+        for ends, (x, y, heading), more in (
+            (there, spots[first], _turned(ssh_map, first, second)),
+            (here, spots[second], 0.0),
+        ):
+            ends += [complex(x, y), complex(x, y) + cmath.rect(1.0, heading + more)]
     source, target = np.array(here), np.array(there)
-    middle, goal = source.mean(axis=0), target.mean(axis=0)
-    (a, b), (c, d) = (source - middle).T, (target - goal).T
-    turn = math.atan2(float((a * d - b * c).sum()), float((a * c + b * d).sum()))
-    cos, sin = math.cos(turn), math.sin(turn)
-    x = goal[0] - cos * middle[0] + sin * middle[1]
-    y = goal[1] - sin * middle[0] - cos * middle[1]
-    return float(x), float(y), turn
+    angle = float(np.angle(np.vdot(source - source.mean(), target - target.mean())))
+    shift = complex(target.mean() - source.mean() * cmath.rect(1.0, angle))
+    return shift.real, shift.imag, angle
 
 
 def _turned(ssh_map: SSHMap | None, first: int, second: int) -> float:

@@ -68,7 +68,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.start import Start as Start
     from ssh_abduction.solver.steps.certificate import RESTS_ON as RESTS_ON
     from ssh_abduction.solver.steps.certificate import Certificate as Certificate
-    from ssh_abduction.solver.steps.log import Outcome as Outcome
     from ssh_abduction.solver.steps.log import observation as observation
     from ssh_abduction.solver.values import Bound as Bound
     from ssh_abduction.solver.values import Cost as Cost
