@@ -143,6 +143,16 @@ def test_closure_decides_between_maps_that_odometry_allows(offset: float) -> Non
         assert pinned.theory.without == ("closure",)
 
 
+@pytest.mark.parametrize(("last", "fits"), [(8, True), (4, False)])
+def test_map_of_least_cost_has_no_probability_if_it_fits_badly(last: int, fits: bool) -> None:
+    """A closure agrees with the odometry, or puts opposite corners of the square at one place."""
+    solution = solve(closed(0, last, (0.0, 0.0, 0.0)))
+    assert solution.weighed is not None
+    assert solution.weighed.proven
+    assert (solution.confidence > 0.9) is fits
+    assert ("the best map does not fit the displacements" in solution.weighed.sentence) is not fits
+
+
 def test_closure_sentence_names_the_offset() -> None:
     trace = closed(1, 9, (0.05, 0.05, 0.0))
     theory = Theory.topological().replace(star="none", boundary="none")

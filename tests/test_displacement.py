@@ -285,6 +285,14 @@ def test_warning_if_the_noise_model_is_wrong(factor: float, said: str | None) ->
     )
 
 
+def test_warning_gives_a_limit_if_displacements_are_exact() -> None:
+    square = [(10, 0, 0), (0, 0, math.pi / 2)] * 4
+    (warning,) = solve(
+        Trace.from_steps("abcdefgha", ["travel", "left"] * 4, displacements=square)
+    ).warnings
+    assert "its standard deviations are at least 100 times larger than the errors" in warning
+
+
 def test_no_noise_warning_for_a_map_without_returns() -> None:
     """Turns on the spot fit exactly. A chi-square of 0 for them is no sign of too much noise."""
     trace = Trace.from_steps(

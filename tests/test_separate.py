@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from brute_force import consistent_maps
 
-from ssh_abduction import Theory, Trace, check, solve
+from ssh_abduction import SSHMap, Theory, Trace, check, solve
 from ssh_abduction.cli import main, outcome
-from ssh_abduction.solver import Search, Status
+from ssh_abduction.solver import Search, Status, candidates
+from ssh_abduction.solver.fallback import clash_in
 from ssh_abduction.solver.guesses.separate import separate_map
 from ssh_abduction.theory.settle import settle
 
@@ -69,3 +71,27 @@ def test_clash_of_a_whole_visit_is_found_after_the_limit(
     told = capsys.readouterr().out
     assert told.startswith("unsatisfiable: no map satisfies the axioms: in steps ")
     assert " some clash\nlook at what was seen and done from " in told
+
+
+def wrong_turn() -> Trace:
+    """Right, then left: the same heading by the axioms, and 0.8 rad off by the odometry."""
+    turned = [(0, 0, -1.57), (0, 0, -1.57), (0, 0, 0.8)]
+    done = ["right", "right", "left"]
+    return Trace.from_steps("abcb", done, displacements=turned, stars=[(1, 1, 1, 1)] * 4)
+
+
+def test_clash_of_turns_within_a_visit_uses_displacements() -> None:
+    trace, within = wrong_turn(), range(1, 4)
+
+    def maps_of(trace: Trace, theory: Theory) -> tuple[tuple[SSHMap, ...], bool]:
+        solution = solve(trace, theory)
+        return solution.maps, solution.status is not Status.FEASIBLE
+
+    assert clash_in(trace, settle(trace, None).theory, [within], maps_of) == within
+
+
+def test_steps_at_which_a_refused_map_breaks_axioms_come_from_one_check() -> None:
+    search = Search(wrong_turn())
+    with patch.object(candidates, "violations", side_effect=AssertionError):
+        search._parts.candidates.sketch()
+    assert search._parts.candidates.contradicting == {3: None}

@@ -494,6 +494,7 @@ def test_sentence_names_the_most_probable_missed_join() -> None:
     apart = Rival(10.5, (0, 1, 2, 3), (0, 1, 2, 3))
     doubtful = replace(weighed, rivals=(*rivals, apart))
     assert doubtful.sentence.endswith("; the most doubtful join is of steps 0 and 2 (0.69)")
+    assert replace(doubtful, broken=30.0).sentence.endswith("(0.69 if the axioms hold)")
     assert replace(weighed, rivals=(best,)).missed is None
     turned = replace(weighed, rivals=(best, Rival(11.0, (0, 1, 2, 3), (0, 1, 0, 2))))
     assert turned.sentence.endswith(

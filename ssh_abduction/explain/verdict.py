@@ -187,7 +187,8 @@ class PairExplanation:
             counts = f"{_effect(price)} for its parts ({', '.join(priced) or 'the same counts'})"
         loop = f": {self.loop}" if self.loop else ""
         laying = " and of laying drives on each other" if self.theory.several_drives else ""
-        return f"{what} {counts} and {_effect(misfit)} of misfit{laying}{loop}"
+        effect = _effect(misfit) if abs(misfit) >= 0.05 else "0.0 nats"
+        return f"{what} {counts} and {effect} of misfit{laying}{loop}"
 
     @property
     def assuming(self) -> dict[str, str]:

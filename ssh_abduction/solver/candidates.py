@@ -254,18 +254,16 @@ class Candidates:
     def _offer_or_blame(self, ssh_map: SSHMap) -> None:
         """Offer a map. If no map is known then, note the steps at which this one breaks axioms."""
         self.offer(ssh_map)
-        if self._known.best is None:
-            whole = self._with_unknown_views(ssh_map)
-            broken = next(violations(self._trace, whole, self._task.theory), None)
-            if broken is not None and broken.steps:
-                last = max(broken.steps)
-                # The next travel may put these steps on a path.
-                later = (
-                    t
-                    for t in range(last, len(self._trace) - 1)
-                    if self._trace.actions[t].kind == "travel"
-                )
-                self.contradicting |= dict.fromkeys((next(later, last - 1) + 1, last))
+        broken = self._judging.broken
+        if self._known.best is None and broken is not None and broken.steps:
+            last = max(broken.steps)
+            # The next travel may put these steps on a path.
+            later = (
+                t
+                for t in range(last, len(self._trace) - 1)
+                if self._trace.actions[t].kind == "travel"
+            )
+            self.contradicting |= dict.fromkeys((next(later, last - 1) + 1, last))
 
     def _offer_mended(self) -> None:
         """Offer a map made without a search. Treat steps that contradict it as wrong."""

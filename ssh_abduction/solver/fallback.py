@@ -69,8 +69,10 @@ def clash_in(
         if any(step.action and step.action.starts for step in steps):
             continue
         piece = Trace((*steps, replace(last, action=None)), odometry=trace.odometry)
-        # The axiom one_pose compares the first steps of visits, so it needs whole visits.
-        axioms = counting if _begins_visit(trace, found.start) else bare
+        # The axiom one_pose compares the first steps of visits. So a stretch of several visits
+        # must begin with a whole one.
+        is_one_visit = not any(_begins_visit(trace, t) for t in found[1:])
+        axioms = counting if is_one_visit or _begins_visit(trace, found.start) else bare
         part = axioms.of_steps(found.start, len(found))
         if has_quick_map(piece, part):
             continue
@@ -82,7 +84,7 @@ def clash_in(
 
 def _begins_visit(trace: Trace, step: int) -> bool:
     """Whether a visit to a place begins at a step."""
-    return step == 0 or trace.actions[step - 1].kind == "travel"
+    return step == 0 or trace.actions[step - 1].kind != "turn"
 
 
 def _stretches(trace: Trace, ends: Sequence[int]) -> Iterator[range]:

@@ -35,13 +35,18 @@ class InternalError(AbductionError):
 
 
 class Judging:
-    """Judges the maps of one search: by the evidence, and by the checker."""
+    """Judges the maps of one search: by the evidence, and by the checker.
+
+    Attributes:
+        broken: The first axiom that the map breaks which was judged last; None if it breaks none.
+    """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._trace = problem.trace
         theory = self._theory = problem.theory
         self._evidence = problem.evidence
+        self.broken: Violation | None = None
         self._accepted: SSHMap | None = None  # the map that the checker accepted last
         self._judged = 0
         self._seconds = 0.0  # spent on checking so far
@@ -87,9 +92,11 @@ class Judging:
 
     def accepts_grown(self, ssh_map: SSHMap, since: int) -> bool:
         """Accept a map as `accepts` does. The evidence accepted its first `since` steps already."""
+        if not self.can_accept:
+            return False
+        self.broken = next(violations(self._trace, ssh_map, self._theory, since), None)
         return (
-            self.can_accept
-            and next(violations(self._trace, ssh_map, self._theory, since), None) is None
+            self.broken is None
             and self.allows_grown(self._trace, ssh_map, since)
             and keeps_own_rules(self._problem, ssh_map)
         )

@@ -115,6 +115,19 @@ def doubt_of(problem: Problem, best: SSHMap) -> str | None:
     return None
 
 
+def misfit_of(problem: Problem, best: SSHMap) -> str | None:
+    """Say that the best map contradicts the displacements, if it does; else None.
+
+    A map that costs least may still be false: the displacements, or the axioms, may be wrong.
+    """
+    from ssh_abduction.solver.geometry.fit import fit  # loads scipy
+
+    believed = problem.trace.without_displacements_at(jumped(best))
+    if fit(believed, best).p >= problem.theory.reject:
+        return None
+    return "the best map does not fit the displacements"
+
+
 def maps_apart(
     problem: Problem, misfit: Misfit, best: SSHMap, pair: tuple[int, int], seconds: float
 ) -> Iterator[SSHMap]:

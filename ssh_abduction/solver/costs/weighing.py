@@ -51,6 +51,7 @@ from ssh_abduction.solver.costs.estimating import (
     dstates_and_places,
     least_places,
     may_join_more,
+    misfit_of,
     rival_of,
     rivals_of,
 )
@@ -376,6 +377,9 @@ class Weighing:
         found, excess = list(rivals.values()), self._excess()
         problem = self._parts.task.problem
         is_likely = excess < math.inf and not may_join_more(problem, found)
+        doubt = doubt_of(problem, self.candidates[0].map)
+        if self.proven and not 1 < excess < math.inf:
+            doubt = doubt or misfit_of(problem, self.candidates[0].map)
         return Weighed(
             bound=self.bound,
             within=self._within if self.proven else 0.0,
@@ -383,7 +387,7 @@ class Weighing:
             searched=is_likely and self._beams.found(self.candidates[0].nats),
             broken=self._beams.broken,
             excess=excess if excess < math.inf else 1.0,
-            doubt=doubt_of(problem, self.candidates[0].map),
+            doubt=doubt,
             drives=drives_of(problem.trace),
         )
 

@@ -192,4 +192,6 @@ def units_warning(trace: Trace) -> str | None:
 
 def _times(factor: float) -> str:
     """Say a factor, or its inverse if that is larger, in words."""
+    if factor == NEVER_LESS:
+        return f"at least {1 / factor:g} times"
     return f"{max(factor, 1 / factor):.1f} times"

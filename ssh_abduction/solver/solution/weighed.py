@@ -224,19 +224,21 @@ class Weighed:
             if self.proven or self.searched
             else f"a map that costs {self.nats - self.bound:.1f} nats less may exist"
         )
+        given = ""
         if self.broken > SAID:
             text += f"; a map that breaks axioms costs {self.broken:.1f} nats less"
+            given = " if the axioms hold"
         elif self.searched and not self.proven:
             least = math.floor(100 * self.bound / self.nats)
             text += f" (not proven: no map costs less than {least} % of this one)"
         doubted = 1 - self.joins[0][2] if self.joins else 0.0
         if self.missed and self.missed[2] > max(doubted, DOUBTED):
             first, second, probability = self.missed
-            sure = probability_in_words(probability)
+            sure = probability_in_words(probability) + given
             return f"{text}; steps {first} and {second} may be at one place, too ({sure})"
         if self.unsure and doubted <= DOUBTED <= self.unsure[2] <= 1 - DOUBTED:
             first, second, probability = self.unsure
-            sure = probability_in_words(probability)
+            sure = probability_in_words(probability) + given
             two = "two dstates of one place" if self.rivals[0].places else "two dstates"
             return (
                 f"{text}; steps {first} and {second} are one dstate with probability {sure}, "
@@ -249,8 +251,8 @@ class Weighed:
         if not (self.proven or self.searched):
             if len(self.rivals) == 1:
                 return f"{text}; no other map was found, so it is unknown which joins are doubtful"
-            sure += f" among the {len(self.rivals)} maps found"
-        return f"{text}; the most doubtful join is of steps {first} and {second} ({sure})"
+            given = f" among the {len(self.rivals)} maps found"
+        return f"{text}; the most doubtful join is of steps {first} and {second} ({sure}{given})"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the costs as plain data."""
