@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -17,9 +16,9 @@ from perception.places.following import _matched
 from perception.places.local_map import CELL, PackedPatch, Patch
 from perception.places.matching import Match, Scene, Turned, match
 from perception.places.tracing import closure_of, to_trace
-from perception.places.track import Track, Trust, points_turned
+from perception.places.track import Track, odometer_covariance, points_turned
 from perception.places.visits import Visit
-from perception.places.walls import MARGIN
+from perception.places.walls import Surfaces
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.odometry import displacement_between
 
@@ -167,35 +166,14 @@ def test_match_against_the_odometer_gets_a_large_covariance(share: float, is_wid
     seen = walls.copy()
     astray = np.arange(len(walls)) % 100 >= 100 * share
     seen[astray] *= 0.4  # people in the room
-    prior = Trust().covariance((0.0, 0.0, 0.0))
-    recent = deque([(walls, normals)])
+    still = (0.0, 0.0, 0.0)
+    recent = [Surfaces(walls, normals)]
     pose, covariance, found = _matched(
-        seen, normals, recent, (0.0, 0.0, 0.0), (0.0, 0.0, 0.5), prior
+        Surfaces(seen, normals), recent, still, (0.0, 0.0, 0.5), odometer_covariance(still)
     )
     assert abs(pose[2]) < 0.05
     assert found == pytest.approx(share, abs=0.1)
     assert bool(covariance[2, 2] > 0.4**2) is is_wide
-
-
-def test_walls_far_from_a_scan_count_if_the_match_needs_them(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The odometer turned by 0.3 radians, so a wall 21 m away is far outside of the scan."""
-    along = np.linspace(-3, 3, 61)
-    sides = [(along, np.full(61, 1.5)), (along, np.full(61, -1.5))]
-    sides.append((np.full(61, 20.0), along / 3 - 7))
-    walls = np.concatenate([np.stack(side, axis=1) for side in sides])
-    normals = np.repeat([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], 61, axis=0)
-    recent, turned = deque([(walls, normals)]), (0.0, 0.0, 0.3)
-    found = []
-    for margin in (MARGIN, math.inf):
-        monkeypatch.setattr("perception.places.walls.MARGIN", margin)
-        prior = Trust().covariance(turned)
-        found.append(_matched(walls, normals, recent, (0.0, 0.0, 0.0), turned, prior))
-    (pose, covariance, share), (same, other, equal) = found
-    assert (pose, share) == (same, equal)
-    assert share > 0.9
-    assert (covariance == other).all()
 
 
 @pytest.mark.parametrize("block", [1, 2, 3, 4, 7, 8, 9])

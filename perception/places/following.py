@@ -25,13 +25,12 @@ from perception.places.jumps import Doubt, Unknown, is_missing, unknown_steps
 from perception.places.track import (
     Array,
     Track,
-    Trust,
-    points_moved,
+    covariance_turned,
+    odometer_covariance,
     points_turned,
-    rotation,
     wrapped,
 )
-from perception.places.walls import MOVED, ScanFit, in_sight, surfaces
+from perception.places.walls import ScanFit, Surfaces, in_sight, surfaces_in
 from perception.readers.scans import Pose, RobotLog, Scan
 from perception.readers.stored import in_turn
 from ssh_abduction.data.odometry import displacement_between, moved
@@ -67,15 +66,13 @@ ALIKE = 0.03
 ROW = 3 + 9 + 1
 
 
-def follow(log: RobotLog, trust: Trust | None = None) -> Track:
+def follow(log: RobotLog) -> Track:
     """Compute the trajectory of a robot from its log, by odometry and scan matching.
 
-    Corrected poses are not read. `trust` has the standard deviations of errors of the odometer;
-    None for a typical odometer.
+    Corrected poses are not read.
     """
     steps = unknown_steps(log)
-    follower = _Follower(log, trust or Trust(), steps)
-    track = follower.followed(steps.carried)
+    track = _track_of(log, steps)
     # People or an arm of the robot can change what the laser sees while the robot stands.
     standing = frozenset(
         k
@@ -85,28 +82,19 @@ def follow(log: RobotLog, trust: Trust | None = None) -> Track:
         <= CARRIED
     )
     if standing:
-        follower = replace(follower, steps=steps.without(standing))
-        track = follower.followed(steps.carried)
+        steps = steps.without(standing)
+        track = _track_of(log, steps)
     if more := frozenset(_carried(log, track)):
-        track = follower.followed(steps.carried | more)
+        track = _track_of(log, replace(steps, carried=steps.carried | more))
     return track
 
 
-@dataclass(frozen=True)
-class _Follower:
-    """Computes the track of a log."""
-
-    log: RobotLog
-    trust: Trust
-    steps: Unknown
-
-    def followed(self, carried: frozenset[int]) -> Track:
-        """Make the track, which is broken before each scan to which the robot was carried."""
-        steps, done = replace(self.steps, carried=carried), GrowingTrack()
-        scans = in_turn(self.log.scans)
-        for one in poses_of_scans(scans, lambda i, _: steps.doubt_of(i), self.trust):
-            done.add(one)
-        return done.track
+def _track_of(log: RobotLog, steps: Unknown) -> Track:
+    """Make the track, which is broken before each scan to which the robot was carried."""
+    done = GrowingTrack()
+    for one in poses_of_scans(in_turn(log.scans), lambda i, _: steps.doubt_of(i)):
+        done.add(one)
+    return done.track
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -168,31 +156,31 @@ class GrowingTrack:
 
 
 def poses_of_scans(
-    scans: Iterable[Scan], doubt_of: Callable[[int, Pose], Doubt], trust: Trust
+    scans: Iterable[Scan], doubt_of: Callable[[int, Pose], Doubt]
 ) -> Iterator[Followed]:
     """Compute the pose of each scan from the scans before it, and yield it before the next is read.
 
     `doubt_of` takes the index of a scan and the motion from the previous scan by odometry. It says
-    how far this motion can be trusted. `trust` has the standard deviations of errors of odometry.
+    how far this motion can be trusted.
     """
-    recent: deque[tuple[Array, Array]] = deque(maxlen=RECENT)
+    recent: deque[Surfaces] = deque(maxlen=RECENT)
     last: Followed | None = None
     before: Pose = (0.0, 0.0, 0.0)
     for i, scan in enumerate(scans):
-        points, normals = surfaces(scan)
+        seen = surfaces_in(scan)
         if last is None:
             one = Followed(scan, (0.0, 0.0, 0.0))
         else:
             onward = displacement_between(last.scan.odometry, scan.odometry)
-            step = _ScanMotion(scan, points, normals, recent, last.pose, onward, before, trust)
+            step = _ScanMotion(scan, seen, recent, last.pose, onward, before)
             one = step.judged(doubt_of(i, onward))
             one = one if in_sight(scan).any() else replace(one, share=math.nan)
             before = displacement_between(last.pose, one.pose)
         if one.broken:
             recent.clear()
         # Walls are remembered while the laser sees none.
-        if len(points) or not recent:
-            recent.append((points_moved(one.pose, points), points_turned(one.pose[2], normals)))
+        if len(seen) or not recent:
+            recent.append(seen.moved(one.pose))
         last = one
         yield one
 
@@ -203,39 +191,32 @@ class _ScanMotion:
 
     Attributes:
         scan: The next scan.
-        points: (m, 2) its points in metres.
-        normals: (m, 2) their unit normals.
-        recent: Points and normals of previous scans, in the frame of the track.
+        seen: The surfaces that it shows.
+        recent: The surfaces in previous scans, in the frame of the track.
         last: Pose of the previous scan.
         onward: The motion by odometry.
         before: The motion to the previous scan.
-        trust: Standard deviations of the errors of the odometer.
     """
 
     scan: Scan
-    points: Array
-    normals: Array
-    recent: deque[tuple[Array, Array]]
+    seen: Surfaces
+    recent: deque[Surfaces]
     last: Pose
     onward: Pose
     before: Pose
-    trust: Trust
 
     def judged(self, doubt: Doubt) -> Followed:
         """Match the scan: with the odometry if it can be trusted, otherwise without."""
-        nowhere = Followed(
-            self.scan, self.last, self.trust.covariance((0.0, 0.0, 0.0)), 0.0, True, True
-        )
+        still = odometer_covariance((0.0, 0.0, 0.0))
+        nowhere = Followed(self.scan, self.last, still, 0.0, True, True)
         if doubt is Doubt.CARRIED:
             return nowhere
         if doubt is Doubt.UNKNOWN:
             return self._without_odometry() or nowhere
-        prior = self.trust.covariance(self.onward)
+        prior = odometer_covariance(self.onward)
         # An odometer that misses a large turn mostly stands still.
         most = TURNED if 0 < math.hypot(*self.onward[:2]) < 2 * NEARBY else math.pi
-        found = _matched(
-            self.points, self.normals, self.recent, self.last, self.onward, prior, most
-        )
+        found = _matched(self.seen, self.recent, self.last, self.onward, prior, most)
         if found[2] < POOR and doubt in (Doubt.DOUBTFUL, Doubt.SEAM):
             if other := self._without_odometry():
                 return other
@@ -244,24 +225,17 @@ class _ScanMotion:
         return Followed(self.scan, *found)
 
     def _without_odometry(self) -> Followed | None:
-        found = _bridged(self.points, self.normals, self.recent, self.last, self.before)
-        return found and Followed(self.scan, *found, cut=True)
+        """Match the scan without odometry; None if it does not match.
 
-
-def _bridged(
-    points: Array, normals: Array, recent: deque[tuple[Array, Array]], last: Pose, before: Pose
-) -> tuple[Pose, Array, float] | None:
-    """Match a scan without odometry.
-
-    Two guesses are tried: the robot moved as it did before, or it stood still. Returns the pose,
-    its covariance, and the share of points on walls; None if neither guess matches.
-    """
-    wide = np.diag(UNKNOWN) ** 2
-    onward, stayed = (
-        _matched(points, normals, recent, last, guess, wide) for guess in (before, (0.0, 0.0, 0.0))
-    )
-    best = stayed if stayed[2] > onward[2] + ALIKE else onward
-    return best if best[2] >= SURE else None
+        Two guesses are tried: the robot moved as it did before, or it stood still.
+        """
+        wide = np.diag(UNKNOWN) ** 2
+        onward, stayed = (
+            _matched(self.seen, self.recent, self.last, guess, wide)
+            for guess in (self.before, (0.0, 0.0, 0.0))
+        )
+        best = stayed if stayed[2] > onward[2] + ALIKE else onward
+        return Followed(self.scan, *best, cut=True) if best[2] >= SURE else None
 
 
 def _carried(log: RobotLog, track: Track) -> list[int]:
@@ -280,19 +254,12 @@ def _carried(log: RobotLog, track: Track) -> list[int]:
         ):
             continue
         begin = max(0, i - RECENT, *(b for b in (*track.breaks, *found) if b <= i))
-        known: deque[tuple[Array, Array]] = deque()
-        for k in range(begin, i):
-            points, normals = surfaces(log.scans[k])
-            known.append(
-                (points_moved(track.poses[k], points), points_turned(track.poses[k, 2], normals))
-            )
-        wide = np.diag(UNKNOWN) ** 2
-        if not sum(len(walls) for walls, _ in known):
+        known = [surfaces_in(log.scans[k]).moved(track.poses[k]) for k in range(begin, i)]
+        if not any(map(len, known)):
             continue
+        wide = np.diag(UNKNOWN) ** 2
         shares = [
-            _matched(
-                *surfaces(log.scans[k]), known, (*track.poses[k].tolist(),), (0.0, 0.0, 0.0), wide
-            )[2]
+            _matched(surfaces_in(log.scans[k]), known, track.pose(k), (0.0, 0.0, 0.0), wide)[2]
             for k in range(i, i + IN_A_ROW)
         ]
         # The scans must match each other; otherwise the laser sees nothing.
@@ -321,9 +288,8 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
 
 
 def _matched(
-    points: Array,
-    normals: Array,
-    recent: deque[tuple[Array, Array]],
+    seen: Surfaces,
+    recent: Iterable[Surfaces],
     last: Pose,
     onward: Pose,
     prior: Array,
@@ -335,19 +301,13 @@ def _matched(
     heading differs by at most `most` radians. Returns the pose; the covariance of the motion, in
     the frame of the robot at the previous scan; and the share of the points on walls.
     """
-    turn: Array = np.eye(3)
-    turn[:2, :2] = rotation(last[2])
-    walls, wall_normals = (np.concatenate(parts) for parts in zip(*recent, strict=True))
+    walls = Surfaces.joined(recent)
     guess: Array = np.array(moved(last, onward))
-    weight: Array = np.asarray(np.linalg.inv(turn @ prior @ turn.T), np.float64)
+    weight: Array = np.asarray(np.linalg.inv(covariance_turned(last[2], prior)), np.float64)
     pose, information, share = guess, weight, 0.0
-    if len(walls) and len(points):
-        kept = np.unique(np.linspace(0, len(points) - 1, min(len(points), POINTS)).astype(int))
-        fit = ScanFit(points[kept], normals[kept], walls, wall_normals)
-        share, pose, information = fit.near(guess).improved(guess, weight)
-        moves = points_moved(pose, fit.points) - points_moved(guess, fit.points)
-        if share < POOR or np.abs(moves).max() > MOVED:
-            share, pose, information = fit.improved(guess, weight)
+    if len(walls) and len(seen):
+        fit = ScanFit(seen.some(POINTS), walls)
+        share, pose, information = fit.improved(guess, weight)
         # A poor match may have a wrong heading: try others.
         if share < POOR:
             turns = (wrapped(2 * math.pi * k / HEADINGS) for k in range(HEADINGS))
@@ -357,9 +317,9 @@ def _matched(
             )
             if best[0] > 1.5 * share:
                 share, pose, information = best
-    covariance = np.asarray(turn.T @ _accumulating(information, weight) @ turn)
-    astray = turn.T @ (pose - guess)
-    astray[2] = wrapped(float(astray[2]))
+    covariance = covariance_turned(-last[2], _accumulating(information, weight))
+    off = pose - guess
+    astray = np.array([*points_turned(-last[2], off[:2]), wrapped(float(off[2]))])
     if share < CLEAR and astray @ np.linalg.solve(prior, astray) > CONTRARY:
         covariance += np.diag(astray**2)
     return (float(pose[0]), float(pose[1]), wrapped(float(pose[2]))), covariance, share

@@ -21,7 +21,7 @@ from perception.places import jumps, log_checks
 from perception.places.agreement import disagreement
 from perception.places.distinctive import WIDTH, visits_of
 from perception.places.following import Followed, GrowingTrack, poses_of_scans, turned_wrongly
-from perception.places.track import Track, Trust
+from perception.places.track import Track
 from perception.places.units import LEAST_WAY, Units, units_of
 from perception.places.visits import Visit
 from perception.readers.scans import Damage, RobotLog, Scan
@@ -108,7 +108,7 @@ class LiveLog:
     def _followed(self) -> Iterator[Followed]:
         """Follow the robot, and keep what is needed of each scan."""
         scans = watched(self._scans_of(), self._tell, self._source)
-        for one in poses_of_scans(scans, jumps.LiveJumps(), Trust()):
+        for one in poses_of_scans(scans, jumps.LiveJumps()):
             self._keep(one)
             if len(self._scans) == COMPARED:
                 self._compare()

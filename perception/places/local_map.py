@@ -15,14 +15,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from perception.places.masks import Bools, grown, shrunk
 from perception.places.recent import Recent
 from perception.places.track import Array
 
+Bools = NDArray[np.bool_]
 Cells = NDArray[np.int32]
 Cell = tuple[int, int]
 
+# A cell and its eight neighbours.
+EIGHT = np.ones((3, 3), np.bool_)
 # Side of a cell in metres.
 CELL = 0.1
 # Beams are ignored beyond this many metres, as gaps between them grow too wide.
@@ -186,10 +189,10 @@ class LocalMaps:
         passed, met = self._passed[cells], self._met[cells]
         occupied = (met > 0) & (met >= OCCUPIED * (met + passed))
         trail = self._trail(begin, end, first, passed.shape)
-        free = ((passed > 0) & ~occupied) | grown(grown(trail))
+        free = ((passed > 0) & ~occupied) | ndimage.binary_dilation(trail, EIGHT, 2)
         # A cell between two beams may have been missed. So close gaps of up to two cells, but do
         # not free cells with an obstacle.
-        closed = shrunk(grown(np.pad(free, 1)))[1:-1, 1:-1]
+        closed = ndimage.binary_closing(np.pad(free, 1), EIGHT)[1:-1, 1:-1]
         return Patch((free | closed) & ~(occupied & ~free), occupied & ~trail, trail, first * CELL)
 
     def _trail(

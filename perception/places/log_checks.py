@@ -15,7 +15,7 @@ import numpy as np
 from perception.errors import LogError
 from perception.places import jumps
 from perception.places.following import share_failing
-from perception.places.track import Array, Track, Trust, wrapped
+from perception.places.track import Array, Track, odometer_covariance, wrapped
 from perception.places.units import FAR_OFF, LEAST_WAY, SIDEWAYS, SPARSE, ahead, units_of, way_of
 from perception.readers.scans import RobotLog
 from perception.readers.stored import in_turn
@@ -301,12 +301,12 @@ def _beams_of(log: RobotLog) -> float:
 
 def _overriding(log: RobotLog, track: Track) -> float:
     """The share of the steps in which matching contradicts the odometry."""
-    trust, count = Trust(), 0
+    count = 0
     for i in range(1, len(log)):
         measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)
         seen = displacement_between(track.pose(i - 1), track.pose(i))
         off = np.array([*np.subtract(seen[:2], measured[:2]), wrapped(seen[2] - measured[2])])
-        spread = np.diag(trust.covariance(measured))
+        spread = np.diag(odometer_covariance(measured))
         count += i not in track.cuts and float((off**2 / spread).sum()) > CONTRADICTS
     return count / max(len(log) - 1, 1)
 

@@ -28,8 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from perception.places.local_map import CELL, Patch
-from perception.places.masks import Bools, box_of, grown, near, shrunk
+from perception.places.local_map import CELL, EIGHT, Bools, Patch
 from perception.places.thinning import Edge, Graph, Node, graph_of, thinned
 from perception.places.track import Array
 
@@ -50,7 +49,6 @@ SHORE, WIDE = 3.0, 1.5
 # A node of a skeleton with its branches: (n, 2) rows and columns each.
 Fork = tuple[Node, list[Array]]
 
-_EIGHT = np.ones((3, 3), bool)
 Bend = tuple[Node, list[Array]]
 
 # A line bends at a cell if it turns there by at least this many radians. Ways out that differ by
@@ -126,7 +124,7 @@ def open_space(distance: Array, far: float) -> Bools:
     """
     if distance.max() < WIDE * far:
         return np.zeros(distance.shape, np.bool_)
-    parts, count = ndimage.label(distance > far, _EIGHT)
+    parts, count = ndimage.label(distance > far, EIGHT)
     is_open = np.zeros(count + 1, np.bool_)
     is_open[parts[distance >= WIDE * far]] = True
     return np.asarray(is_open[parts])
@@ -147,10 +145,12 @@ def passable(patch: Patch, room: float) -> Bools:
 
     Furniture does not count as an obstacle.
     """
-    trail = grown(patch.trail)
-    fits = (patch.free & ~near(patch.occupied, room, CELL)) | trail
-    fits = grown(shrunk(fits)) | trail
-    parts, count = ndimage.label(fits, _EIGHT)
+    trail = ndimage.binary_dilation(patch.trail, EIGHT)
+    span = np.arange(-int(room / CELL), int(room / CELL) + 1)
+    disc = np.hypot(*np.meshgrid(span, span)) * CELL < room
+    fits = (patch.free & ~ndimage.binary_dilation(patch.occupied, disc)) | trail
+    fits = ndimage.binary_opening(fits, EIGHT) | trail
+    parts, count = ndimage.label(fits, EIGHT)
     is_reached = np.zeros(count + 1, np.bool_)
     is_reached[parts[trail]] = True
     reached = is_reached[parts]
@@ -164,9 +164,7 @@ def passable(patch: Patch, room: float) -> Bools:
 
 
 def _distances(mask: Bools) -> Array:
-    found, box = np.zeros(mask.shape), box_of(mask)
-    found[box] = ndimage.distance_transform_edt(np.pad(mask[box], 1))[1:-1, 1:-1]
-    return found
+    return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1])
 
 
 def pruned(graph: Graph) -> Graph:

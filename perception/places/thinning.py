@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from perception.places.masks import Bools, box_of
+from perception.places.local_map import EIGHT, Bools
 from perception.places.track import Array
 
-_EIGHT = np.ones((3, 3), bool)
 # Steps to the eight neighbours of a cell, those with a common side first.
 _STEPS = sorted(
     set(product((-1, 0, 1), repeat=2)) - {(0, 0)},
@@ -120,10 +119,7 @@ def thinned(mask: Bools) -> Bools:
     # The import takes a while, and only logs need it.
     from skimage.morphology import skeletonize
 
-    lines, box = np.zeros_like(mask), box_of(mask)
-    if mask.any():
-        lines[box] = skeletonize(np.ascontiguousarray(mask[box]))
-    return lines
+    return np.asarray(skeletonize(mask))
 
 
 def graph_of(lines: Bools, distance: Array) -> Graph:
@@ -167,7 +163,7 @@ def _with_neighbours(lines: Bools, steps: Sequence[int], counts: range) -> NDArr
 
 def _parts(mask: Bools) -> list[list[int]]:
     """The connected parts of a mask, each as the numbers of its cells, ascending."""
-    labels, count = ndimage.label(mask, _EIGHT)
+    labels, count = ndimage.label(mask, EIGHT)
     parts: list[list[int]] = [[] for _ in range(count)]
     cells = np.flatnonzero(mask)
     for cell, label in zip(cells.tolist(), labels.ravel()[cells].tolist(), strict=True):

@@ -15,6 +15,11 @@ from perception.readers.scans import Pose
 
 Array = NDArray[np.float64]
 
+# Standard deviations of the errors of a typical odometer from one scan to the next. The error along
+# the motion is WAY times its length plus OFFSET metres. The error across has half of that share.
+# The error of the heading, in radians, is TURNING times the turn, DRIFT for each metre, and ANGLE.
+WAY, OFFSET = 0.1, 0.03
+TURNING, DRIFT, ANGLE = 0.1, 0.02, 0.02
 # The sums of covariances are kept for each BLOCK-th scan.
 BLOCK = 256
 
@@ -139,27 +144,9 @@ def points_moved(pose: Pose | Array, points: Array) -> Array:
     return np.asarray(points_turned(pose[2], points) + np.asarray(pose[:2]))
 
 
-@dataclass(frozen=True)
-class Trust:
-    """Standard deviations of the errors of an odometer from one scan to the next.
-
-    Attributes:
-        way: Error along the motion, as a share of its length. The error across is half of it.
-        offset: Additional error of the position, in metres.
-        turning: Error of the heading, as a share of the turn.
-        drift: Error of the heading for each metre, in radians.
-        angle: Additional error of the heading, in radians.
-    """
-
-    way: float = 0.1
-    offset: float = 0.03
-    turning: float = 0.1
-    drift: float = 0.02
-    angle: float = 0.02
-
-    def covariance(self, onward: Pose) -> NDArray[np.float64]:
-        """Compute the covariance, (3, 3), of a motion by odometry in metres and radians."""
-        way = math.hypot(onward[0], onward[1])
-        along, across = self.offset + self.way * way, self.offset + self.way * way / 2
-        heading = self.angle + self.turning * abs(onward[2]) + self.drift * way
-        return np.diag([along**2, across**2, heading**2])
+def odometer_covariance(onward: Pose) -> Array:
+    """Compute the covariance, (3, 3), of a motion in metres and radians by a typical odometer."""
+    way = math.hypot(onward[0], onward[1])
+    along, across = OFFSET + WAY * way, OFFSET + WAY * way / 2
+    heading = ANGLE + TURNING * abs(onward[2]) + DRIFT * way
+    return np.diag([along**2, across**2, heading**2])

@@ -5,7 +5,8 @@ Points are matched with lines (Chen & Medioni 1992; Censi 2008).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from perception.places.track import Array, points_moved, points_turned, wrapped
-from perception.readers.scans import Scan
+from perception.readers.scans import Pose, Scan
 
 # Longer beams are not matched, in metres, since neighbouring beams are too far apart to show a
 # wall.
@@ -26,13 +27,43 @@ TOGETHER = 3
 # Largest distance in metres from a point to a wall: BEGIN in the first round, then SHRINK times as
 # large in each round, but at least END. ROUNDS is the largest number of rounds.
 BEGIN, END, SHRINK, ROUNDS = 1.0, 0.25, 0.75, 12
-# Walls more than MARGIN metres outside of the box around the points of a scan are far away. A match
-# needs them only if it moves a point by more than MOVED metres.
-MARGIN, MOVED = 3.0, 2.0
 
 
-def surfaces(scan: Scan) -> tuple[Array, Array]:
-    """Find points on smooth surfaces, (m, 2) metres, and unit normals, in the robot's frame."""
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Points on smooth surfaces.
+
+    Attributes:
+        points: (m, 2) metres.
+        normals: (m, 2) unit normals.
+    """
+
+    points: Array
+    normals: Array
+
+    def __len__(self) -> int:
+        """The number of points."""
+        return len(self.points)
+
+    def moved(self, pose: Pose | Array) -> Surfaces:
+        """Transform to the frame that a pose is given in, from the frame of the pose."""
+        return Surfaces(points_moved(pose, self.points), points_turned(pose[2], self.normals))
+
+    def some(self, most: int) -> Surfaces:
+        """Take at most this many points, evenly spread."""
+        kept = np.unique(np.linspace(0, len(self) - 1, min(len(self), most)).astype(int))
+        return Surfaces(self.points[kept], self.normals[kept])
+
+    @staticmethod
+    def joined(several: Iterable[Surfaces]) -> Surfaces:
+        """Make one of several."""
+        parts = [(one.points, one.normals) for one in several]
+        points, normals = map(np.concatenate, zip(*parts, strict=True))
+        return Surfaces(points, normals)
+
+
+def surfaces_in(scan: Scan) -> Surfaces:
+    """Find the smooth surfaces that a scan shows, in the frame of the robot."""
     laser, ranges, good = scan.laser, scan.ranges, in_sight(scan)
     r = np.where(good, ranges, 0.0)
     points = np.stack([r * np.cos(laser.bearings), r * np.sin(laser.bearings)], axis=1)
@@ -56,9 +87,7 @@ def surfaces(scan: Scan) -> tuple[Array, Array]:
         )
         normals[middle][smooth] = normal[smooth]
     on_surface = good & np.isfinite(normals[:, 0])
-    return points_moved(laser.mount, points[on_surface]), points_turned(
-        laser.mount[2], normals[on_surface]
-    )
+    return Surfaces(points[on_surface], normals[on_surface]).moved(laser.mount)
 
 
 def in_sight(scan: Scan) -> NDArray[np.bool_]:
@@ -75,30 +104,16 @@ def products(first: Array, second: Array) -> Array:
 class ScanFit:
     """Moves a scan until its points lie on walls.
 
-    Points are in the frame of the robot, walls in the frame of the track.
+    The scan is in the frame of the robot, and the walls are in the frame of the track.
     """
 
-    points: Array
-    normals: Array
-    walls: Array
-    wall_normals: Array
+    scan: Surfaces
+    walls: Surfaces
 
     @cached_property
     def tree(self) -> cKDTree:
         """The walls. These settings build the tree faster, and queries take no longer."""
-        return cKDTree(self.walls, compact_nodes=False, balanced_tree=False)
-
-    def near(self, pose: Array) -> ScanFit:
-        """Leave out the walls that are far from the points at a pose. The tree is built faster."""
-        (left, low), (right, high) = (
-            edge(points_moved(pose, self.points), axis=0) for edge in (np.min, np.max)
-        )
-        x, y = self.walls.T
-        inside = (x > left - MARGIN) & (x < right + MARGIN)
-        inside &= (y > low - MARGIN) & (y < high + MARGIN)
-        kept = np.flatnonzero(inside)
-        walls, normals = (part.take(kept, axis=0) for part in (self.walls, self.wall_normals))
-        return replace(self, walls=walls, wall_normals=normals)
+        return cKDTree(self.walls.points, compact_nodes=False, balanced_tree=False)
 
     def improved(self, guess: Array, weight: Array) -> tuple[float, Array, Array]:
         """Move a pose until the points lie on the walls, by Gauss-Newton steps.
@@ -108,20 +123,19 @@ class ScanFit:
         """
         information, pose, share = weight, guess, 0.0
         for count in range(ROUNDS):
-            placed = points_moved(pose, self.points)
+            placed = points_moved(pose, self.scan.points)
             distance, nearest = self.tree.query(
                 placed, distance_upper_bound=max(END, BEGIN * SHRINK**count)
             )
             met = np.flatnonzero(np.isfinite(distance))
-            alike = products(
-                points_turned(pose[2], self.normals[met]), self.wall_normals[nearest[met]]
-            )
+            facing = points_turned(pose[2], self.scan.normals[met])
+            alike = products(facing, self.walls.normals[nearest[met]])
             met = met[np.abs(alike) > 0.8]
             share = float((distance[met] < END).sum() / len(placed))
             if len(met) < 5:
                 break
-            normal = self.wall_normals[nearest[met]]
-            off = products(placed[met] - self.walls[nearest[met]], normal)
+            normal = self.walls.normals[nearest[met]]
+            off = products(placed[met] - self.walls.points[nearest[met]], normal)
             arm = placed[met] - pose[:2]
             jacobian = np.column_stack(
                 [normal, arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]]

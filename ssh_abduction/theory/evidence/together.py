@@ -39,8 +39,6 @@ Mask: TypeAlias = NDArray[np.bool_]
 MARGIN = 1e-3
 # How many pairs are computed at once.
 AT_A_TIME = 1_000_000
-# At most this many returns decide which drift of heading is tried first.
-SAMPLE = 300
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ class Together:
         rows: Steps,
         before: Together | None = None,
     ) -> None:
-        """Choose the drift of heading that is tried first. No pair is tested yet.
+        """Keep what pairs are tested with. No pair is tested yet.
 
         `thresholds` has the chi-square above which a pair is rejected, by its degrees of
         freedom. The results of `before`, for the first of these rows and steps, are reused.
@@ -93,12 +91,6 @@ class Together:
         self.rows = rows
         self._reckoning, self._thresholds = reckoning, thresholds
         self._alone: dict[int, _ReturnsAlone] = dict(before._alone) if before else {}
-        self._number: int  # the number of the drift that is tried first
-        self._chosen_among: int  # the number of returns when that drift was chosen
-        if before and len(rows) <= 2 * before._chosen_among:
-            self._number, self._chosen_among = before._number, before._chosen_among
-        else:
-            self._number, self._chosen_among = self._likeliest(), len(rows)
 
     def worst(self, new: Mask) -> tuple[Steps, Steps] | None:
         """Return the later and the earlier row of the pair that is rejected most clearly, or None.
@@ -137,15 +129,15 @@ class Together:
         return [earlier[at : at + size] for at in range(0, len(earlier), size)]
 
     def _unsafe(self, end: int, later: Steps, earlier: Steps, new: Mask) -> tuple[Steps, Steps]:
-        """Find the pairs that the first bound does not accept, for the drift that is tried first.
+        """Find the pairs that the first bound does not accept, without a drift of heading.
 
         Rows `later` end at step `end`. Returns the index of the later and of the earlier row of
         each pair.
         """
-        alone, rows = self._of_each(self._number), self.rows
+        alone, rows = self._of_each(0), self.rows
         first = rows[later, 0]
         inverse = alone.inverse[later]
-        loops = self._loops(self._number)
+        loops = self._loops(0)
         gathered = loops.of_ends(end) @ inverse.T
         before = np.arange(end + 1)[:, None] < first
         # Steps before the beginning of a loop do not count.
@@ -156,9 +148,7 @@ class Together:
             + (inverse * alone.repeated[later]).sum(1)
             + _common_ends(rows[earlier, None], rows[later]) * (inverse @ loops.at_end.ravel())
         )
-        unsafe = ~self._is_safe(
-            share, alone.square[earlier, None] + alone.square[later], self._number
-        )
+        unsafe = ~self._is_safe(share, alone.square[earlier, None] + alone.square[later], 0)
         unsafe &= rows[earlier, 1, None] > first
         unsafe &= (earlier[:, None] < later) & (new[earlier, None] | new[later])
         others, these = np.nonzero(unsafe)
@@ -178,8 +168,7 @@ class Together:
     def _least_excess(self, end: int, later: Steps, earlier: Steps) -> Array:
         """Return the least `_excess` of each pair of returns over all drifts of heading."""
         excess = np.full(len(later), np.inf)
-        others = (number for number in range(len(self._reckoning.bends)) if number != self._number)
-        for number in (self._number, *others):
+        for number in range(len(self._reckoning.bends)):
             left = np.flatnonzero(excess > 0)
             if not len(left):
                 break
@@ -239,20 +228,6 @@ class Together:
             np.maximum((freedom - 1) / freedom * (square - trace**2 / freedom), 0.0)
         )
         return bound
-
-    def _likeliest(self) -> int:
-        """Return the index of the drift with which a sample of the loops closes best."""
-        if not len(self.rows):
-            return 0
-        rows = self.rows[:: max(len(self.rows) // SAMPLE, 1)]
-        numbers = np.arange(len(self._reckoning.bends))
-        closing, covariance = self._reckoning.closings(
-            np.repeat(numbers, len(rows)), *np.tile(rows[:, :2], (len(numbers), 1)).T
-        )
-        squares = _alone(
-            closing, covariance, np.zeros_like(covariance), np.tile(rows[:, 2], len(numbers))
-        ).square
-        return int((squares.reshape(len(numbers), -1).sum(1) + self._reckoning.unlikely).argmin())
 
     def _of_each(self, number: int) -> _ReturnsAlone:
         """Return what is known about each return alone, for the drift with this index."""
