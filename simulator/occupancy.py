@@ -13,14 +13,14 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError, SimulatorWarning
 from ssh_abduction.data.errors import brief, named
-from ssh_abduction.data.files import read_at_most
+from ssh_abduction.data.files import parse_yaml, read_at_most, read_file
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -109,58 +109,26 @@ def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
 
 def read_map_file(path: Path) -> MapFile:
     """Read the YAML file of an occupancy map, but not its image. Raises SimulatorError."""
+    data = read_file(path, LARGEST_TEXT, "the YAML file of an occupancy map", SimulatorError)
     try:
-        fields = _fields(read_at_most(path, LARGEST_TEXT))
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
+        # Scalars stay texts, as in the parser of map_server. PyYAML reads 5e-2 as a text.
+        fields = parse_yaml(data)
+    except ValueError as error:
         raise SimulatorError(
-            f"{named(path)}: expected the YAML file of an occupancy map, got none: {reason}; "
-            "check the path"
+            f"{named(path)}: expected the YAML file of an occupancy map, got {error}; mend it"
         ) from None
-    return _MapFileReader(fields, path).map_file()
-
-
-def _fields(data: bytes) -> dict[str, str | list[str]]:
-    """Parse the fields of a YAML file: a text or a list of texts for each.
-
-    Scalars stay texts, as in the parser of map_server. PyYAML would read 5e-2 as a text and
-    1:30 as a number. Raises ValueError if the file is no YAML, or a field has another form.
-    """
-    import yaml  # Imported here because it loads slowly.
-
-    try:
-        root = yaml.compose(data, Loader=yaml.SafeLoader)
-    except yaml.YAMLError as error:
-        raise ValueError(" ".join(str(error).split())) from None
-    except (RecursionError, ValueError) as error:
-        raise ValueError(
-            "nested too deeply" if isinstance(error, RecursionError) else str(error)
-        ) from None
-    if not isinstance(root, yaml.MappingNode):
-        raise ValueError("no fields in it")
-    found: dict[str, str | list[str]] = {}
-    for key, value in root.value:
-        name, line = (
-            brief(key.value if isinstance(key, yaml.ScalarNode) else "a list or an object"),
-            key.start_mark.line + 1,
+    if not isinstance(fields, dict):
+        raise SimulatorError(
+            f"{named(path)}: expected the YAML file of an occupancy map, got no fields in it; "
+            "name another file"
         )
-        if key.value in found:
-            raise ValueError(f"{name} twice, again in line {line}")
-        if isinstance(value, yaml.ScalarNode):
-            found[key.value] = value.value
-        elif isinstance(value, yaml.SequenceNode) and all(
-            isinstance(item, yaml.ScalarNode) for item in value.value
-        ):
-            found[key.value] = [item.value for item in value.value]
-        elif key.value in FIELDS:
-            raise ValueError(f"an object or a nested list as {name} in line {line}")
-    return found
+    return _MapFileReader(fields, path).map_file()
 
 
 class _MapFileReader:
     """Checks the fields of a map file. Errors name the field that is wrong."""
 
-    def __init__(self, fields: Mapping[str, str | list[str]], path: Path) -> None:
+    def __init__(self, fields: Mapping[str, Any], path: Path) -> None:
         self.fields, self.path = fields, path
 
     def map_file(self) -> MapFile:
@@ -227,7 +195,7 @@ class _MapFileReader:
         return TRUTHS[value.lower()]
 
     @staticmethod
-    def _number(value: str | list[str] | None) -> float:
+    def _number(value: object) -> float:
         """Convert a text to a finite number; NaN for anything else."""
         try:
             number = float(value) if isinstance(value, str) else math.nan

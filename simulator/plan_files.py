@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from simulator.errors import SimulatorError
 from ssh_abduction.data.checks import a_path
 from ssh_abduction.data.errors import brief, named, printable
-from ssh_abduction.data.files import read_at_most
+from ssh_abduction.data.files import read_file
 
 Point = tuple[float, float]
 # Largest size of a plan in bytes.
@@ -63,14 +63,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tupl
     Raises SimulatorError if the file cannot be read, or a part of the plan is wrong.
     """
     path = a_path("path", path, SimulatorError)
-    try:
-        data = read_at_most(path, LARGEST)
-    except OSError as error:
-        raise SimulatorError(
-            f"{named(path)}: expected a readable plan: {error.strerror or error}; check the path"
-        ) from None
-    except ValueError as error:
-        raise SimulatorError(f"{named(path)}: expected a plan: {error}; check the path") from None
+    data = read_file(path, LARGEST, "a readable plan", SimulatorError)
     # Entities can expand to gigabytes.
     if b"<!ENTITY" in data:
         raise SimulatorError(

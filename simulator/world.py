@@ -46,7 +46,7 @@ from ssh_abduction.data.checks import (
     one_of,
 )
 from ssh_abduction.data.errors import brief, named, printable
-from ssh_abduction.data.files import parse_json, read_at_most
+from ssh_abduction.data.files import parse_json, read_file
 
 __all__ = ["Clutter", "Lift", "TrueDState", "World", "checked_segments", "distances_to", "pose_of"]
 
@@ -292,13 +292,9 @@ class World:
             SimulatorError: The file cannot be read, or a field is wrong. The text names the field.
         """
         path = a_path("path", path, SimulatorError)
+        text = read_file(path, LARGEST, "a readable world", SimulatorError)
         try:
-            data = parse_json(read_at_most(path, LARGEST).decode("utf-8"))
-        except OSError as error:
-            raise SimulatorError(
-                f"{named(path)}: expected a readable world: {error.strerror or error}; check "
-                "the path"
-            ) from None
+            data = parse_json(text.decode("utf-8"))
         except ValueError as error:
             raise SimulatorError(
                 f"{named(path)}: expected a world in JSON, got something else "

@@ -229,12 +229,9 @@ def test_yaw_turns_a_map_about_its_lower_left_corner(tmp_path: Path) -> None:
         (HEAD + "origin: [1, 2, x]\n" + TAIL, r"origin: expected \[x, y, yaw\]"),
         (HEAD + "origin: [1, 2, .inf]\n" + TAIL, r"origin: expected \[x, y, yaw\]"),
         (HEAD + "origin: 3\n" + TAIL, r"origin: expected \[x, y, yaw\]"),
-        (
-            HEAD + "origin: {x: 1, y: 2}\n" + TAIL,
-            "an object or a nested list as 'origin' in line 3",
-        ),
-        (HEAD + "origin: [[1, 2, 3]]\n" + TAIL, "an object or a nested list as 'origin' in line 3"),
-        (HEAD + ORIGIN + TAIL + "resolution: 0.1\n", "'resolution' twice, again in line 7"),
+        (HEAD + "origin: {x: 1, y: 2}\n" + TAIL, r"origin: expected \[x, y, yaw\].*got {'x': '1'"),
+        (HEAD + "origin: [[1, 2, 3]]\n" + TAIL, r"origin: expected \[x, y, yaw\]"),
+        (HEAD + ORIGIN + TAIL + "resolution: 0.1\n", "'resolution' twice, first in line 2"),
         (
             HEAD + ORIGIN + TAIL + "mode: rawest\n",
             "mode: expected trinary, scale or raw, got 'rawest'",
@@ -270,12 +267,12 @@ def test_yaw_turns_a_map_about_its_lower_left_corner(tmp_path: Path) -> None:
         ("- 1\n- 2\n", "no fields in it"),
         (
             "a: b: c\n",
-            "expected the YAML file of an occupancy map, got none: mapping values are not allowed",
+            "expected the YAML file of an occupancy map, got mapping values are not allowed",
         ),
         ("image: map.pgm\n--- \nimage: map.pgm\n", "expected a single document"),
-        ("[" * 5000, "expected the YAML file of an occupancy map, got none"),
-        (b"image: \xff\n", "expected the YAML file of an occupancy map, got none"),
-        (b"image: a\0b\n", "expected the YAML file of an occupancy map, got none"),
+        ("[" * 5000, "expected the YAML file of an occupancy map, got"),
+        (b"image: \xff\n", "expected the YAML file of an occupancy map, got"),
+        (b"image: a\0b\n", "expected the YAML file of an occupancy map, got"),
     ],
 )
 def test_errors_of_occupancy_maps_name_the_file(

@@ -27,7 +27,7 @@ from ssh_abduction.data.corrections import (
 )
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, named
-from ssh_abduction.data.files import json_line, read_at_most, save_file
+from ssh_abduction.data.files import json_line, parse_yaml, read_file, save_file
 from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.map_parts import NAMED
 from ssh_abduction.data.maps import SSHMap
@@ -51,14 +51,8 @@ def load_corrections(path: str | os.PathLike[str]) -> Corrections:
         MapError: The file cannot be read or is malformed. The error names the field.
     """
     file = file_in(path)
-    try:
-        text = read_at_most(file, LARGEST).decode()
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise MapError(
-            f"{named(file)}: expected a file of corrections: {why}; check the path"
-        ) from None
-    return from_yaml(text, str(file))
+    data = read_file(file, LARGEST, "a file of corrections", MapError)
+    return from_yaml(data, str(file))
 
 
 def save_corrections(corrections: Corrections, path: str | os.PathLike[str]) -> None:
@@ -147,33 +141,13 @@ def _note(said: Naming | Passage) -> dict[str, str]:
     return {"note": said.note} if said.note else {}
 
 
-def from_yaml(text: str, source: str = "corrections") -> Corrections:
+def from_yaml(text: str | bytes, source: str = "corrections") -> Corrections:
     """Read names and corrections from YAML. Raises MapError, which names source and field."""
-    import yaml  # loads slowly
-
     try:
-        # This loader makes a text of each scalar: a step such as 1:30 is no number of seconds.
-        _check_keys(yaml.compose(text, Loader=yaml.BaseLoader))
-        data = yaml.load(text, Loader=yaml.BaseLoader)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise MapError(f"{source}: expected YAML, got {reason}; mend it there") from None
+        data = parse_yaml(text)
+    except ValueError as error:
+        raise MapError(f"{source}: expected YAML, got {error}; mend it there") from None
     return _CorrectionsReader(named(source)).corrections(data, source)
-
-
-def _check_keys(node: Any) -> None:
-    """Raise ValueError if an object has a field twice. YAML would keep only the last one."""
-    if isinstance(getattr(node, "value", None), list):
-        for child in node.value:
-            pair = child if isinstance(child, tuple) else (child,)
-            for part in pair:
-                _check_keys(part)
-        keys = [child[0].value for child in node.value if isinstance(child, tuple)]
-        for child in node.value:
-            if isinstance(child, tuple) and keys.count(child[0].value) > 1:
-                raise ValueError(
-                    f"{brief(child[0].value)} twice, first in line {child[0].start_mark.line + 1}"
-                )
 
 
 class _CorrectionsReader(FieldReader):

@@ -140,6 +140,33 @@ def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
     return data
 
 
+def read_file(
+    path: str | os.PathLike[str], most: int, what: str, error: type[AbductionError]
+) -> bytes:
+    """Read a file as `read_at_most`. If it cannot be read, raise `error`, which names `what`."""
+    try:
+        return read_at_most(path, most)
+    except (OSError, ValueError) as found:
+        why = getattr(found, "strerror", None) or found
+        raise error(f"{named(path)}: expected {what}: {why}; check the path") from None
+
+
+def parse_yaml(data: str | bytes) -> Any:
+    """Parse YAML in which each scalar is a text: a step such as 1:30 is no number of seconds.
+
+    Raises ValueError if the YAML is broken, nested too deeply, or has a field twice.
+    """
+    import yaml  # loads slowly
+
+    try:
+        _check_keys(yaml.compose(data, Loader=yaml.BaseLoader))
+        return yaml.load(data, Loader=yaml.BaseLoader)
+    except yaml.YAMLError as error:
+        raise ValueError(" ".join(str(error).split())) from None
+    except RecursionError:
+        raise ValueError("one nested too deeply; flatten it") from None
+
+
 def write_file(path: str | os.PathLike[str], data: bytes) -> None:
     """Write a file so that it appears whole or not at all.
 
@@ -202,6 +229,21 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = next(name for name in fields if names.count(name) > 1)
         raise ValueError(f"the field {twice[:60]!r} twice; keep one of them")
     return fields
+
+
+def _check_keys(node: Any) -> None:
+    """Raise ValueError if an object has a field twice. YAML would keep only the last one."""
+    if isinstance(getattr(node, "value", None), list):
+        for child in node.value:
+            pair = child if isinstance(child, tuple) else (child,)
+            for part in pair:
+                _check_keys(part)
+        keys = [child[0].value for child in node.value if isinstance(child, tuple)]
+        for child in node.value:
+            if isinstance(child, tuple) and keys.count(child[0].value) > 1:
+                raise ValueError(
+                    f"{brief(child[0].value)} twice, first in line {child[0].start_mark.line + 1}"
+                )
 
 
 def _integer(text: str) -> int:
