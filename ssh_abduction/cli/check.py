@@ -309,10 +309,7 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
         return
     backbone = solution.backbone
     if backbone and backbone.proven and solution.minimal_listed:
-        sharing = Sharing()
-        for ssh_map in solution.minimal_maps or solution.maps:
-            sharing.absorb(ssh_map)
-        right = sharing.backbone(proven=True)
+        right = Sharing(solution.minimal_maps or solution.maps).backbone(proven=True)
         if backbone.to_dict() != right.to_dict():
             yield (
                 f"backbone: expected {right.sentence or 'the one map'}, as the maps show, got "

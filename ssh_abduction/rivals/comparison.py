@@ -44,7 +44,7 @@ from ssh_abduction.rivals.questions import (
     questions_of,
 )
 from ssh_abduction.rivals.table import Table
-from ssh_abduction.solver import Backbone, Shared
+from ssh_abduction.solver import Backbone, Shared, Sharing
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +269,9 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
         listing.check_same_trace(listing_there)
     table = Table(listing.maps, listing.drives)
     # the backbone has more information than the listed maps only if the list is not complete
-    listed = replace(table.shared(), proven=listing.complete is True, drives=listing.drives)
+    # if some maps have no places, only dstates are compared: the first map decides about that
+    sharing = Sharing(sorted(listing.maps, key=lambda ssh_map: bool(ssh_map.places)))
+    listed = replace(sharing.backbone(proven=listing.complete is True), drives=listing.drives)
     shared = listed
     if listing.backbone and listing.complete is False:
         shared = replace(listing.backbone, drives=listing.drives)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import SORTS, Backbone, Shared, Sort, key_of
+from ssh_abduction.solver import SORTS, Sort, key_of
 
 Ints: TypeAlias = NDArray[np.int32]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -102,34 +102,6 @@ class Table:
                     yield c, c, ones[:, c] != NONE
                 elif h != c and not (same := ones[:, h] == ones[:, c]).all():
                     yield h, c, same
-
-    def shared(self) -> Backbone:
-        """Find what these maps share: which steps are one in all of them, in some, or in none."""
-        found = {sort: self._shared(ones) for sort, ones in self.ones.items()}
-        places, paths, courses = (found.get(sort) for sort in ("places", "paths", "courses"))
-        return Backbone(found["dstates"], places, paths, courses, proven=False)
-
-    def _shared(self, ones: Ints) -> Shared:
-        """Find which pairs of steps all maps, or only some maps, join in one sort."""
-        _, column = np.unique(ones, axis=1, return_inverse=True)
-        number: dict[Hashable, int] = {}
-        named = (ones != NONE).all(axis=0).tolist()
-        of_class = [
-            number.setdefault(("one", k) if named[c] else ("own", c), len(number))
-            for c, k in enumerate(column.reshape(-1).tolist())
-        ]
-        heads = [of_class.index(n) for n in range(len(number))]
-        columns = ones[:, heads]
-        pairs = []
-        for n in range(len(heads)):
-            is_named = columns[:, n] != NONE
-            if is_named.any() and not is_named.all():
-                pairs.append((n, n))
-            one_in_some = ((columns[:, n + 1 :] == columns[:, [n]]) & is_named[:, None]).any(axis=0)
-            pairs += [(n, n + 1 + d) for d in np.flatnonzero(one_in_some).tolist()]
-        first = [int(self.firsts[head]) for head in heads]
-        always = tuple(of_class[c] for c in self.classes.tolist())
-        return Shared(always, tuple(sorted((first[n], first[d]) for n, d in pairs)))
 
 
 def _common_classes(labelings: Sequence[Ints]) -> Ints:

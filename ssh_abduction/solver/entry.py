@@ -193,9 +193,7 @@ def find_backbone(
         raise SolverError("trace: expected the trace that was solved, got none; give it")
     views = "functional_view" in solution.theory.hard
     check_of_trace(minimal, trace, "solution", views=views)
-    sharing = Sharing()
-    for ssh_map in minimal:
-        sharing.absorb(ssh_map)
+    sharing = Sharing(minimal)
     watch = Watch(time_limit, memory_limit)
     watch.start()
     cost, proven = solution.costs[0].preferred_by(solution.theory), False

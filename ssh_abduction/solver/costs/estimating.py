@@ -26,6 +26,7 @@ from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.overlap import groups_of_each
+from ssh_abduction.theory.pairs import pairs_in
 from ssh_abduction.theory.settle import Problem
 
 if TYPE_CHECKING:
@@ -247,15 +248,7 @@ def least_places(problem: Problem) -> int:
     """Return a lower bound on the places: the size of a set of steps at different places."""
     if problem.theory.level == "causal":
         return 0
-    import numpy as np
+    from ssh_abduction.solver.steps.apart import pairwise_distinct  # loads numpy
 
-    from ssh_abduction.solver.steps.apart import large_clique
-
-    elsewhere = problem.pairs.elsewhere
-    steps = sorted({0, *elsewhere, *(i for others in elsewhere.values() for i in others)})
-    number = {step: i for i, step in enumerate(steps)}
-    apart = np.zeros((len(steps), len(steps)), dtype=bool)
-    for j, others in elsewhere.items():
-        for i in others:
-            apart[number[i], number[j]] = apart[number[j], number[i]] = True
-    return len(large_clique(apart))
+    pairs = pairs_in(problem.pairs.elsewhere)
+    return len(pairwise_distinct(sorted({0, *chain(*pairs)}), pairs))

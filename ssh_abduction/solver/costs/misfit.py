@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Collection, Hashable, Iterable, Sequence
 from typing import TypeAlias
 
+from ssh_abduction.data.groups import NodeClasses
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.geometry.equations import Equations
@@ -31,8 +32,8 @@ from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import Problem
 
-# The heading of each step and the position of each step, as numbers, such that steps with equal
-# numbers share them; and the steps whose displacements are ignored.
+# The heading of each step and the position of each step, numbered in the order of first steps, such
+# that steps with equal numbers share them; and the steps whose displacements are ignored.
 _Groups: TypeAlias = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
 
@@ -56,15 +57,16 @@ class Misfit:
 
     def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
         """Return the misfit (a chi-square) of returns, ignoring displacements to `wrong` steps."""
-        headings, positions = list(range(len(self.visit))), list(self.visit)
+        headings, visits = NodeClasses[int](), NodeClasses[int]()
         for found in returns:
             if found.of == "dstate":
-                _join(headings, found.first, found.second)
-            _join(positions, found.first, found.second)
-        return self._of_groups((_roots(headings), _roots(positions), tuple(sorted(wrong))))[0]
+                headings.merge(found.first, found.second)
+            visits.merge(self.visit[found.first], self.visit[found.second])
+        steps = range(len(self.visit))
+        return self.of_course([*map(headings.of, steps)], [*map(visits.of, self.visit)], wrong)
 
     def of_course(
-        self, dstates: Sequence[int], places: Sequence[int], wrong: Collection[int] = ()
+        self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
     ) -> float:
         """Return the misfit if steps are at these dstates and places, without `wrong` moves."""
         return self._of_groups(_groups_of(dstates, places, wrong))[0]
@@ -91,9 +93,8 @@ class Misfit:
         square, at = self._of_groups(groups)
         if not self._overlap.near or not self._overlap.nats(positions):
             return square / 2
-        labels = numbered(headings)
-        of_dstate = [*dict(zip(labels, positions, strict=True)).values()]
-        return square / 2 + self._overlap.crowding(dict(enumerate(labels)), of_dstate, at.tolist())
+        places = _of_headings(headings, positions)
+        return square / 2 + self._overlap.crowding(dict(enumerate(headings)), places, at.tolist())
 
     def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
         """List the returns of a map: each step with the last step at its dstate or place."""
@@ -135,12 +136,7 @@ class Misfit:
         if groups not in self._known:
             headings, positions, wrong = groups
             said = self.trace.without_displacements_at(wrong) if wrong else self._equations
-            number = {heading: i for i, heading in enumerate(dict.fromkeys(headings))}
-            position = dict(zip(headings, positions, strict=True))
-            poses = Poses(
-                said, [number[heading] for heading in headings], [position[h] for h in number]
-            )
-            square, at = poses.placed()
+            square, at = Poses(said, headings, _of_headings(headings, positions)).placed()
             self._known[groups] = square + 2 * self._overlap.nats(positions), at
         return self._known[groups]
 
@@ -148,28 +144,10 @@ class Misfit:
 def _groups_of(
     dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int]
 ) -> _Groups:
-    """Number the dstate and the place of each step by the first step there."""
-    first_at: dict[int, int] = {}
-    first_in: dict[Hashable, int] = {}
-    headings = (first_at.setdefault(name, t) for t, name in enumerate(dstates))
-    positions = (first_in.setdefault(name, t) for t, name in enumerate(places))
-    return tuple(headings), tuple(positions), tuple(sorted(wrong))
+    """Number the dstates and the places of steps in the order of first steps."""
+    return tuple(numbered(dstates)), tuple(numbered(places)), tuple(sorted(wrong))
 
 
-def _join(groups: list[int], first: int, second: int) -> None:
-    """Merge the groups of two members. Each member is linked to an earlier one of its group."""
-    a, b = _root(groups, first), _root(groups, second)
-    groups[max(a, b)] = min(a, b)
-
-
-def _root(groups: list[int], member: int) -> int:
-    """Return the first member of the group of a member."""
-    while groups[member] != member:
-        groups[member] = groups[groups[member]]
-        member = groups[member]
-    return member
-
-
-def _roots(groups: list[int]) -> tuple[int, ...]:
-    """For each member, return the first member of its group."""
-    return tuple(_root(groups, member) for member in range(len(groups)))
+def _of_headings(headings: Sequence[int], positions: Sequence[int]) -> list[int]:
+    """Return the position of each heading."""
+    return [*dict(zip(headings, positions, strict=True)).values()]

@@ -60,20 +60,19 @@ def laid(
     from ssh_abduction.solver.guesses.existing import ExistingMap
 
     joint, theory = problem.trace, problem.theory
-    ranking, judging, existing = Ranking(joint), Judging(problem), ExistingMap(old, ssh_map)
-    fitted = map(ranking.fitted, _joint_maps(existing, old, ssh_map, trace, problem))
-    priced = ((_nats(m, problem), m) for m in fitted)
-    found = sorted(priced, key=lambda pair: pair[0])
+    judging, existing, misfit = Judging(problem), ExistingMap(old, ssh_map), Misfit(problem)
+    maps = _joint_maps(existing, old, ssh_map, trace, problem)
+    found = sorted(((misfit.nats_of(m), m) for m in maps), key=lambda pair: pair[0])
     while found and not judging.accepts_grown(found[0][1], since):
         del found[0]
     if not found:
         return None
-    best = Deriving(joint, theory).mapped(found[0][1])
+    best = Deriving(joint, theory).mapped(Ranking(joint).fitted(found[0][1]))
     kept = (ssh_map if ssh_map.fit else Ranking(old).fitted(ssh_map)).fit
     assert kept is not None
     assert best.fit is not None
     known = [rival_of(m, nats) for nats, m in found]
-    moved = rivals_of(problem, Misfit(problem), best, ESTIMATING, len(old))
+    moved = rivals_of(problem, misfit, best, ESTIMATING, len(old))
     weighed = Weighed(
         bound=nats_of(replace(Cost.of(ssh_map), paths=0), theory) + kept.chi2 / 2,
         within=0.0,
@@ -118,15 +117,6 @@ def unproven(
             onto=tuple(drive.name for drive in drives_of(old)),
         ),
     )
-
-
-def _nats(ssh_map: SSHMap, problem: Problem) -> float:
-    """Compute the cost in nats of a map that has a fit."""
-    assert ssh_map.fit is not None
-    overlap = problem.overlap
-    crowding = overlap.crowded_price * sum(share for *_, share in overlap.crowded_in(ssh_map))
-    nats = nats_of(Cost.of(ssh_map), problem.theory) + overlap.of_map(ssh_map) + crowding
-    return nats + ssh_map.fit.chi2 / 2
 
 
 def _joint_maps(

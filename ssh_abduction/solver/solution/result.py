@@ -268,9 +268,7 @@ class Solution(MapSequence):
         """
         shared = self.shared
         if shared is None:
-            sharing = Sharing()
-            for ssh_map in self.minimal_maps:
-                sharing.absorb(ssh_map)
+            sharing = Sharing(self.minimal_maps)
             if not sharing.maps:
                 return None
             shared = sharing.backbone(proven=self.minimal_listed)

@@ -212,12 +212,14 @@ class Sharing:
         classes: The number of the class of each step.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, maps: Iterable[SSHMap] = ()) -> None:
         self.maps = 0
         self.classes: tuple[int, ...] = ()
         self._labels: tuple[int, ...] = ()  # the labels of the last map
         self._label_of: list[int] = []  # the label of each class in the last map
         self._kept: dict[Sort, Kept] = {}
+        for ssh_map in maps:
+            self.absorb(ssh_map)
 
     def absorb(self, ssh_map: SSHMap) -> None:
         """Add a map: keep only what it shares with all earlier maps."""

@@ -217,7 +217,7 @@ def large_clique(apart: Matrix) -> list[int]:
 
 
 def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
-    """Find a large clique: a list of segments, or places, that are pairwise distinct.
+    """Find a large clique: a list of segments, places or steps that are pairwise distinct.
 
     `pairs` has the pairs that are distinct. A pair of a member with itself means that the labels
     contradict the axioms, and is ignored.
@@ -225,7 +225,7 @@ def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) 
     number = {member: i for i, member in enumerate(members)}
     rivals = np.zeros((len(members), len(members)), dtype=bool)
     for g, h in pairs:
-        rivals[number[g], number[h]] = g != h
+        rivals[number[g], number[h]] = rivals[number[h], number[g]] = g != h
     return [members[i] for i in large_clique(rivals)]
 
 
