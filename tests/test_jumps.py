@@ -14,6 +14,7 @@ from coarse import every_second_beam, hall
 
 from perception.errors import LogError
 from perception.places import importing
+from perception.places.following import turned_wrongly
 from perception.places.importing import import_log, tracked
 from perception.places.jumps import Unknown, unknown_steps
 from perception.places.track import Track
@@ -204,3 +205,10 @@ def test_note_names_scans_that_turn_unlike_the_odometry(
     )
     assert "Scans turn differently from the odometry, once: at scan 70" in notes
     assert track.way[-1] == pytest.approx(metres, abs=3)
+
+
+def test_scans_metres_apart_are_not_turned_around_against_the_odometry(
+    scans: tuple[Scan, ...],
+) -> None:
+    log = RobotLog(scans[::3], source="drive")
+    assert turned_wrongly(log, tracked(log)[1]) == []

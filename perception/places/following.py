@@ -214,8 +214,9 @@ class _ScanMotion:
         if doubt is Doubt.UNKNOWN:
             return self._without_odometry() or nowhere
         prior = odometer_covariance(self.onward)
-        # An odometer that misses a large turn mostly stands still.
-        most = TURNED if 0 < math.hypot(*self.onward[:2]) < 2 * NEARBY else math.pi
+        # An odometer that misses a large turn stands still. In corridors, scans that hardly
+        # overlap match as well if they are turned around.
+        most = TURNED if any(self.onward) else math.pi
         found = _matched(self.seen, self.recent, self.last, self.onward, prior, most)
         if found[2] < POOR and doubt in (Doubt.DOUBTFUL, Doubt.SEAM):
             if other := self._without_odometry():
