@@ -136,6 +136,7 @@ RIGHT: dict[str, set[str]] = {
     "Closure.last": {"huge"},
     "Corrections.known_in.drives": EMPTY,
     "Corrections.named.drives": EMPTY,
+    "Corrections.of_names.drives": EMPTY,
     "Corrections.with_gateway.is_open": {"True"},
     "Corrections.with_gateway.seen": EMPTY,
     "Corrections.with_name.name": {"nonsense", "folder"},

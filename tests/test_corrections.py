@@ -24,6 +24,8 @@ from ssh_abduction.data import (
 )
 from ssh_abduction.data.corrections_file import from_yaml, to_yaml
 from ssh_abduction.data.drives import fingerprints_of
+from ssh_abduction.data.map_parts import Name
+from ssh_abduction.data.regions import Region
 from ssh_abduction.data.star import Gateway, with_gateway
 from ssh_abduction.output import to_dot, to_networkx, to_svg
 from ssh_abduction.output.cards import map_card
@@ -284,7 +286,16 @@ def test_two_names_of_one_place_can_both_be_changed(
     assert found.pairs[0].steps == ("monday:0", "monday:3")
 
 
-@pytest.mark.parametrize("name", ["5", "p4", "place 4", "path2", "region 0"])
+def test_unknown_name_in_place_of_a_step_is_an_error_that_shows_a_step(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for option in ("--same", "--elsewhere"):
+        assert main(["correct", str(folder / "building"), option, "kitchen,monday:1"]) == 1
+        error = capsys.readouterr().err
+        assert "step 'kitchen': expected a step such as monday:0, got 'kitchen'" in error
+
+
+@pytest.mark.parametrize("name", ["5", "p4", "place 4", "path2", "region 0", "tuesday:2"])
 def test_name_that_looks_like_a_number_is_refused(
     name: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -665,6 +676,13 @@ def test_names_are_in_all_exports_of_a_map(
     assert to_networkx(ssh_map, "places").nodes[1]["name"] == "kitchen"
     assert to_networkx(ssh_map, "topological").nodes["path", 0]["name"] == "hall"
     assert content_of([ssh_map])["maps"][0]["names"] == {"path 0": "hall", "place 1": "kitchen"}
+    with_region = replace(
+        ssh_map,
+        regions=(Region(0, (0, 1), bounds=((0, 1),)), Region(1, (2,), bounds=((0, -1),))),
+        names=(Name("region", 0, "west wing"),),
+    )
+    for to in ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json"):
+        assert "west wing" in export_map(with_region, to), to
     assert route(ssh_map, 0, "kitchen").goal == "place 1 (kitchen)"
     with pytest.raises(
         MapError, match="or a place as p0, or a region as region0, or kitchen, got 'den'"
@@ -728,6 +746,33 @@ def test_opposite_correction_replaces_the_old_one(first: str, then: str, left: l
     changed = said.with_pair(then, "tuesday:1", "monday:0")
     assert [pair.kind for pair in changed.pairs if "monday:0" in pair.steps] == left
     assert said.pairs[1] in changed.pairs
+
+
+def test_corrections_of_one_command_count_in_their_order(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    building = str(folder / "building")
+    for first, then in (("same", "different"), ("different", "same")):
+        steps = "monday:1,tuesday:0"
+        assert main(["correct", building, f"--{first}", steps, f"--{then}", steps]) == 0
+        (said,) = load_corrections(building).pairs
+        assert said.kind == then
+    named = ["--name", "p1", "den", "--elsewhere", "den,p0"]
+    assert main(["correct", building, *named]) == 0
+    assert [pair.kind for pair in load_corrections(building).pairs] == ["same", "elsewhere"]
+
+
+def test_solve_warns_of_names_that_the_map_does_not_have(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both names are of one place of the joint map."""
+    said = Corrections(MARKS).with_name("kitchen", "place", "monday:1")
+    save_corrections(said.with_name("cafe", "place", "tuesday:0"), folder / "building")
+    assert main(solving(folder)) == 0
+    told = capsys.readouterr()
+    assert "name 'cafe' of the place of tuesday:0: it is not used" in told.err
+    assert "name 'kitchen'" not in told.err
+    assert "(kitchen)" in told.out
 
 
 def test_names_of_drives_may_have_commas(

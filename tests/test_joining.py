@@ -9,6 +9,7 @@ from itertools import pairwise, product
 from unittest.mock import patch
 
 import changes
+import numpy as np
 import pytest
 import truth
 from together import of_mazes
@@ -25,6 +26,7 @@ from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.weighing import Weighing
 from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.kept_apart import KeptApart
+from ssh_abduction.solver.guesses.reckoning import conditioned
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.weighed import groups_of_drives
@@ -355,3 +357,13 @@ def test_explain_states_the_price_of_laying_drives() -> None:
     said = str(explain_pair(along("abcda", "a"), 4, 5, time_limit=100))
     assert "saves 1 dstate, 1 place (16.0 nats)" in said
     assert "costs 32.0 nats of misfit and of laying drives on each other" in said
+
+
+def test_conditioning_survives_the_rounding_of_large_variances() -> None:
+    """Of variances of 1e9, the rounding leaves a difference with a negative variance."""
+    mean = np.array([0.0, 0.0, 1.0, 0.0])
+    covariance = np.diag([0.01, -0.001, 0.0, 0.0])
+    moved, less, square = conditioned(mean, covariance, [0, 1], [2, 3], np.full(3, 1e-6))
+    assert np.isfinite(moved).all()
+    assert np.isfinite(less).all()
+    assert square > 0

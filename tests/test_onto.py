@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from strategies import TOYS, theories
 from test_together import joint_traces
 from truth import NOISE, Noise, random_walk
+from worlds import TEE, drive
 
 from ssh_abduction import Solution, SSHMap, Theory, Trace, check, solve
 from ssh_abduction.cli import main
@@ -120,6 +121,34 @@ def test_solve_onto_adds_a_drive_in_the_shell(
     )
 
 
+def test_onto_obeys_corrections_beside_the_map_and_keeps_its_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    MONDAY.save(tmp_path / "monday.jsonl")
+    TUESDAY.save(tmp_path / "tuesday.jsonl")
+    maps, grown = str(tmp_path / "maps.json"), str(tmp_path / "grown" / "maps.json")
+    Path(grown).parent.mkdir()
+    assert main(["solve", str(tmp_path / "monday.jsonl"), "-o", maps]) == 0
+    assert main(["name", maps, "p1", "kitchen"]) == 0
+    assert main(["correct", maps, "--elsewhere", "monday:0,monday:3"]) == 0
+    adding = ["solve", str(tmp_path / "tuesday.jsonl"), "--onto", maps, "-o", grown]
+    assert main(adding) == 1
+    assert "a map that obeys 'elsewhere: monday:0, monday:3'" in capsys.readouterr().err
+    assert main(["solve", str(tmp_path / "monday.jsonl"), "-o", maps]) == 0
+    capsys.readouterr()
+    assert main(adding) == 0
+    told = capsys.readouterr()
+    assert "obeying 2 corrections of " in told.err
+    assert "nothing observed separates these places" in told.out
+    assert Solution.load(grown).theory.elsewhere == ((0, 3),)
+    # A second name does not make the first one disappear.
+    assert main(["name", grown, "p0", "porch"]) == 0
+    assert main(["show", grown]) == 0
+    shown = capsys.readouterr().out
+    assert "1 (kitchen)" in shown
+    assert "0 (porch)" in shown
+
+
 def test_onto_refuses_a_drive_that_contradicts_the_map() -> None:
     """Monday saw b twice. Its minimal map makes that one dstate; Tuesday shows that it is two."""
     monday = Trace.from_steps("abcb", ["on", "on", "back"], name="monday")
@@ -197,6 +226,16 @@ def test_digest_has_each_link_once() -> None:
     assert solve(short, onto=standing)[0].dstate_at == (0, 1) * 50 + (0, 1, 0, 1, 0, 1, 0)
 
 
+def test_onto_turns_frames_to_the_first_visit_of_each_place() -> None:
+    """The digest of Monday begins with a dstate that Monday was at only later."""
+    monday = drive(TEE, "S", "S", "RLRRTR", stars=True)
+    tuesday = replace(drive(TEE, "S", "W", "RLR", stars=True), name="tuesday")
+    for theory in (Theory(star="frame"), Theory(star="gateways")):
+        solution = solve(tuesday, theory, onto=solve(monday, theory))
+        assert solution.trace is not None
+        assert [check(solution.trace, ssh_map, solution.theory) for ssh_map in solution] == [()]
+
+
 def test_onto_keeps_names() -> None:
     monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
     said = Corrections.for_drives(monday).with_name("kitchen", "place", "monday:1")
@@ -209,6 +248,10 @@ def test_onto_keeps_names() -> None:
         assert ssh_map.name_of("place", kitchen.place) == "kitchen"
         assert ssh_map.name_of("path", kitchen.path) == "corridor"
         assert len(ssh_map.names) == 2
+    room = Trace.from_steps("abcdef", ["travel", "right", "travel", "left", "travel"], name="room")
+    said = Corrections.for_drives(room).with_name("west wing", "region", "room:0")
+    grown = solve(replace(room[:4], name="again"), onto=solve(room, corrections=said)).maps[0]
+    assert [name.text for name in grown.names] == ["west wing"]
     unnamed = Corrections.for_drives(monday)
     last = Trace.from_steps("xb", ["travel"], name="last")
     assert solve(last, onto=solution, corrections=unnamed).maps[0].names == ()

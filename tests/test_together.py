@@ -27,6 +27,7 @@ from ssh_abduction import (
     Theory,
     Trace,
     explain_pair,
+    route,
     solve,
 )
 from ssh_abduction.checker.checker import check
@@ -45,7 +46,8 @@ from ssh_abduction.data import (
 from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.drives import fingerprints_of, named_steps, pieces_in_words
 from ssh_abduction.explain import explain_trace
-from ssh_abduction.rivals import Listing, compare, difference, joins_of_drives
+from ssh_abduction.rivals import DrivePair, Listing, compare, difference, joins_of_drives
+from ssh_abduction.rivals.drive_joins import DriveJoin
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.beam import Beam
@@ -320,9 +322,25 @@ def test_joins_of_drives_are_certain_possible_or_excluded(
     solution.save(maps)
     assert main(["compare", maps]) == 0
     said = "monday and tuesday: 1 dstate in common in all maps (monday:4 = tuesday:0); 2 possible"
-    assert said in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert said in told
+    assert "; 7 pairs of dstates joined in no map" in told
+    assert route(solution, "monday:0", "tuesday:0") == route(solution, "monday:0", "monday:4")
+    with pytest.raises(MapError, match="to: step 'friday:1': expected a drive out of monday, tues"):
+        route(solution, "monday:0", "friday:1")
     assert main(["compare", maps, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["drives"][0]["excluded"] == 7
+
+
+def test_possible_joins_have_a_probability_or_a_share_of_the_maps() -> None:
+    join = DriveJoin(0, 1, 0.8)
+    for of_maps, said in (
+        (None, "each with its probability (monday:0 = tuesday:1, 0.80)"),
+        (5, "in some maps that were found (monday:0 = tuesday:1, 4 of 5 maps)"),
+    ):
+        pair = DrivePair("monday", "tuesday", "place", (), (join,), 1, False, of_maps)
+        ending = f"1 possible join, {said}; 1 pair of places joined in no map"
+        assert str(pair) == f"monday and tuesday: {ending}"
 
 
 def test_shell_accepts_step_names_with_drives(

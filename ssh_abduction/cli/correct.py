@@ -40,33 +40,48 @@ def add_parser(verbs: Verbs) -> None:
     add_maps(parser)
     for name, words in HELPS.items():
         metavar = "I,J" if name in PAIRS else "GATEWAY"
-        parser.add(f"--{name.replace('_', '-')}", words, action="append", metavar=metavar)
+        parser.add(f"--{name.replace('_', '-')}", words, action=_InOrder, metavar=metavar)
     parser.add(
         "--name",
         "name or rename a place, path or region (p4, path2, kitchen), or the place of a step",
-        action="append",
+        action=_InOrder,
         nargs=2,
         metavar=("WHAT", "NAME"),
     )
+    parser.set_defaults(said=())
     add_map(parser)
+
+
+class _InOrder(argparse.Action):
+    """Appends an option and its value to `said`. So a later option can replace an earlier one."""
+
+    def __call__(
+        self,
+        _parser: argparse.ArgumentParser,
+        options: argparse.Namespace,
+        value: object,
+        _option: str | None = None,
+    ) -> None:
+        options.said = (*options.said, (self.dest, value))
 
 
 def run(options: argparse.Namespace) -> int:
     saved = SavedMap.load(options.maps, options.map)
-    said = saved.corrections
-    for kind in PAIRS:
-        for pair in getattr(options, kind) or ():
-            said = said.with_pair(kind, *_pair(saved, kind, pair))
-    for is_open, gateways in ((True, options.open), (False, options.closed)):
-        for gateway in gateways or ():
-            said = said.with_gateway(is_open, saved.gateway(gateway))
-    for what, name in options.name or ():
-        said = said.with_name(name, *saved.thing_to_name(what))
-    if said == saved.corrections:
+    before = said = saved.corrections
+    for kind, value in options.said:
+        if kind in PAIRS:
+            said = said.with_pair(kind, *_pair(saved, kind, value))
+        elif kind == "name":
+            what, name = value
+            said = said.with_name(name, *saved.thing_to_name(what))
+            saved = saved.named(said)
+        else:
+            said = said.with_gateway(kind == "open", saved.gateway(value))
+    if said == before:
         print("\n".join(map(printable, sentences_of(said))) or "nothing was said")
         return 0
     file = saved.save(said)
-    if (options.open or options.closed) and saved.star == "none":
+    if saved.star == "none" and {"open", "closed"} & {kind for kind, _ in options.said}:
         warn(
             [
                 "this map was made without stars, so a gateway that is open or closed changes no "

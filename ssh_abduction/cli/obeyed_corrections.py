@@ -16,13 +16,13 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.explain.no_map import Explanation, explain
-from ssh_abduction.solver import Solution, obeyed, solve, with_kept_apart, with_names
+from ssh_abduction.solver import Solution, obeyed, solve, with_correction_warnings, with_names
 from ssh_abduction.theory.theory import Theory
 
 
 def corrections_of(options: argparse.Namespace) -> Corrections | None:
-    """Read the corrections that --corrections names, or those beside the output; None for none."""
-    file = options.corrections or beside(options.output)
+    """Read the corrections of --corrections, or beside the output or the maps of --onto, if any."""
+    file = options.corrections or beside(options.output) or beside(options.onto)
     return None if file is None else load_corrections(file)
 
 
@@ -103,7 +103,7 @@ class Obeying:
         def find(trace: Trace, theory: Theory, seconds: float) -> Solution:
             return solve(trace, theory, max_maps=1, time_limit=seconds)
 
-        return with_kept_apart(self.corrections, self.with_names(solution), limit, find)
+        return with_correction_warnings(self.corrections, self.with_names(solution), limit, find)
 
     def blamed(self, explanation: Explanation | None) -> list[str]:
         """List the corrections that may be the reason why the trace has no map.

@@ -27,8 +27,8 @@ def add_parser(verbs: Verbs) -> None:
     add_maps(parser)
     parser.add(
         "--from A",
-        "start: the number of a dstate, or a place or region by number or name, such as p3, "
-        "region2 or kitchen (default: the robot's last dstate)",
+        "start: the number of a dstate, a step such as monday:12, or a place or region by number "
+        "or name, such as p3, region2 or kitchen (default: the robot's last dstate)",
         dest="start",
     )
     parser.add(

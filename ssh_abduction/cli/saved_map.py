@@ -69,15 +69,21 @@ class SavedMap:
                 "fingerprint, got none; solve again, with -o"
             )
         theory = data.get("theory") if isinstance(data, dict) else None
-        beside = file.parent / FILE
-        said = load_corrections(beside) if beside.is_file() else Corrections()
-        said.check_drives(known)
-        drives = {**said.drives, **{name: str(mark) for name, mark in known.items()}}
         ssh_map = listing.maps[listing.number(str(number))]
+        beside = file.parent / FILE
         if beside.is_file():
-            ssh_map = said.named(ssh_map, listing.drives)
+            said = load_corrections(beside)
+            said.check_drives(known)
+        else:  # keep the names that the map has
+            said = Corrections.of_names(ssh_map, listing.drives)
+        drives = {**said.drives, **{name: str(mark) for name, mark in known.items()}}
         star = theory.get("star") if isinstance(theory, dict) else None
-        return cls(ssh_map, listing.drives, file, replace(said, drives=drives), star)
+        found = cls(ssh_map, listing.drives, file, replace(said, drives=drives), star)
+        return found.named(found.corrections)
+
+    def named(self, said: Corrections) -> SavedMap:
+        """Return the same map with these corrections, and with their names."""
+        return replace(self, map=said.named(self.map, self.drives), corrections=said)
 
     @property
     def in_quarters(self) -> bool:

@@ -41,11 +41,17 @@ from ssh_abduction.cli.outcome import (
     why_no_map,
 )
 from ssh_abduction.cli.parsing import Verbs
-from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
+from ssh_abduction.cli.text import (
+    describe,
+    describe_backbone,
+    findings,
+    first_map,
+    headline,
+    told_apart,
+)
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.floors import floors_in_words
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.sidecar import with_images_named_from
 from ssh_abduction.data.trace import Trace
@@ -100,7 +106,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "--corrections FILE",
         "obey the names and corrections in this file, or in corrections.yaml of this folder "
-        "(default: corrections.yaml in the folder of the file of --output, if there is one)",
+        "(default: corrections.yaml in the folder of the file of --output or, if there is none, of "
+        "--onto)",
     )
     parser.add(
         "--front K",
@@ -361,13 +368,7 @@ def _lines(
 ) -> Iterator[str]:
     """Yield the lines that describe the result of a search to people."""
     yield headline(solution, search.count, explanation)
-    yield from by_displacements(solution)
-    if solution.joined:
-        yield solution.joined
-    if solution.maps and (floors := floors_in_words(solution.maps[0])):
-        yield floors
-    if solution.weighed is None and solution.sureness:  # else the headline says it
-        yield solution.sureness
+    yield from findings(solution)
     if solution.status is Status.UNSATISFIABLE:
         if explanation:
             yield from explanation.sentences
@@ -387,22 +388,12 @@ def _lines(
                 f"steps\n{describe(solution.partial)}"
             )
         return
-    yield f"\n{'map 1' if search.count > 1 else 'map'}\n{describe(solution.maps[0])}"
+    yield first_map(solution, search.count)
     if backbone and (search.count > 1 or not solution.complete):
         yield f"\n{summary_of(solution, search.count, backbone)}"
     if backbone and not solution.minimal_listed:
         yield describe_backbone(backbone, search.trace)
-    if len(solution.maps) > 1:
-        from ssh_abduction.rivals.comparison import compare
-        from ssh_abduction.rivals.listing import Listing
-
-        some = (
-            ""
-            if search.count == len(solution.maps)
-            else f" (of the first {len(solution.maps)} found)"
-        )
-        yield f"\nwhat tells the maps apart{some}"
-        yield from compared(compare(Listing(solution.maps, drives=solution.drives)))
+    yield from told_apart(solution, search.count)
 
 
 @contextlib.contextmanager

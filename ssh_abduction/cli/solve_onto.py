@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.obeyed_corrections import corrections_of
+from ssh_abduction.cli.obeyed_corrections import corrections_of, say_obeyed
 from ssh_abduction.cli.options import number_steps, theory_of
 from ssh_abduction.cli.outcome import exit_code, save_solution, warn
-from ssh_abduction.cli.text import describe, headline
+from ssh_abduction.cli.text import findings, first_map, headline, told_apart
 from ssh_abduction.data.drives import together
-from ssh_abduction.data.errors import AbductionError, printable
+from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import Solution, solve
@@ -25,6 +25,7 @@ def run(options: argparse.Namespace) -> int:
             )
     existing = Solution.load(options.onto)
     trace = together([Trace.load(path) for path in options.traces])
+    said = corrections_of(options)
     if existing.trace is not None:
         number_steps(options, together([existing.trace, trace]))
     solution = solve(
@@ -36,15 +37,17 @@ def run(options: argparse.Namespace) -> int:
         within=options.within,
         memory_limit=options.memory_limit,
         speedups=Speedups.without(options.without_speedups),
-        corrections=corrections_of(options),
+        corrections=said,
     )
+    if said is not None and solution.trace is not None:
+        say_obeyed(said, solution.trace)
     warn(solution.warnings)
     save_solution(solution, options.output)
     if options.json:
         print(json_line(solution.to_dict()))
         return exit_code(solution)
-    kept = ", ".join(solution.support.onto)
-    print(headline(solution, len(solution.maps), None))
-    print(printable(f"the map of {kept} is kept; {solution.joined}"))
-    print(f"\n{'map 1' if len(solution) > 1 else 'map'}\n{describe(solution[0])}")
+    count = len(solution.maps)
+    print(headline(solution, count, None))
+    lines = (*findings(solution), first_map(solution, count), *told_apart(solution, count))
+    print("\n".join(lines))
     return exit_code(solution)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import printable
+from ssh_abduction.data.floors import floors_in_words
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted as counted  # noqa: PLC0414 - the verbs have it from here
@@ -107,6 +108,36 @@ def _counts_of(cost: Cost, theory: Theory) -> dict[str, float]:
     if theory.level == "causal":
         del counts["places"], counts["paths"]
     return counts
+
+
+def findings(solution: Solution) -> Iterator[str]:
+    """Yield the lines between the headline and the maps: what joins drives, and how surely."""
+    yield from by_displacements(solution)
+    if solution.joined:
+        kept = solution.support.onto
+        standing = f"the map of {', '.join(kept)} is kept; " if kept else ""
+        yield printable(standing + solution.joined)
+    if solution.maps and (floors := floors_in_words(solution.maps[0])):
+        yield floors
+    if solution.weighed is None and solution.sureness:  # else the headline says it
+        yield solution.sureness
+
+
+def first_map(solution: Solution, count: int) -> str:
+    """Describe the first of the maps that a search found. `count` is their number."""
+    return f"\n{'map 1' if count > 1 else 'map'}\n{describe(solution.maps[0])}"
+
+
+def told_apart(solution: Solution, count: int) -> Iterator[str]:
+    """Yield lines about how the maps of a solution differ; `count` maps were found."""
+    if len(solution.maps) > 1:
+        from ssh_abduction.rivals.comparison import compare  # loads numpy
+        from ssh_abduction.rivals.listing import Listing
+
+        held = len(solution.maps)
+        some = "" if count == held else f" (of the first {held} found)"
+        yield f"\nwhat tells the maps apart{some}"
+        yield from compared(compare(Listing(solution.maps, drives=solution.drives)))
 
 
 def by_displacements(solution: Solution) -> Iterator[str]:

@@ -26,7 +26,14 @@ from ssh_abduction.data.checks import (
     an_object,
     one_of,
 )
-from ssh_abduction.data.drives import SEEN, Drive, drives_of, fingerprints_of, step_of
+from ssh_abduction.data.drives import (
+    SEEN,
+    Drive,
+    drives_of,
+    fingerprints_of,
+    step_name,
+    step_of,
+)
 from ssh_abduction.data.errors import MapError, TraceError, brief, is_writable
 from ssh_abduction.data.map_parts import NAMED, Name, thing_named
 from ssh_abduction.data.maps import SSHMap, checked_map
@@ -135,6 +142,32 @@ class Corrections:
         return bool(self.names or self.pairs or self.gateways)
 
     @classmethod
+    def of_names(cls, ssh_map: SSHMap, drives: Sequence[Drive]) -> Corrections:
+        """Return the names of a map as corrections, each for the first step that it is about.
+
+        Args:
+            drives: The drives of its trace.
+
+        Raises:
+            MapError: An argument is wrong.
+        """
+        checked_map(ssh_map)
+        drives = _drives(drives)
+        places = [ssh_map.dstates[s].place for s in ssh_map.dstate_at]
+        numbers = {
+            "place": places,
+            "path": [ssh_map.dstates[s].path for s in ssh_map.dstate_at],
+            "region": [region_of(ssh_map.regions, place) for place in places],
+        }
+        return cls(
+            names=tuple(
+                Naming(name.text, name.kind, step_name(drives, numbers[name.kind].index(name.id)))
+                for name in ssh_map.names
+                if name.id in numbers[name.kind]
+            )
+        )
+
+    @classmethod
     def for_drives(cls, trace: Trace) -> Corrections:
         """Return empty corrections for the drives of a trace."""
         return cls(fingerprints_of(checked_trace(trace)))
@@ -232,8 +265,7 @@ class Corrections:
             MapError: A sentence names a drive that these corrections do not list, or a step that
                 its drive does not have.
         """
-        mend = "take drives_of(trace), or those of a solution"
-        drives = all_instances("drives", drives, Drive, MapError, mend=mend)
+        drives = _drives(drives)
         names = {drive.name for drive in drives}
 
         def is_known(step: str) -> bool:
@@ -348,11 +380,12 @@ class Corrections:
         where = self.source or "corrections"
         first: dict[tuple[str, ...], int] = {}
         for i, naming in enumerate(self.names):
-            if thing_named(naming.name):
+            drive, _, number = naming.name.rpartition(":")
+            if thing_named(naming.name) or (drive in self.drives and number.isdecimal()):
                 raise MapError(
                     f"{where}: names[{i}]: expected a name such as kitchen, got "
-                    f"{brief(naming.name)}, which is how to write a dstate, place, path or region "
-                    f"by its number; give another one, such as 'room {naming.name}'"
+                    f"{brief(naming.name)}, which is how to write a dstate, place, path, region or "
+                    f"step by its number; give another one, such as 'room {naming.name}'"
                 )
             for key, what in (
                 ((naming.name,), f"another name than {brief(naming.name)}"),
@@ -390,6 +423,12 @@ class Corrections:
 def direction_in_words(way: float) -> str:
     """Say a direction: ahead, right, back, left, or degrees clockwise from ahead."""
     return {degrees: name for name, degrees in DIRECTIONS.items()}.get(way, f"{way:g}")
+
+
+def _drives(value: object) -> tuple[Drive, ...]:
+    """Return drives in a tuple, or raise MapError for other values."""
+    mend = "take drives_of(trace), or those of a solution"
+    return all_instances("drives", value, Drive, MapError, mend=mend)
 
 
 def checked_corrections(value: object) -> Corrections:

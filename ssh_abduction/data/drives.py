@@ -179,6 +179,11 @@ def step_of(drives: Sequence[Drive], name: str) -> int:
             f"{brief(drive_name)}; name one, such as {next(iter(by_name))}:0"
         )
     steps = drive.stop - drive.first
+    if not colon and not number.isdecimal():
+        raise TraceError(
+            f"step {brief(name)}: expected a step such as {step_name(drives, 0)}, got "
+            f"{brief(name)}; name a drive and a step"
+        )
     if not (number.isascii() and number.isdecimal()) or int(number) >= steps:
         raise TraceError(
             f"step {brief(name)}: expected 0 to {steps - 1}, got {brief(number)}"

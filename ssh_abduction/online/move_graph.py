@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Any, TypeAlias
 
 import networkx as nx
 
-from ssh_abduction.data.errors import MapError, brief
+from ssh_abduction.data.drives import Drive, step_of
+from ssh_abduction.data.errors import MapError, TraceError, brief
 from ssh_abduction.data.map_parts import thing_named
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.words import meant
@@ -35,6 +36,7 @@ class MoveGraph:
 
     Args:
         by: What the shortest route minimises: "actions", "places" or "metres".
+        drives: The drives of the map's trace, to find steps such as "monday:12".
 
     Raises:
         MapError: The map has no poses for "metres", or no paths for "places".
@@ -46,8 +48,8 @@ class MoveGraph:
             bearing of each. No edge passes them.
     """
 
-    def __init__(self, ssh_map: SSHMap, by: str) -> None:
-        self.map, self.by = ssh_map, by
+    def __init__(self, ssh_map: SSHMap, by: str, drives: Sequence[Drive] = ()) -> None:
+        self.map, self.by, self._drives = ssh_map, by, drives
         self._poses = drawable_poses(ssh_map)
         if by == "metres" and self._poses is None:
             raise MapError(
@@ -74,8 +76,9 @@ class MoveGraph:
         """Return the dstates that a user names, and words for them, such as "place 3".
 
         `name` is a dstate, place or region by its number, such as 3, "p3" or "region2", or a name
-        that a person gave. A place or region stands for all dstates there. `field` is the name of
-        the user's parameter, for messages. Raises MapError, which lists what exists.
+        that a person gave. A place or region stands for all dstates there, and a step such as
+        "monday:12" for its dstate. `field` is the name of the user's parameter, for messages.
+        Raises MapError, which lists what exists.
         """
         kind, number = thing_named(str(name), self.map.names) or (None, -1)
         if kind == "place":
@@ -84,6 +87,11 @@ class MoveGraph:
         if kind == "region" and region is not None:
             return self._dstates_in(region.places), self.map.called(kind, number)
         count = len(self.map.dstates)
+        if kind is None and ":" in str(name) and self._drives:
+            try:
+                kind, number = "dstate", self.map.dstate_at[step_of(self._drives, str(name))]
+            except TraceError as error:
+                raise MapError(f"{field}: {error}") from None
         if kind == "dstate" and number < count:
             return {number}, f"dstate {number}"
         places = f", or a place as p{self.map.places[0]}" if self.map.places else ""

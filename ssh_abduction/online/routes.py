@@ -194,8 +194,9 @@ def route(
 
     Args:
         maps: A solution, maps of one trace, or one map.
-        start: The number of a dstate; or a place or region, such as "p3", "region2" or "kitchen",
-            which means any dstate there; None for the dstate of the last step.
+        start: The number of a dstate, or a step of a joint trace such as "monday:12"; or a place or
+            region, such as "p3", "region2" or "kitchen", which means any dstate there; None for the
+            dstate of the last step.
         goal: A dstate, place or region, named in the same way.
         by: What to minimise. "actions" and "metres" use links only, so the robot did each move
             before. "places" minimises travels, and also uses moves that the paths of the map imply.
@@ -210,7 +211,7 @@ def route(
     listing = Listing.of(maps)
     number = listing.number(str(map))
     ssh_map = listing.maps[number]
-    graph = MoveGraph(ssh_map, by)
+    graph = MoveGraph(ssh_map, by, listing.drives)
     here, _ = graph.nodes(ssh_map.dstate_at[-1] if start is None else start, "from")
     there, goal_named = graph.nodes(goal, "to")
     if not goal_named.startswith("dstate"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.maps import DState, SSHMap, checked_map
-from ssh_abduction.data.regions import course_named, list_in_words
+from ssh_abduction.data.regions import course_named, ids_at, list_in_words
 
 
 def to_dot(ssh_map: SSHMap) -> str:
@@ -48,6 +48,8 @@ def _clusters(ssh_map: SSHMap, places: set[int], after: int, indent: str = "  ")
         inside = " ".join(_node(s, ssh_map) for s in ssh_map.dstates if s.place == p)
         bounds = {c for r in ssh_map.regions or () if p in r.places for c in r.bounds}
         beside = f"\nright of {list_in_words(map(course_named, sorted(bounds)))}" if bounds else ""
+        names = (ssh_map.name_of("region", r) for r in ids_at(ssh_map.regions, p))
+        beside += "".join(f"\nin {name}" for name in names if name is not None)
         label = _quoted(ssh_map.called("place", p) + beside)
         lines.append(f"{indent}subgraph cluster_{p} {{ label={label}; {inside} }}")
     return lines

@@ -77,8 +77,10 @@ def place_title(ssh_map: SSHMap, place: int) -> str:
     regions = [r for r in ssh_map.regions or () if place in r.places]
     bounds = sorted({course for region in regions for course in region.bounds})
     beside = f", right of {list_in_words(map(course_named, bounds))}" if bounds else ""
-    ids = ids_at(ssh_map.regions, place)
-    within = f", in region{'' if len(ids) == 1 else 's'} {list_in_words(ids)}" if ids else ""
+    around = [ssh_map.numbered("region", region) for region in ids_at(ssh_map.regions, place)]
+    within = (
+        f", in region{'' if len(around) == 1 else 's'} {list_in_words(around)}" if around else ""
+    )
     return f"{ssh_map.called('place', place)}{beside}{within}"
 
 

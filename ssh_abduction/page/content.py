@@ -178,7 +178,7 @@ def _shared_by(pair: DrivePair) -> str:
     if not pair.forced and not pair.possible:
         return f"no {pair.of} in common in any map"
     parts = [f"{counted(len(pair.forced), f'{pair.of}s')} in common in all maps"]
-    parts += [f"{counted(len(pair.possible), 'possible joins')}, in some maps"]
+    parts += [pair.not_forced]
     return "; ".join(parts[not pair.forced : 1 + bool(pair.possible)])
 
 

@@ -82,6 +82,13 @@ class DrivePair:
             return probability_in_words(join.share)
         return f"{round(join.share * self.of_maps)} of {self.of_maps} maps"
 
+    @property
+    def not_forced(self) -> str:
+        """Say how many joins are possible, and what is known of them."""
+        maps = "maps" if self.proven else "maps that were found"
+        known = "each with its probability" if self.of_maps is None else f"in some {maps}"
+        return f"{counted(len(self.possible), 'possible joins')}, {known}"
+
     def __str__(self) -> str:
         maps = "maps" if self.proven else "maps that were found"
         parts = []
@@ -89,8 +96,9 @@ class DrivePair:
             number = counted(len(self.forced), f"{self.of}s")
             parts.append(f"{number} in common in all {maps} ({self._named(self.forced)})")
         if self.possible:
-            number = counted(len(self.possible), "possible joins")
-            parts.append(f"{number}, in some {maps} ({self._named(self.possible)})")
+            parts.append(f"{self.not_forced} ({self._named(self.possible)})")
+        if parts and self.excluded:
+            parts.append(f"{counted(self.excluded, 'pairs')} of {self.of}s joined in no map")
         text = "; ".join(parts) or f"nothing in common in any of the {maps}"
         return f"{self.first} and {self.second}: {text}"
 

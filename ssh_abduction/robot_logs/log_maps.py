@@ -41,7 +41,7 @@ from ssh_abduction.solver import (
     Status,
     find_backbone,
     obeyed,
-    with_kept_apart,
+    with_correction_warnings,
     with_names,
 )
 from ssh_abduction.theory.theory import Theory
@@ -342,7 +342,7 @@ def map_log(
         solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
     mapping.latest = lambda: outcome(solution)
     if corrections is not None:
-        solution = with_kept_apart(
+        solution = with_correction_warnings(
             corrections,
             solution,
             allowed,

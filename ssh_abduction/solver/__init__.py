@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.judging import InternalError as InternalError
     from ssh_abduction.solver.judging import Judging as Judging
     from ssh_abduction.solver.obeying import obeyed as obeyed
-    from ssh_abduction.solver.obeying import with_kept_apart as with_kept_apart
+    from ssh_abduction.solver.obeying import with_correction_warnings as with_correction_warnings
     from ssh_abduction.solver.obeying import with_names as with_names
     from ssh_abduction.solver.search import Search as Search
     from ssh_abduction.solver.solution.recorded import drives_in as drives_in

@@ -29,7 +29,7 @@ from ssh_abduction.solver.drives.added_drives import Solving, solve_onto
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.obeying import obeyed, with_kept_apart, with_names
+from ssh_abduction.solver.obeying import obeyed, with_correction_warnings, with_names
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
@@ -141,10 +141,10 @@ def _with_warnings(
         return search.solution(tuple(search))
 
     if corrections is not None:
-        solution = with_kept_apart(corrections, solution, time_limit, find)
+        solution = with_correction_warnings(corrections, solution, time_limit, find)
     if solution.maps and len(joined_drives(solution.drives, solution.maps[0])) > 1:
         _log.warning("%s", solution.joined)
-    for warning in solution.support.kept_apart:
+    for warning in solution.support.correction_warnings:
         _log.warning("%s", warning)
     return solution
 

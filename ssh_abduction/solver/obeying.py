@@ -69,13 +69,13 @@ def with_names(corrections: Corrections, solution: Solution, trace: Trace) -> So
     return replace(solution, maps=named(solution.maps))
 
 
-def with_kept_apart(
+def with_correction_warnings(
     corrections: Corrections,
     solution: Solution,
     limit: float | None,
     find: Callable[[Trace, Theory, float], Solution],
 ) -> Solution:
-    """Add warnings about drives that contradict a corrected gateway.
+    """Add warnings about drives that contradict a corrected gateway, and about unused names.
 
     A correction changes only the stars of the steps that it names. If another drive saw the gateway
     as it was before, its steps cannot be at the place any more. Without stars, they can be there.
@@ -87,19 +87,34 @@ def with_kept_apart(
         find: Finds a map of a trace and a theory in some seconds. It is called once, without
             corrections of gateways, if the correction may keep a drive from the place.
     """
-    if not corrections.gateways or solution.stopped == "interrupted":
-        return solution
-    left = DOUBTING if limit is None else min(limit - solution.seconds.total, DOUBTING)
-    said = _contradictions(
-        corrections, solution, lambda trace, theory: find(trace, theory, max(left, SHORTEST))
-    )
-    return replace(solution, support=replace(solution.support, kept_apart=tuple(said)))
+    said = [*_unused_names(corrections, solution)]
+    if corrections.gateways and solution.stopped != "interrupted":
+        left = DOUBTING if limit is None else min(limit - solution.seconds.total, DOUBTING)
+        said += _contradictions(
+            corrections, solution, lambda trace, theory: find(trace, theory, max(left, SHORTEST))
+        )
+    return replace(solution, support=replace(solution.support, correction_warnings=tuple(said)))
+
+
+def _unused_names(corrections: Corrections, solution: Solution) -> Iterator[str]:
+    """Yield a warning for each name that the first map does not have."""
+    if not solution.maps or solution.trace is None:
+        return
+    drives = drives_of(solution.trace)
+    used = {name.text for name in corrections.named(solution.maps[0], drives).names}
+    for naming in corrections.known_in(drives).names:
+        if naming.name not in used:
+            yield (
+                f"{named(corrections.source or 'corrections')}: {naming}: it is not used: in the "
+                f"first map, this step has no {naming.kind}, or its {naming.kind} has an earlier "
+                "name; rename one of them"
+            )
 
 
 def _contradictions(
     corrections: Corrections, solution: Solution, find: Callable[[Trace, Theory], Solution]
 ) -> Iterator[str]:
-    """Yield the warnings that `with_kept_apart` adds."""
+    """Yield the warnings that `with_correction_warnings` adds."""
     trace = solution.trace
     if trace is None or not solution.maps:
         return

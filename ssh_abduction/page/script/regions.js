@@ -20,7 +20,8 @@ function bandsOf(ssh) {
 
 function regionTold(ssh, { id, places, door }) {
   const named = [...places].map((p) => ssh.called("place", p));
-  return `${ssh.called("region", id)}: ${named.join(", ")}, behind ${ssh.called("place", door)}`;
+  const behind = door === null ? "" : `, behind ${ssh.called("place", door)}`;
+  return `${ssh.called("region", id)}: ${named.join(", ")}${behind}`;
 }
 
 // The places right and left of a path, as the robot faces in its first direction.
@@ -64,7 +65,8 @@ function paintChosen(figure) {
       }
 }
 
-// A list of the sides of paths and of the regions behind one place. A click rings their places.
+// A list of the sides of paths, and of the regions that are named or behind one place. A click
+// rings their places.
 function tellRegions() {
   const list = $("regions"),
     ssh = state.mode === "one" ? mapOf(state.map) : null;
@@ -87,6 +89,6 @@ function tellRegions() {
     if (told.length) add(`path ${path}`, `${ssh.called("path", path)} – ${told.join("; ")}`, sides);
   }
   for (const region of ssh.regions)
-    if (region.door !== null)
+    if (region.door !== null || `region ${region.id}` in ssh.names)
       add(`region ${region.id}`, regionTold(ssh, region), { within: region.places });
 }

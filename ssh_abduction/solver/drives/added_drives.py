@@ -20,7 +20,7 @@ drives are short, the solver gets all old steps.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -29,7 +29,8 @@ from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import drives_of, starts_of, step_name, together
 from ssh_abduction.data.errors import SolverError
-from ssh_abduction.data.map_parts import Name
+from ssh_abduction.data.gateways import with_allowed_headings
+from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
@@ -89,6 +90,7 @@ def solve_onto(
     if corrections is not None:
         joint, theory = obeyed(corrections, joint, theory)
         old, trace = joint[: len(old)], joint[len(old) :]
+    _check_assertions(theory, old, ssh_map)
     problem = settle(joint, theory)
     in_use = problem.theory
     if solving.speedups.greedy and len(joint) > READABLE and can_lay(in_use):
@@ -108,12 +110,7 @@ def solve_onto(
     ended = found.stopped in _LIMITS
     if not kept and not ended and found.status is not Status.UNSATISFIABLE:
         found, kept = _with_assertions(part, pinned, digest, ssh_map, found, solving)
-    maps = tuple(
-        replace(
-            m, dstate_at=digest.labels_of_all(m, ssh_map), starts=starts_of(joint), names=()
-        ).renumbered()
-        for m in kept
-    )
+    maps = tuple(_of_all_drives(m, digest, ssh_map, joint, in_use) for m in kept)
     if not maps and ended and (grown := _grown(ssh_map, old, problem)):
         found, maps = replace(found, status=Status.FEASIBLE, cost=Cost.of(grown)), (grown,)
     if not maps:
@@ -137,6 +134,26 @@ def solve_onto(
         ),
     )
     return _named(solution, ssh_map, corrections)
+
+
+def _of_all_drives(
+    found: SSHMap, digest: Digest, ssh_map: SSHMap, joint: Trace, theory: Theory
+) -> SSHMap:
+    """Make a map of all drives from a map of a digest and a new drive.
+
+    The robot may first have visited a place at another dstate than the digest. That dstate has
+    heading 0.
+    """
+    labels = digest.labels_of_all(found, ssh_map)
+    whole = replace(found, dstate_at=labels, starts=starts_of(joint), names=())
+    if theory.star == "gateways":
+        whole = with_allowed_headings(joint, whole, theory.axioms) or whole
+    elif theory.star == "frame":
+        visited = (whole.dstates[label] for label in dict.fromkeys(labels))
+        back = firsts((s.place, s.heading or 0) for s in visited)
+        turned = (replace(s, heading=((s.heading or 0) - back[s.place]) % 4) for s in whole.dstates)
+        whole = replace(whole, dstates=tuple(turned))
+    return whole.renumbered()
 
 
 def _laid_in_time(
@@ -163,25 +180,10 @@ def _effort(found: Solution, steps: int, watch: Watch) -> Effort:
 
 
 def _named(solution: Solution, ssh_map: SSHMap, corrections: Corrections | None) -> Solution:
-    """Name places and paths as a person said or, if nothing is said, as in the existing map."""
-    if corrections is not None:
-        assert solution.trace is not None
-        return with_names(corrections, solution, solution.trace)
-    maps = (replace(grown, names=tuple(_kept_names(grown, ssh_map))) for grown in solution.maps)
-    return replace(solution, maps=tuple(maps))
-
-
-def _kept_names(grown: SSHMap, ssh_map: SSHMap) -> Iterator[Name]:
-    """Yield the names of an existing map for a map that begins with its steps."""
-    for name in ssh_map.names:
-        steps = zip(ssh_map.dstate_at, grown.dstate_at, strict=False)
-        ids = [
-            getattr(grown.dstates[after], name.kind)
-            for before, after in steps
-            if name.kind != "region" and getattr(ssh_map.dstates[before], name.kind) == name.id
-        ]
-        if ids and ids[0] is not None:
-            yield replace(name, id=ids[0])
+    """Give the maps the names that a person gave or, without corrections, those of the old map."""
+    assert solution.trace is not None
+    said = Corrections.of_names(ssh_map, solution.drives) if corrections is None else corrections
+    return with_names(said, solution, solution.trace)
 
 
 def _grown(ssh_map: SSHMap, old: Trace, problem: Problem) -> SSHMap | None:
@@ -208,6 +210,22 @@ def _existing(existing: object) -> tuple[Trace, SSHMap]:
             "together"
         )
     return solution.trace, solution.maps[0]
+
+
+def _check_assertions(theory: Theory, old: Trace, ssh_map: SSHMap) -> None:
+    """Raise SolverError if the existing map contradicts what a theory asserts of the old steps."""
+    dstates = ssh_map.dstate_at
+    places = [ssh_map.dstates[s].place for s in dstates]
+    for kind in ASSERTIONS:
+        ids = dstates if kind in ("same", "different") else places
+        for i, j in getattr(theory, kind):
+            known = max(i, j) < len(old) and ids[i] is not None
+            if known and (ids[i] == ids[j]) != kind.startswith("same"):
+                steps = ", ".join(step_name(drives_of(old), t) for t in (i, j))
+                raise SolverError(
+                    f"onto: expected a map that obeys '{kind}: {steps}', got one that "
+                    "does not; map the old drives again, or solve all drives together"
+                )
 
 
 def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, joins: bool) -> Theory:

@@ -293,7 +293,12 @@ def conditioned(
     if len(off) % 2:
         off[-1] = math.remainder(off[-1], math.tau)
     across = covariance[:, first] - covariance[:, second]
-    root = np.linalg.cholesky(across[first] - across[second] + np.diag(spreads[: len(off)]))
+    spread = across[first] - across[second] + np.diag(spreads[: len(off)])
+    try:
+        root = np.linalg.cholesky(spread)
+    except np.linalg.LinAlgError:  # large variances were rounded, as after travels of 500 m
+        variances, axes = np.linalg.eigh(spread)
+        root = axes * np.sqrt(np.maximum(variances, BLUR))
     white = np.linalg.solve(root, across.T)
     misfit = np.linalg.solve(root, off)
     less = white.T @ white  # symmetric

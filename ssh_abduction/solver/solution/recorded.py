@@ -85,7 +85,8 @@ class Support:
         recorded: The certificate and warnings of the file, if the solution was read from a file;
             else None.
         onto: The names of the old drives whose map had to be kept; empty if there are none.
-        kept_apart: Warnings that two drives share no place because of a corrected gateway.
+        correction_warnings: Warnings that a corrected gateway keeps drives apart, or that a name is
+            not used.
     """
 
     basis: Basis | None = None
@@ -94,7 +95,7 @@ class Support:
     weighed: Weighed | None = None
     recorded: Recorded | None = None
     onto: tuple[str, ...] = ()
-    kept_apart: tuple[str, ...] = ()
+    correction_warnings: tuple[str, ...] = ()
 
     @property
     def certificate(self) -> Certificate | None:

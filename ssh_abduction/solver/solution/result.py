@@ -300,13 +300,13 @@ class Solution(MapSequence):
         """Sentences about what is suspicious in the trace, or in corrections of a person.
 
         They are about a step that looks like noise, about the noise or the units of the odometry,
-        and about drives that a corrected gateway keeps apart.
+        about drives that a corrected gateway keeps apart, and about names that are not used.
         """
         if self.support.recorded is not None:
             return self.support.recorded.warnings
         noise = [self.noise.sentence(self.trace)] if self.noise and self.trace else []
         others = (self.support.odometry_warning, self.support.weigh_warning)
-        return (*noise, *filter(None, others), *self.support.kept_apart)
+        return (*noise, *filter(None, others), *self.support.correction_warnings)
 
     @property
     def noise(self) -> Noise | None:
