@@ -25,7 +25,7 @@ from worlds import ENDLESS, TOURS, drive, rectangle
 
 from perception.readers.writers import write_carmen
 from ssh_abduction import Theory, Trace
-from ssh_abduction.cli import batch, cluster_jobs, main, mapping
+from ssh_abduction.cli import cluster_jobs, main, mapping
 from ssh_abduction.cli.batch import SolveQuestion
 from ssh_abduction.cli.cluster_jobs import Absence, answers_on_cluster
 from ssh_abduction.cli.jobs import FileAnswer, answers_here
@@ -428,7 +428,7 @@ def test_ctrl_c_prints_finished_answers_that_waited_for_their_turn(
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(10)
 
-    monkeypatch.setattr(batch, "answers_here", answers)
+    monkeypatch.setattr(cluster_jobs, "answers_here", answers)
     assert main(["solve", *["quick.jsonl"] * 5]) == 130
     assert capsys.readouterr() == (
         "first\nthird\nfourth\n",

@@ -105,12 +105,11 @@ def parser() -> Parser:
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
     verbs = top.add_subparsers(action=Verbs, metavar="VERB", dest="verb", required=True)
-    for modules in VERBS.values():
+    for title, modules in VERBS.items():
+        known = set(verbs.choices)
         for verb in modules:
-            known = set(verbs.choices)
             verb.add_parser(verbs)
-            group = next(title for title, members in VERBS.items() if members is modules)
-            top.groups[group] = (*top.groups.get(group, ()), *(set(verbs.choices) - known))
+        top.groups[title] = tuple(set(verbs.choices) - known)
     for each in (top, *verbs.choices.values()):
         add_verbosity(each)
     for each in verbs.choices.values():

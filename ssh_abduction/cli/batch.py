@@ -11,31 +11,23 @@ import contextlib
 import ctypes
 import gc
 import sys
-from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
 from ssh_abduction.cli import EXIT_ERROR
-from ssh_abduction.cli.cluster_jobs import answers_on_cluster
+from ssh_abduction.cli.cluster_jobs import answers_of
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.jobs import (
-    FileAnswer,
-    FileQuestion,
-    answers_here,
-    final_code,
-    in_a_line,
-)
+from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, final_code, in_a_line
 from ssh_abduction.cli.options import check_jobs, theory_of
 from ssh_abduction.cli.outcome import (
-    Given,
     StopFlag,
     all_given,
     answer_ending,
     answer_opening,
     exit_code,
-    given_by,
     on_ctrl_c,
     warn,
     warnings_of,
@@ -45,6 +37,7 @@ from ssh_abduction.cli.text import headline
 from ssh_abduction.cli.verbosity import progress_bar
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import json_line
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.program import SIGNALLED
@@ -136,22 +129,20 @@ class SolveQuestion(FileQuestion):
             speedups=self.speedups,
             on_progress=on_progress,
         )
-        maps: list[Given] = []
-        with self._guarded(number, path, search, maps, given_up):
+        kept: list[SSHMap] = []
+        with self._guarded(number, path, search, kept, given_up):
             for ssh_map in search:
-                maps += [given_by(search, ssh_map)] if self.json else []
+                kept += [ssh_map] if self.json else []
             explanation = why_no_map(search)
-            solution = search.solution(tuple(ssh_map for ssh_map, _ in maps))
-            return self._answer(
-                number, path, search, solution, all_given(solution), explanation, search.backbone
-            )
+            solution = search.solution(tuple(kept))
+            return self._answer(number, path, search, solution, explanation, search.backbone)
 
     def _guarded(
         self,
         number: int,
         path: str,
         search: Search,
-        maps: list[Given],
+        kept: list[SSHMap],
         given_up: Callable[[], bool],
     ) -> contextlib.AbstractContextManager[object]:
         """Make a guard that ends a worker process at its limits; nothing in other processes."""
@@ -159,9 +150,8 @@ class SolveQuestion(FileQuestion):
         def last_words(why: Stop) -> tuple[str, int, Callable[[], None]]:
             try:
                 solution = search.snapshot(why)
-                given = [(ssh_map, None) for ssh_map in solution.maps] if self.json else []
-                found = [*maps] or given
-                answer = self._answer(number, path, search, solution, found, None, None)
+                solution = replace(solution, maps=tuple(kept) or solution.maps)
+                answer = self._answer(number, path, search, solution, None, None)
             except Exception as error:  # without an answer, the process would seem to be killed
                 answer = self.failed(number, path, error)
             # Nobody reads the exit code of this process.
@@ -169,13 +159,7 @@ class SolveQuestion(FileQuestion):
 
         if not workers.serves():
             return contextlib.nullcontext()
-        return Guard(
-            search.interrupt,
-            last_words,
-            self.limit,
-            self.memory,
-            given_up=given_up,
-        )
+        return Guard(search.interrupt, last_words, self.limit, self.memory, given_up=given_up)
 
     def _answer(
         self,
@@ -183,14 +167,13 @@ class SolveQuestion(FileQuestion):
         path: str,
         search: Search,
         solution: Solution,
-        maps: Sequence[Given],
         explanation: Explanation | None,
         backbone: Backbone | None,
     ) -> FileAnswer:
         """Make the answer for a solution: its line, exit code and warnings."""
         if self.json:
-            written = [written_map(*given) for given in maps]
-            ending = answer_ending(search, solution, explanation, len(maps), backbone)
+            written = [written_map(*given) for given in all_given(solution)]
+            ending = answer_ending(search, solution, explanation, len(written), backbone)
             line = json_line({"trace": path, **answer_opening(search), "maps": written, **ending})
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
@@ -235,11 +218,7 @@ def run(options: argparse.Namespace) -> int:
         options.within,
     )
     stop = StopFlag()
-    if options.scheduler is None:
-        answers = answers_here(question, paths, options.jobs or 1, stop)
-    else:
-        answers = answers_on_cluster(question, paths, options.scheduler, options.jobs, stop)
-    codes = _printed(answers, len(paths), stop)
+    codes = _printed(answers_of(question, paths, options, stop), len(paths), stop)
     return final_code(codes, len(paths), stop, "traces")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from ssh_abduction.checker.checker import Violation, check, unchecked
 from ssh_abduction.checker.claims import false_claims
-from ssh_abduction.checker.proof import check_bound
+from ssh_abduction.checker.proof import ProvenBound, check_bound
 from ssh_abduction.cli.obeyed_corrections import as_corrected
 from ssh_abduction.cli.options import (
     add_maps,
@@ -19,6 +19,7 @@ from ssh_abduction.cli.options import (
     solved_trace,
     some_maps,
     theory_of,
+    written_theory,
 )
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted
@@ -120,8 +121,7 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     trace = solved_trace(options)
     data = read_json(options.maps)
-    written = data.get("theory") if isinstance(data, dict) else None
-    solved = None if written is None else Theory.from_dict(written)
+    solved = written_theory(data)
     trace, theory = as_corrected(trace, theory_of(options, solved), options.maps)
     theory.check_steps(trace)
     if options.bound:
@@ -143,7 +143,7 @@ def run(options: argparse.Namespace) -> int:
     if resolved.weigh == "cost" and isinstance(data, dict) and data.get("weighed"):
         holds &= _costs_hold(trace, data, maps, resolved, str(options.maps), said)
     if options.bound:
-        _refuse_bound(resolved, solved)
+        _refuse_bound(data, resolved, solved)
         broken, doubt = not holds, None
         if broken:
             doubt = "some maps break axioms"
@@ -151,14 +151,14 @@ def run(options: argparse.Namespace) -> int:
             doubt = "the file names no theory"
         elif other:
             doubt = "the file is of another theory"
-        holds &= _bound(trace, data, theory, maps, doubt, made_by, broken, said)
+        holds &= _bound(trace, data, maps, doubt, made_by, broken, said)
     found = _Judgement(violations, resolved, [*map(printable, said)], holds)
     print(json_line(found.to_dict()) if options.json else "\n".join(found.lines()))
     return 0 if holds else EXIT_VIOLATED
 
 
-def _refuse_bound(resolved: Theory, solved: Theory | None) -> None:
-    """Raise MapError if a clique proves no bound for the theory to check, or that of the file."""
+def _refuse_bound(data: Any, resolved: Theory, solved: Theory | None) -> None:
+    """Raise MapError if a clique proves no bound for these theories, or the file has none."""
     if resolved.has_faults or (solved is not None and solved.has_faults):
         raise MapError(
             "bound: expected a theory without faults (misread, slipped), as a clique of steps "
@@ -168,6 +168,16 @@ def _refuse_bound(resolved: Theory, solved: Theory | None) -> None:
         raise MapError(
             "bound: expected a trace whose views are all known, as a step whose view is unknown "
             "may be any dstate; leave out --bound"
+        )
+    if RESTS_ON - set(resolved.axioms):
+        raise MapError(
+            "bound: expected a theory with the axioms functional_view and deterministic, which "
+            "the proof rests on, got another one; leave out --bound"
+        )
+    if not isinstance(data, dict) or "certificate" not in data:
+        raise MapError(
+            "certificate: expected one in the file of maps, got none; leave out --bound, "
+            "or take a file that solve --onto did not write"
         )
 
 
@@ -215,8 +225,7 @@ def _costs_hold(
 
 def _bound(
     trace: Trace,
-    data: Any,
-    theory: Theory,
+    data: Mapping[str, Any],
     maps: Sequence[SSHMap],
     doubt: str | None,
     solved: Theory,
@@ -228,17 +237,6 @@ def _bound(
     `doubt` says why clingo's proofs may not hold for this trace and theory. Returns whether all
     claims hold.
     """
-    fewest = min((len(m.dstates) for m in maps), default=None)
-    if RESTS_ON - set(theory.axioms):
-        raise MapError(
-            "bound: expected a theory with the axioms functional_view and deterministic, which "
-            "the proof rests on, got another one; leave out --bound"
-        )
-    if not isinstance(data, dict) or "certificate" not in data:
-        raise MapError(
-            "certificate: expected one in the file of maps, got none; leave out --bound, "
-            "or take a file that solve --onto did not write"
-        )
     bound = check_bound(trace, data["certificate"])
     said += [f"bound: {fault}" for fault in bound.faults]
     false = [
@@ -250,28 +248,37 @@ def _bound(
     said += false
     if bound.faults:
         return False
+    fewest = min((len(m.dstates) for m in maps), default=None)
+    total = bound.dstates + (0 if doubt else len(bound.refuted))
+    said += _bound_in_words(bound, total, fewest, doubt)
+    return not false and (fewest is None or fewest >= total)
+
+
+def _bound_in_words(
+    bound: ProvenBound, total: int, fewest: int | None, doubt: str | None
+) -> Iterator[str]:
+    """Yield sentences about a lower bound of `total` dstates. A map has `fewest`, if there is one.
+
+    `doubt` is as for `_bound`.
+    """
     pairs = bound.dstates * (bound.dstates - 1) // 2
     states = counted(bound.dstates, "dstates")
-    said.append(
+    yield (
         f"at least {states}: no two of {counted(bound.dstates, 'steps')} can be one dstate "
         f"({counted(pairs, 'pairs')} checked)"
     )
-    total = bound.dstates + (0 if doubt else len(bound.refuted))
     if bound.refuted and doubt:
-        said.append(
-            f"clingo's verdict on {counted(bound.refuted[0], 'dstates')} and more is left out: "
-            f"{doubt}"
-        )
+        refuted = counted(bound.refuted[0], "dstates")
+        yield f"clingo's verdict on {refuted} and more is left out: {doubt}"
     elif bound.refuted:
         sizes = str(bound.refuted[0]) + f" to {total - 1}" * (len(bound.refuted) > 1)
         least = counted(total, "dstates")
-        said.append(f"at least {least}, if clingo is right that no map has {sizes}")
+        yield f"at least {least}, if clingo is right that no map has {sizes}"
     if fewest is not None and fewest < total:
-        said.append(f"the maps have {fewest}, fewer than that, so this bound or a map is wrong")
+        yield f"the maps have {fewest}, fewer than that, so this bound or a map is wrong"
     elif fewest is not None:
         more = f", {fewest - total} more than proven" if fewest > total else ": no map has fewer"
-        said.append(f"the maps have {fewest}{more}")
-    return not false and (fewest is None or fewest >= total)
+        yield f"the maps have {fewest}{more}"
 
 
 def _false_of_maps(data: Mapping[str, Any], maps: Sequence[SSHMap], trace: Trace) -> Iterator[str]:

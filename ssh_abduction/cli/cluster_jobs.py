@@ -1,7 +1,8 @@
-"""Answer the same question about many files, on the workers of a Dask scheduler."""
+"""Answer the same question about many files, here or on the workers of a Dask scheduler."""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import logging
 import re
@@ -12,7 +13,7 @@ from concurrent.futures import CancelledError
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from ssh_abduction.cli.jobs import FileQuestion, solved_in_worker
+from ssh_abduction.cli.jobs import FileQuestion, answers_here
 from ssh_abduction.cli.outcome import StopFlag, warn
 from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError, SolverError, brief
@@ -28,6 +29,15 @@ LOST = (
     "scheduler: expected an answer, got a lost connection; see whether it runs, and solve this "
     "trace again"
 )
+
+
+def answers_of(
+    question: FileQuestion, paths: Sequence[str], options: argparse.Namespace, stop: StopFlag
+) -> Generator[Any]:
+    """Yield answers from processes here, or from the scheduler that the options name."""
+    if options.scheduler is None:
+        return answers_here(question, paths, options.jobs or 1, stop)
+    return answers_on_cluster(question, paths, options.scheduler, options.jobs, stop)
 
 
 def answers_on_cluster(
@@ -227,8 +237,8 @@ def _on_worker(question: FileQuestion, number: int, path: str, content: Any) -> 
         return question.answer(number, path, content, given_up)
     # A task that exceeds its limits is killed together with its process. So it gets its own
     # process, as other tasks may run in this one.
-    work = [(number, path, question, content)]
+    work = [(number, path, content)]
     answer: Any = next(
-        workers.answers(solved_in_worker, work, 1, given_up, question.overdue, question.patience)
+        workers.answers(question.answer, work, 1, given_up, question.overdue, question.patience)
     )
     return question.lost(answer, path) if isinstance(answer, workers.Lost) else answer

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.options import add_maps, add_trace, read_maps, some_maps, trace_of
@@ -91,23 +92,15 @@ def run(options: argparse.Namespace) -> int:
     named_truth = tells_names(trace)
     found, judged = None, []
     with said_of(named(options.maps), MapError):
-        if (
-            options.near is not None
-            or options.truth is not None
-            or (not named_truth and any(told_poses(trace)))
-        ):
+        by_poses = options.near is not None or options.truth is not None
+        if by_poses or (not named_truth and any(told_poses(trace))):
             judged.append(evaluate_visits(maps, trace, near=near))
         if relations is not None:
             judged.append(evaluate_visits(maps, trace, near=near, relations=relations))
         if named_truth or not judged:
             found = evaluate(maps, trace)
     for visits in judged:
-        if not visits.places.judged:
-            warn([_nothing_judged(visits)])
-        if visits.by_both is not None and visits.by_both[1] < ALIKE * visits.by_both[0]:
-            agree = f"{visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits only"
-            ask = f"are {named(options.relations)} relations of this log?"
-            warn([f"relations and the poses of the trace agree on {agree}: {ask}"])
+        warn(_doubts(visits, options.relations))
     if options.json:
         record = {"count": len(maps)} if found is None else found.to_dict()
         print(json_line({**record, **{visits.judge: visits.to_dict() for visits in judged}}))
@@ -122,6 +115,16 @@ def run(options: argparse.Namespace) -> int:
         rows = enumerate(visits.maps, 1)
         print(table(PAIRS, [[i, *_pairs(one.places), *_pairs(one.dstates)] for i, one in rows]))
     return 0
+
+
+def _doubts(found: VisitsEvaluation, relations: str | None) -> Iterator[str]:
+    """Yield warnings if nothing is judged, or if the relations seem to be of another log."""
+    if not found.places.judged:
+        yield _nothing_judged(found)
+    if found.by_both is not None and found.by_both[1] < ALIKE * found.by_both[0]:
+        agree = f"{found.by_both[1]} of {counted(found.by_both[0], 'pairs')} of visits only"
+        ask = f"are {named(relations)} relations of this log?"
+        yield f"relations and the poses of the trace agree on {agree}: {ask}"
 
 
 def _nothing_judged(found: VisitsEvaluation) -> str:

@@ -204,9 +204,9 @@ def _as_json(in_map: PairInMap | None, explanation: Answer) -> str:
 
 def _exit_code(explanation: Answer) -> int:
     """Find the exit code for an explanation, as the help lists them."""
+    if explanation.stopped == "interrupted":
+        return interrupted_code()
     if isinstance(explanation, PlaceExplanation):
-        if explanation.stopped == "interrupted":
-            return interrupted_code()
         if explanation.maps:
             return 0
         return EXIT_NO_MAP if explanation.possible is False else EXIT_UNKNOWN
@@ -214,9 +214,6 @@ def _exit_code(explanation: Answer) -> int:
         no_map, known = explanation.verdict is Verdict.NO_MAP, explanation.proven
     else:
         no_map, known = explanation.possible is False, explanation.possible is not None
-    if explanation.stopped == "interrupted":
-        return interrupted_code()
-    has_clash = isinstance(explanation, PlaceExplanation) or explanation.clash is not None
-    if not known or (no_map and not has_clash):
+    if not known or (no_map and explanation.clash is None):
         return EXIT_UNKNOWN
     return EXIT_NO_MAP if no_map else 0

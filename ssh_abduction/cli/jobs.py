@@ -103,11 +103,11 @@ def answers_here(
 
     from joblib import effective_n_jobs
 
-    tasks = [(number, path, question, None) for number, path in enumerate(paths)]
+    tasks = [(number, path, None) for number, path in enumerate(paths)]
     processes = min(effective_n_jobs(jobs), len(paths))
     with on_ctrl_c(stop.ask):
         for answer in workers.answers(
-            solved_in_worker, tasks, processes, stop.is_set, question.overdue, question.patience
+            question.answer, tasks, processes, stop.is_set, question.overdue, question.patience
         ):
             if not isinstance(answer, workers.Lost):
                 yield answer
@@ -133,13 +133,3 @@ def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> 
         )
         return EXIT_ERROR
     return max(codes, default=0)
-
-
-def solved_in_worker(
-    number: int, path: str, question: FileQuestion, content: Any, given_up: Callable[[], bool]
-) -> Any:
-    """In a worker process, answer a question about one file.
-
-    `content` is None if the file is not loaded yet.
-    """
-    return question.answer(number, path, content, given_up)

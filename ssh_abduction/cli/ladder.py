@@ -61,10 +61,8 @@ def run(options: argparse.Namespace) -> int:
     def last_words(_: Stop) -> tuple[str, int]:
         return written(), interrupted_code()
 
-    with (
-        on_ctrl_c(under_way.interrupt),
-        Guard(under_way.interrupt, last_words, None, None) as guard,
-    ):
+    interrupt = under_way.interrupt
+    with on_ctrl_c(interrupt), Guard(interrupt, last_words) as guard:
         for rung in ladder(
             trace,
             theory,

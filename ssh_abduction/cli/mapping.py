@@ -19,16 +19,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ssh_abduction.checker.joins import joins_in_words
 from ssh_abduction.cli import EXIT_ERROR, unwritten
-from ssh_abduction.cli.cluster_jobs import answers_on_cluster
+from ssh_abduction.cli.cluster_jobs import answers_of
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.import_log import WIDTH, named_after, reading_of
-from ssh_abduction.cli.jobs import (
-    FileAnswer,
-    FileQuestion,
-    answers_here,
-    final_code,
-    in_a_line,
-)
+from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, final_code, in_a_line
 from ssh_abduction.cli.obeyed_corrections import say_obeyed
 from ssh_abduction.cli.options import check_jobs, choices_of, theory_of
 from ssh_abduction.cli.outcome import StopFlag, exit_code, on_ctrl_c, warn
@@ -193,7 +187,7 @@ class MapQuestion(FileQuestion):
             )
             return "", interrupted_code(), partial(keep or workers.reply, answer)
 
-        guard = Guard(interrupt, last_words, None, None, given_up=given_up)
+        guard = Guard(interrupt, last_words, given_up=given_up)
         # A worker process does not handle Ctrl-C: its parent stops it.
         with contextlib.nullcontext() if workers.serves() else on_ctrl_c(end), guard:
             from perception.readers.logs import read_log
@@ -314,24 +308,25 @@ def run(options: argparse.Namespace) -> int:
             print(f"{named(path)}: done already, in {named(str(folders[path]))}")
     if len(options.logs) == 1 and options.jobs is None and options.scheduler is None:
         return max([0, *(_here(question, [path], folders[path]) for path in left)])
+    return _many(question, options, {path: folders[path] for path in left})
+
+
+def _many(question: MapQuestion, options: argparse.Namespace, folders: dict[str, Path]) -> int:
+    """Map each of many logs into its folder, and return the exit code."""
     codes: list[int] = []
-    asked = len(left)
-    for path in [*left]:
+    left = [*folders]
+    for path, folder in folders.items():
         try:
-            check_folder(folders[path])
-            _check_alone(path, folders[path])
+            check_folder(folder)
+            _check_alone(path, folder)
         except AbductionError as error:
             print(f"{named(path)}: error: {error}", flush=True)
             left.remove(path)
             codes.append(EXIT_ERROR)
     stop = StopFlag()
-    if left and options.scheduler is None:
-        codes += _kept(answers_here(question, left, options.jobs or 1, stop), left, folders)
-    elif left:
-        codes += _kept(
-            answers_on_cluster(question, left, options.scheduler, options.jobs, stop), left, folders
-        )
-    return final_code(codes, asked, stop, "logs")
+    if left:
+        codes += _kept(answers_of(question, left, options, stop), left, folders)
+    return final_code(codes, len(folders), stop, "logs")
 
 
 def _together(question: MapQuestion, options: argparse.Namespace) -> int:

@@ -15,6 +15,7 @@ from ssh_abduction.cli.options import (
     solved_trace,
     some_maps,
     theory_of,
+    written_theory,
 )
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.parsing import Verbs
@@ -69,8 +70,8 @@ def run(options: argparse.Namespace) -> int:
     data = read_json(options.maps)
     maps = some_maps(data, options.maps, "seek an experiment for")
     sureness = Listing.from_dict(data, named(options.maps)).sureness
-    found = data.get("theory") if isinstance(data, dict) else None
-    theory: Theory | None = theory_of(options, None if found is None else Theory.from_dict(found))
+    found = written_theory(data)
+    theory: Theory | None = theory_of(options, found)
     if found is None and options.theory is None and theory == Theory.topological():
         theory = None  # a saved map does not contain its theory
     watch = Watch(options.time_limit, options.memory_limit)

@@ -413,14 +413,20 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
     return theory_of_maps(read_json(named_theory), named_theory).replace(**chosen)
 
 
+def written_theory(data: Any) -> Theory | None:
+    """Return the theory with which maps were made, from the data of their file; None if unknown."""
+    written = data.get("theory") if isinstance(data, dict) else None
+    return None if written is None else Theory.from_dict(written)
+
+
 def theory_of_maps(data: Any, file: str) -> Theory:
-    """Return the theory with which maps were made, from the data of their file. Raises MapError."""
-    if not isinstance(data, dict) or data.get("theory") is None:
+    """Return the theory with which maps were made, from their data. Raises MapError if unknown."""
+    if (theory := written_theory(data)) is None:
         raise MapError(
             f"{named(file)}: theory: expected the theory that the maps were made with, got none; "
             "take what solve --json printed"
         )
-    return Theory.from_dict(data["theory"])
+    return theory
 
 
 def number_steps(options: argparse.Namespace, trace: Trace) -> None:

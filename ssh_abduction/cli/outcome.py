@@ -73,13 +73,8 @@ def answer_opening(search: Search) -> dict[str, Any]:
     return written_opening(search.theory, len(search.trace), search.limits.within)
 
 
-def given_by(search: Search, ssh_map: SSHMap) -> Given:
-    """Pair the last map that a search found with its cost; with None if `within` is 0."""
-    return ssh_map, search.cost if search.limits.within else None
-
-
 def all_given(solution: Solution) -> list[Given]:
-    """List the maps of a solution in its order, each paired with its cost as in `given_by`."""
+    """Pair each map of a solution with its cost; with None if `within` is 0."""
     return list(zip_longest(solution.maps, solution.costs if solution.within else ()))
 
 

@@ -98,25 +98,17 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
             place = wished if wished in places else places[0]
         else:
             digits = content or hashlib.sha256(os.fsencode(os.path.abspath(path))).hexdigest()
-            longer = folder / f"{_cut(plain.name)}-{digits[:DIGITS]}"
             choices = [
                 *([folder] if wished == folder else []),
                 *([plain] if content and named_so[_key(plain)] == 1 else []),
-                longer,
+                folder / f"{_cut(plain.name)}-{digits[:DIGITS]}",
             ]
             place = next((one for one in choices if _key(one) not in owners), folder / digits)
             if place != wished and content:
-                why = (
-                    "has the map of another log"
-                    if _key(wished) in owners
-                    else "is the name of several logs"
-                )
-                warn(
-                    [
-                        f"{named(path)}: its folder is {named(str(place))}, as "
-                        f"{named(str(wished))} {why}"
-                    ]
-                )
+                is_taken = _key(wished) in owners
+                why = "has the map of another log" if is_taken else "is the name of several logs"
+                where = f"its folder is {named(str(place))}, as {named(str(wished))} {why}"
+                warn([f"{named(path)}: {where}"])
         other = next((one for one, taken in found.items() if _key(taken) == _key(place)), None)
         if other is None:
             found[path] = place

@@ -33,7 +33,6 @@ from ssh_abduction.cli.outcome import (
     answer_ending,
     answer_opening,
     exit_code,
-    given_by,
     on_ctrl_c,
     save_solution,
     warn,
@@ -213,12 +212,8 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
                 save = partial(save_solution, solution, options.output)
                 return printed.last_words(solution), exit_code(solution), save
 
-            guard = Guard(
-                search.interrupt,
-                last_words,
-                options.time_limit,
-                options.memory_limit,
-            )
+            limits = options.time_limit, options.memory_limit
+            guard = Guard(search.interrupt, last_words, *limits)
             until_printed.enter_context(guard)
             explanation = printed.searched(guard.say)
         solution = obeying.finished(search.solution(tuple(printed.kept)), options.time_limit)
@@ -301,7 +296,8 @@ class _Json:
         Return why there is no map, or None.
         """
         for ssh_map in self._search:
-            given = given_by(self._search, self._obeying.named(ssh_map))
+            cost = self._search.cost if self._search.limits.within else None
+            given = self._obeying.named(ssh_map), cost
             if self._maps:
                 say(partial(self._line, given))
                 continue

@@ -22,8 +22,8 @@ from ssh_abduction.theory import Theory
 from ssh_abduction.theory.evidence import evidence_of
 
 if TYPE_CHECKING:
-    from ssh_abduction.rivals.comparison import Comparison
-    from ssh_abduction.rivals.questions import Matter
+    from ssh_abduction.rivals.comparison import Choice, Comparison
+    from ssh_abduction.rivals.questions import Matter, Question
 
 # The largest number of pairs of steps, questions of a choice, and options of a choice to print.
 SHOWN_PAIRS = SHOWN_QUESTIONS = SHOWN_OPTIONS = SHOWN_WEIGHTS = 12
@@ -237,33 +237,7 @@ def compared(found: Comparison) -> Iterator[str]:
     if found.product:
         yield f"  {found.product}: each combination of these choices is a map"
     for choice in found.choices:
-        yield f"  {counted(len(choice.options), 'options')} for {depending(choice.differing)}"
-        asked = sorted(choice.questions, key=number.__getitem__)
-        for question in asked[:SHOWN_QUESTIONS]:
-            yes = [
-                i
-                for option in choice.options
-                if option.answers[choice.questions.index(question)]
-                for i in option.maps
-            ]
-            maps = f"{'map' if len(yes) == 1 else 'maps'} {stretches(sorted(yes))}"
-            shown = f"{maps} ({len(yes)} of {len(found.ids)})"
-            yield f"    question {number[question]}: {question}: in {shown}"
-        if len(asked) > SHOWN_QUESTIONS:
-            yield (
-                f"    and {counted(len(asked) - SHOWN_QUESTIONS, 'more questions')}; --json has "
-                "them"
-            )
-        if 1 < len(asked) <= SHOWN_QUESTIONS and len(choice.options) <= SHOWN_OPTIONS:
-            order = [choice.questions.index(question) for question in asked]
-            rows = [
-                [*("yes" if option.answers[k] else "no" for k in order), stretches(option.maps)]
-                for option in choice.options
-            ]
-            yield "\n".join(
-                f"    {line}"
-                for line in table([*(f"{number[q]}." for q in asked), "maps"], rows).splitlines()
-            )
+        yield from _choice_in_words(choice, number, len(found.ids))
     if found.together:
         yield f"  these depend on several choices: {depending(found.together)}"
     if not found.deciding:
@@ -281,6 +255,30 @@ def compared(found: Comparison) -> Iterator[str]:
     )
     maps = "both maps" if len(found.ids) == 2 else f"all {counted(len(found.ids), 'maps')}"
     yield f"  {questions} {maps} apart{some}"
+
+
+def _choice_in_words(choice: Choice, number: Mapping[Question, int], maps: int) -> Iterator[str]:
+    """Yield lines about a choice: its questions, with their numbers, and its options.
+
+    `maps` is the number of all maps that are compared.
+    """
+    yield f"  {counted(len(choice.options), 'options')} for {depending(choice.differing)}"
+    index = {question: k for k, question in enumerate(choice.questions)}
+    asked = sorted(choice.questions, key=number.__getitem__)
+    for question in asked[:SHOWN_QUESTIONS]:
+        options = (option for option in choice.options if option.answers[index[question]])
+        yes = sorted(i for option in options for i in option.maps)
+        where = f"{'map' if len(yes) == 1 else 'maps'} {stretches(yes)} ({len(yes)} of {maps})"
+        yield f"    question {number[question]}: {question}: in {where}"
+    if len(asked) > SHOWN_QUESTIONS:
+        yield f"    and {counted(len(asked) - SHOWN_QUESTIONS, 'more questions')}; --json has them"
+    elif len(asked) > 1 and len(choice.options) <= SHOWN_OPTIONS:
+        rows = [
+            [*("yes" if option.answers[index[q]] else "no" for q in asked), stretches(option.maps)]
+            for option in choice.options
+        ]
+        lines = table([*(f"{number[q]}." for q in asked), "maps"], rows).splitlines()
+        yield from (f"    {line}" for line in lines)
 
 
 def depending(differing: Mapping[Matter, Sequence[int]]) -> str:

@@ -16,6 +16,7 @@ from ssh_abduction.cli.options import (
     trace_beside,
     trace_of_maps,
     trace_path,
+    written_theory,
 )
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.data.checks import a_whole_number
@@ -84,26 +85,14 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.page.content import Called, content_of  # loads numpy
     from ssh_abduction.page.html import Page
     from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.theory.theory import Theory
 
     options.trace = options.trace or trace_beside(options.maps)
     trace = trace_of_maps(options.maps) if options.trace is None else Trace.load(options.trace)
-    if options.serve and trace is None:
-        raise AbductionError(
-            "--serve: expected the trace that was mapped, got none; give it after the maps"
-        )
-    if options.serve and options.output:
-        raise AbductionError(
-            "--output: expected none with --serve, which writes no file; leave out one of the two"
-        )
-    if not 0 <= options.port <= 65535:
-        raise AbductionError(f"port: expected 0 to 65535, got {options.port}; name a free port")
+    _check(options, trace)
     data = read_json(options.maps)
     source = "standard input" if options.maps == "-" else options.maps
     listing = Listing.from_dict(data, source).named_beside(options.maps)
-    theory = (
-        Theory.from_dict(data["theory"]) if isinstance(data, dict) and "theory" in data else None
-    )
+    theory = written_theory(data)
     seen = trace
     if trace is not None and theory is not None:
         trace, theory = as_corrected(trace, theory, options.maps)
@@ -128,6 +117,20 @@ def run(options: argparse.Namespace) -> int:
     if not options.output and options.open:
         _open(Path(file).absolute().as_uri())
     return 0
+
+
+def _check(options: argparse.Namespace, trace: Trace | None) -> None:
+    """Raise AbductionError if the options contradict each other."""
+    if options.serve and trace is None:
+        raise AbductionError(
+            "--serve: expected the trace that was mapped, got none; give it after the maps"
+        )
+    if options.serve and options.output:
+        raise AbductionError(
+            "--output: expected none with --serve, which writes no file; leave out one of the two"
+        )
+    if not 0 <= options.port <= 65535:
+        raise AbductionError(f"port: expected 0 to 65535, got {options.port}; name a free port")
 
 
 def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:

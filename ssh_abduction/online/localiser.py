@@ -113,8 +113,6 @@ class Localiser:
             check_labels(ssh_map, checked_trace(trace), "map")
         self._shown = view_ratios(ssh_map, trace)
         self._moves = Moves(ssh_map, trace)
-        # The results of `_alike` for views, as the same views occur again and again.
-        self._followed: dict[tuple[Observation, Move, Observation], float] = {}
         self._seen = None if recogniser is None else self._likelihood(recogniser)
 
     def __repr__(self) -> str:
@@ -279,28 +277,22 @@ class Localiser:
         links = self._moves.links(move)
         if before is None or seen is None or links is None:
             return 1.0
-        key = (before, move, seen)
-        if (known := self._followed.get(key)) is not None:
-            return known
-        alike = 1.0
         # A distribution over the dstates that look like `before` and have a link for the action.
         shares = np.zeros(self._number)
         shares[before.where] = before.ratio
         shares *= 1 - links.missing
         total = float(shares.sum())
-        if total > TINY:
-            shares /= total
-            # The effective number of dstates in the average (Kish 1965).
-            count = (1 - before.novel) / float(shares @ shares)
-            follows = (
-                float((links.leads @ shares)[seen.where] @ seen.ratio)
-                * self._number
-                / (self._number + 1)
-            )
-            alike = (count * follows + 1 - seen.novel) / (count + 1) + seen.novel
-        if self._seen is None:
-            self._followed[key] = alike
-        return alike
+        if total <= TINY:
+            return 1.0
+        shares /= total
+        # The effective number of dstates in the average (Kish 1965).
+        count = (1 - before.novel) / float(shares @ shares)
+        follows = (
+            float((links.leads @ shares)[seen.where] @ seen.ratio)
+            * self._number
+            / (self._number + 1)
+        )
+        return (count * follows + 1 - seen.novel) / (count + 1) + seen.novel
 
     def _weighed(self, expected: Belief, seen: Observation | None, alike: float = 1.0) -> Belief:
         """Compute the belief after an observation o: the product in equation 2, normalised."""

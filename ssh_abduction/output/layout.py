@@ -115,6 +115,20 @@ def _parts(ssh_map: SSHMap, poses: Sequence[Pose]) -> tuple[tuple[int, ...], ...
     return ssh_map.floors or pieces
 
 
+def fitted_motion(source: Sequence[complex], target: Sequence[complex]) -> tuple[complex, complex]:
+    """Find the turn and the shift that move points nearest to other points, by least squares.
+
+    Points are complex numbers. A point p moves to turn * p + shift. One point, or none, is not
+    turned.
+    """
+    middle, goal = (sum(points) / max(1, len(points)) for points in (source, target))
+    turn = sum(
+        ((y - goal) * (x - middle).conjugate() for x, y in zip(source, target, strict=True)), 0j
+    )
+    turn = turn / abs(turn) if abs(turn) > SAME else 1 + 0j
+    return turn, goal - turn * middle
+
+
 def _on_each_other(ssh_map: SSHMap, poses: Sequence[Pose]) -> tuple[Pose, ...]:
     """Turn and move floors, so that both ends of each lift have nearly one position.
 
@@ -129,11 +143,9 @@ def _on_each_other(ssh_map: SSHMap, poses: Sequence[Pose]) -> tuple[Pose, ...]:
             for s, x in ((a, b), (b, a))
             if floor[s] == i and (floor[x] or 0) < i
         }
-        here, there = (sum(ends) / max(1, len(lifts)) for ends in (lifts, lifts.values()))
-        turn = sum(((y - there) * (x - here).conjugate() for x, y in lifts.items()), 0j)
-        turn = turn / abs(turn) if abs(turn) > SAME else 1 + 0j
+        turn, shift = fitted_motion([*lifts], [*lifts.values()])
         for s in members:
-            found[s] = _turned(poses[s], turn, there + turn * (at[s] - here))
+            found[s] = _turned(poses[s], turn, turn * at[s] + shift)
     return tuple(found)
 
 

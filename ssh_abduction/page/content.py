@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import count, pairwise
@@ -69,29 +69,8 @@ def content_of(
     found = compare(listing)
     maps = [ssh_map.renumbered() for ssh_map in listing.maps]
     # List what maps share once, and let each map refer to it by number, in the order of first use.
-    labelings, places, orders, faults, regions = (
-        defaultdict[Any, int](count().__next__) for _ in range(5)
-    )
-    entries: list[dict[str, Any]] = []
-    for ssh_map, name in zip(maps, found.ids, strict=True):
-        one: dict[str, Any] = {
-            "id": name,
-            "labeling": labelings[ssh_map.dstate_at, tuple(str(s.shown) for s in ssh_map.dstates)],
-            "places": places[tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)],
-            "orders": orders[tuple((path.id, path.order) for path in ssh_map.paths)],
-        }
-        if leaps := _leaps(ssh_map):
-            one["leaps"] = leaps
-        if ssh_map.regions:
-            one["regions"] = regions[tuple((r.places, r.bounds, r.door) for r in ssh_map.regions)]
-        if ssh_map.names:
-            one["names"] = {f"{n.kind} {n.id}": n.text for n in ssh_map.names}
-        if ssh_map.fit:
-            one["chi2"] = round(ssh_map.fit.chi2, 1)
-        if ssh_map.faults:
-            one["faults"] = [faults[fault.step, str(fault), fault.kind] for fault in ssh_map.faults]
-            one["cost"] = round(sum(fault.cost for fault in ssh_map.faults), 1)
-        entries.append(one)
+    shared = _SharedParts()
+    entries = [_entry(ssh_map, name, shared) for ssh_map, name in zip(maps, found.ids, strict=True)]
     layouts = _layouts(maps, entries, trace)
     drawings = [_numbers(drawn, maps[i]) for i, drawn in layouts]
     spots = _spots(maps[0], layouts[0][1])
@@ -110,17 +89,50 @@ def content_of(
         "choices": [_choice(choice.to_dict()) for choice in found.choices],
         "replays": replays(maps, [one["labeling"] for one in entries], trace, run),
         "maps": entries,
-        "labelings": [{"labels": labels, "views": views} for labels, views in labelings],
-        "places": _differences(list(places)),
-        "orders": list(orders),
-        "faults": list(faults),
-        "regions": list(regions),
+        "labelings": [{"labels": labels, "views": views} for labels, views in shared.labelings],
+        "places": _differences(list(shared.places)),
+        "orders": list(shared.orders),
+        "faults": list(shared.faults),
+        "regions": list(shared.regions),
         "layouts": drawings,
         "spots": [
             [round(x, 3), round(y, 3), None if h is None else round(h, 3)] for x, y, h in spots
         ],
         "overview": overview(maps, spots),
     }
+
+
+class _SharedParts:
+    """What maps have in common, each with the number by which maps refer to it."""
+
+    def __init__(self) -> None:
+        self.labelings, self.places, self.orders, self.faults, self.regions = (
+            defaultdict[Any, int](count().__next__) for _ in range(5)
+        )
+
+
+def _entry(ssh_map: SSHMap, name: str, shared: _SharedParts) -> dict[str, Any]:
+    """Make the entry of a map, which refers to what it shares with other maps."""
+    views = tuple(str(s.shown) for s in ssh_map.dstates)
+    entry: dict[str, Any] = {
+        "id": name,
+        "labeling": shared.labelings[ssh_map.dstate_at, views],
+        "places": shared.places[tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)],
+        "orders": shared.orders[tuple((path.id, path.order) for path in ssh_map.paths)],
+    }
+    if leaps := _leaps(ssh_map):
+        entry["leaps"] = leaps
+    if ssh_map.regions:
+        regions = tuple((r.places, r.bounds, r.door) for r in ssh_map.regions)
+        entry["regions"] = shared.regions[regions]
+    if ssh_map.names:
+        entry["names"] = {f"{n.kind} {n.id}": n.text for n in ssh_map.names}
+    if ssh_map.fit:
+        entry["chi2"] = round(ssh_map.fit.chi2, 1)
+    if ssh_map.faults:
+        entry["faults"] = [shared.faults[f.step, str(f), f.kind] for f in ssh_map.faults]
+        entry["cost"] = round(sum(fault.cost for fault in ssh_map.faults), 1)
+    return entry
 
 
 def _leaps(ssh_map: SSHMap) -> list[int]:
@@ -196,32 +208,18 @@ def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
     """Shorten lists of (place, path, direction), which have an entry for each dstate.
 
     The first list stays. A later one is replaced by its differences from the first, as a dict
-    {index: value}, if that is shorter. Paths are numbered by first visit, so one more path changes
-    the numbers of others. So the dict may also have the key `paths`, which maps numbers of paths in
-    the first list to their numbers in this one.
+    {index: value}, if that is shorter.
     """
     first = items[0]
     entries: list[Any] = [first]
     for item in items[1:]:
-        called: dict[Any, Counter[Any]] = {}
-        for (_, before, _), (_, now, _) in zip(first, item, strict=False):
-            called.setdefault(before, Counter())[now] += 1
-        names = {
-            before: counts.most_common(1)[0][0]
-            for before, counts in called.items()
-            if before is not None
-        }
-        expected = [(place, names.get(path, path), direction) for place, path, direction in first]
-        differing: dict[str, Any] = {
+        differing = {
             str(i): value
-            for i, (value, other) in enumerate(zip(item, expected, strict=False))
+            for i, (value, other) in enumerate(zip(item, first, strict=False))
             if value != other
         }
-        if len(item) == len(first) and 2 * len(differing) < len(item):
-            renamed = {str(before): now for before, now in names.items() if before != now}
-            entries.append({**differing, **({"paths": renamed} if renamed else {})})
-        else:
-            entries.append(item)
+        is_shorter = len(item) == len(first) and 2 * len(differing) < len(item)
+        entries.append(differing if is_shorter else item)
     return entries
 
 

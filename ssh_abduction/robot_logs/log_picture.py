@@ -33,6 +33,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import moved
 from ssh_abduction.data.star import Star
 from ssh_abduction.output.drawing import ALARM, colour_of, escaped, page, svg_text, titled
+from ssh_abduction.output.layout import fitted_motion
 from ssh_abduction.output.region_marks import band, banded
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.robot_logs.edges import STEP, edges_of, resampled
@@ -455,10 +456,8 @@ def _fitted(
             (here, spots[second], 0.0),
         ):
             ends += [complex(x, y), complex(x, y) + cmath.rect(1.0, heading + more)]
-    source, target = np.array(here), np.array(there)
-    angle = float(np.angle(np.vdot(source - source.mean(), target - target.mean())))
-    shift = complex(target.mean() - source.mean() * cmath.rect(1.0, angle))
-    return shift.real, shift.imag, angle
+    turn, shift = fitted_motion(here, there)
+    return shift.real, shift.imag, cmath.phase(turn)
 
 
 def _turned(ssh_map: SSHMap | None, first: int, second: int) -> float:

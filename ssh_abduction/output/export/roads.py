@@ -126,21 +126,7 @@ class Roads:
                 )
             stops, ends = _places(ssh_map, drawn), _streets(ssh_map)
         else:
-            where = [
-                (ssh_map.name_of("place", s.place), *_regions_at(ssh_map, s.place))
-                for s in ssh_map.dstates
-            ]
-            views = [() if s.view is None else (s.view,) for s in ssh_map.dstates]
-            stops = tuple(
-                Stop(s.id, x, y, heading or 0.0, views[s.id], s.floor, *where[s.id])
-                for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
-            )
-            # Sort in reverse, so that the first action by name remains if several join two dstates.
-            ends = {
-                (s, x): _way(ssh_map, s, action, x)
-                for s, action, x in sorted(ssh_map.links, reverse=True)
-                if s != x
-            }
+            stops, ends = _dstates(ssh_map, drawn), _links(ssh_map)
         at = {stop.id: (stop.x, stop.y) for stop in stops}
         floor = {stop.id: stop.floor for stop in stops}
         place = {s.id: s.place for s in ssh_map.dstates} if level == "dstates" else {}
@@ -209,6 +195,16 @@ def _is_turn(here: int | None, there: int | None, length: float) -> bool:
     return length < LEAST if here is None or there is None else here == there
 
 
+def _dstates(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
+    """Make a stop for each dstate."""
+    stops = []
+    for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True):
+        views = () if s.view is None else (s.view,)
+        where = ssh_map.name_of("place", s.place), *_regions_at(ssh_map, s.place)
+        stops.append(Stop(s.id, x, y, heading or 0.0, views, s.floor, *where))
+    return tuple(stops)
+
+
 def _places(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
     """Make a stop for each place."""
     stops = []
@@ -227,6 +223,18 @@ def _regions_at(ssh_map: SSHMap, place: int | None) -> tuple[tuple[int, ...], tu
     """The ids of the regions that contain a place, and the names of those that have one."""
     ids = ids_at(ssh_map.regions, place)
     return ids, tuple(name for r in ids if (name := ssh_map.name_of("region", r)) is not None)
+
+
+def _links(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
+    """Find the action, path and direction from each dstate to each other one to which a link leads.
+
+    If several actions link them, the first by name counts.
+    """
+    return {
+        (s, x): _way(ssh_map, s, action, x)
+        for s, action, x in sorted(ssh_map.links, reverse=True)
+        if s != x
+    }
 
 
 def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:

@@ -6,12 +6,7 @@ function whereIn(i) {
   if (!placed.has(number)) {
     const first = data.places[0],
       raw = data.places[number];
-    const named = ([place, path, direction]) => [
-      place,
-      raw.paths?.[path] === undefined ? path : raw.paths[path],
-      direction,
-    ];
-    placed.set(number, Array.isArray(raw) ? raw : first.map((value, k) => raw[k] ?? named(value)));
+    placed.set(number, Array.isArray(raw) ? raw : first.map((value, k) => raw[k] ?? value));
   }
   return placed.get(number);
 }
