@@ -189,7 +189,7 @@ def _open_gateways(
     floor: Floor, stand: Stand, closed: Collection[int], chance: np.random.Generator
 ) -> tuple[Sighted, ...]:
     """The star of a room without its closed doors. Each bearing is off by at most the spread."""
-    found, heading = floor.plan.gateways[stand.room], _heading(floor.plan, stand)
+    found, heading = floor.plan.gateways[stand.room], floor.heading(stand)
     is_open = [k for k, gateway in enumerate(found) if gateway.door not in closed]
     off = chance.uniform(-floor.spread, floor.spread, len(found)).tolist()
     bearing = {k: round(found[k].bearing - heading + off[k], 3) % 360 for k in is_open}

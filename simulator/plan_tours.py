@@ -97,14 +97,14 @@ def tour(
     walk, drawn, sighted = (np.random.default_rng([seed, k]) for k in range(3))
     logged: list[Step] = []
     before: Pose | None = None
-    for stand, action in _drive(plan, steps, walk):
-        pose = _pose(plan, stand)
+    floor = Floor(plan, apart / 4)
+    for stand, action in floor.drive(steps, walk):
+        pose = floor.pose(stand)
         moved = None if before is None else displacement_between(before, pose)
         if moved is not None and odometry is not None:
             moved = reported(moved, odometry, drawn, scale=scale, bend=bend)
-        bearings = _bearings(plan, stand)
-        star = _sighted(plan, stand, apart / 4, sighted)
-        logged.append(Step(_view(bearings), action, star, moved, truth=_truth(plan, stand, pose)))
+        view, star = _view(floor.bearings(stand)), floor.sighted(stand, sighted)
+        logged.append(Step(view, action, star, moved, truth=floor.truth(stand, pose)))
         before = pose
     return Trace(tuple(logged), name=f"{plan.name}, {steps} steps, seed {seed}", odometry=odometry)
 
@@ -135,8 +135,8 @@ class Floor:
 
     def sight(self, stand: Stand) -> Step:
         """Make a step with what the robot sees in a state: view and star, without truth."""
-        bearings = _bearings(self.plan, stand)
-        return Step(_view(bearings), star=_star(self.plan, stand, bearings, self.spread))
+        bearings = self.bearings(stand)
+        return Step(_view(bearings), star=self._star(stand, bearings))
 
     def ends(self, stand: Stand) -> dict[Action, Stand]:
         """List what the robot can do in a state, and the state that each action leads to.
@@ -154,126 +154,112 @@ class Floor:
         They are a turn, unless the gateway is ahead, and a travel. Each comes with the state
         after it.
         """
-        return _way_through(self.plan, stand, goal)
+        if stand != (turned := Stand(stand.room, goal)):
+            yield self._turn(stand, goal), turned
+        gateway = self.plan.gateways[stand.room][goal]
+        back = next(
+            k for k, g in enumerate(self.plan.gateways[gateway.to]) if g.door == gateway.door
+        )
+        ahead = self.plan.gateways[gateway.to][back].opposite
+        yield (
+            Action.of("travel"),
+            Stand(gateway.to, back, False) if ahead is None else Stand(gateway.to, ahead),
+        )
 
+    def drive(
+        self, steps: int, chance: np.random.Generator
+    ) -> Iterator[tuple[Stand, Action | None]]:
+        """Drive at random. Yield each state and the next action, which is None for the last one."""
+        room = int(chance.choice(self.plan.connected))
+        stand = Stand(room, int(chance.integers(len(self.plan.gateways[room]))))
+        came_by: int | None = None
+        passed: Counter[int] = Counter()
+        while True:
+            found = self.plan.gateways[stand.room]
+            # Go back only in a dead end.
+            choices = [k for k, g in enumerate(found) if g.door != came_by or len(found) == 1]
+            least = min(passed[found[k].door] for k in choices)
+            goal = int(chance.choice([k for k in choices if passed[found[k].door] == least]))
+            for action, after in self.way_through(stand, goal):
+                if steps == 0:
+                    yield stand, None
+                    return
+                yield stand, action
+                stand, steps = after, steps - 1
+            came_by = found[goal].door
+            passed[came_by] += 1
 
-def _drive(
-    plan: Plan, steps: int, chance: np.random.Generator
-) -> Iterator[tuple[Stand, Action | None]]:
-    """Drive at random; yield each state and the next action, which is None for the last state."""
-    room = int(chance.choice(plan.connected))
-    stand = Stand(room, int(chance.integers(len(plan.gateways[room]))))
-    came_by: int | None = None
-    passed: Counter[int] = Counter()
-    while True:
-        found = plan.gateways[stand.room]
-        # Go back only in a dead end.
-        choices = [k for k, g in enumerate(found) if g.door != came_by] or list(range(len(found)))
-        least = min(passed[found[k].door] for k in choices)
-        goal = int(chance.choice([k for k in choices if passed[found[k].door] == least]))
-        for action, after in _way_through(plan, stand, goal):
-            if steps == 0:
-                yield stand, None
-                return
-            yield stand, action
-            stand, steps = after, steps - 1
-        came_by = found[goal].door
-        passed[came_by] += 1
+    def _turn(self, stand: Stand, goal: int) -> Action:
+        """Make the action of a turn to a gateway of the room.
 
+        The number in the action counts the gateways on the side of the turn, up to the one where
+        the turn ends. The gateway that the robot faces is not counted.
+        """
+        found = self.plan.gateways[stand.room]
+        if goal == (found[stand.gateway].opposite if stand.faces else stand.gateway):
+            return Action.of("around")
+        bearings = self.bearings(stand)
+        clockwise = sorted(bearing for bearing in bearings if bearing > 0)
+        side, order = ("right", clockwise) if bearings[goal] < 180 else ("left", clockwise[::-1])
+        number = order.index(bearings[goal]) + 1
+        return Action.of(
+            {"name": f"{side} to gateway {number}", "kind": "turn", "turn": side, "gateway": number}
+        )
 
-def _way_through(plan: Plan, stand: Stand, goal: int) -> Iterator[tuple[Action, Stand]]:
-    """Yield the actions that lead through a gateway. See `Floor.way_through`."""
-    if stand != (turned := Stand(stand.room, goal)):
-        yield _turn(plan, stand, goal), turned
-    gateway = plan.gateways[stand.room][goal]
-    back = next(k for k, g in enumerate(plan.gateways[gateway.to]) if g.door == gateway.door)
-    ahead = plan.gateways[gateway.to][back].opposite
-    yield (
-        Action.of("travel"),
-        Stand(gateway.to, back, False) if ahead is None else Stand(gateway.to, ahead),
-    )
+    def heading(self, stand: Stand) -> float:
+        """The heading of the robot in degrees clockwise from north."""
+        return self.plan.gateways[stand.room][stand.gateway].bearing + (0 if stand.faces else 180)
 
+    def bearings(self, stand: Stand) -> tuple[float, ...]:
+        """The bearings of the room's gateways, in its order, in degrees clockwise from ahead."""
+        heading = self.heading(stand)
+        return tuple(
+            round((gateway.bearing - heading) % 360, DIGITS) % 360
+            for gateway in self.plan.gateways[stand.room]
+        )
 
-def _turn(plan: Plan, stand: Stand, goal: int) -> Action:
-    """Make the action of a turn to a gateway of the room.
+    def sighted(self, stand: Stand, chance: np.random.Generator) -> tuple[Sighted, ...]:
+        """The star with random errors: each bearing is off by at most `spread` degrees, rounded."""
+        found, most = self.plan.gateways[stand.room], max(self.spread - ROUNDED, 0)
+        off = chance.uniform(-most, most, len(found)).tolist()
+        bearings = [
+            round(bearing + wrong, DIGITS) % 360
+            for bearing, wrong in zip(self.bearings(stand), off, strict=True)
+        ]
+        return self._star(stand, bearings)
 
-    The number in the action counts the gateways on the side of the turn, up to the one where the
-    turn ends. The gateway that the robot faces is not counted.
-    """
-    found = plan.gateways[stand.room]
-    if goal == (found[stand.gateway].opposite if stand.faces else stand.gateway):
-        return Action.of("around")
-    bearings = _bearings(plan, stand)
-    clockwise = sorted(bearing for bearing in bearings if bearing > 0)
-    side, order = ("right", clockwise) if bearings[goal] < 180 else ("left", clockwise[::-1])
-    number = order.index(bearings[goal]) + 1
-    return Action.of(
-        {"name": f"{side} to gateway {number}", "kind": "turn", "turn": side, "gateway": number}
-    )
+    def _star(self, stand: Stand, bearings: Sequence[float]) -> tuple[Sighted, ...]:
+        """The star of a room: its gateways, sorted by bearing, each with its opposite gateway."""
+        found = self.plan.gateways[stand.room]
+        order = sorted(range(len(found)), key=lambda k: bearings[k])
+        opposite = [found[k].opposite for k in order]
+        return tuple(
+            Sighted(bearings[k], self.spread, None if other is None else order.index(other))
+            for k, other in zip(order, opposite, strict=True)
+        )
 
+    def pose(self, stand: Stand) -> Pose:
+        """The true pose, in metres and radians."""
+        return (
+            *self.plan.rooms[stand.room].centre,
+            math.remainder(math.radians(90 - self.heading(stand)), math.tau),
+        )
 
-def _heading(plan: Plan, stand: Stand) -> float:
-    """The heading of the robot in degrees clockwise from north."""
-    return plan.gateways[stand.room][stand.gateway].bearing + (0 if stand.faces else 180)
-
-
-def _bearings(plan: Plan, stand: Stand) -> tuple[float, ...]:
-    """The bearings of the room's gateways, in its order, in degrees clockwise from ahead."""
-    heading = _heading(plan, stand)
-    return tuple(
-        round((gateway.bearing - heading) % 360, DIGITS) % 360
-        for gateway in plan.gateways[stand.room]
-    )
-
-
-def _sighted(
-    plan: Plan, stand: Stand, spread: float, chance: np.random.Generator
-) -> tuple[Sighted, ...]:
-    """The star with random errors: each bearing is off by at most `spread` degrees, rounded."""
-    found, most = plan.gateways[stand.room], max(spread - ROUNDED, 0)
-    off = chance.uniform(-most, most, len(found)).tolist()
-    bearings = [
-        round(bearing + wrong, DIGITS) % 360
-        for bearing, wrong in zip(_bearings(plan, stand), off, strict=True)
-    ]
-    return _star(plan, stand, bearings, spread)
+    def truth(self, stand: Stand, pose: Pose) -> dict[str, object]:
+        """The truth about a step: dstate, place, path, direction and pose."""
+        door = self.plan.gateways[stand.room][stand.gateway].door
+        path, direction = self.plan.courses[stand.room, door]
+        place = f"room {stand.room}"
+        return {
+            "dstate": f"{place}, {'at' if stand.faces else 'from'} door {door}",
+            "place": place,
+            "path": f"path {path}",
+            "direction": direction if stand.faces else -direction,
+            "pose": [round(v, 5) for v in pose],
+        }
 
 
 def _view(bearings: Sequence[float]) -> str:
     """The view: a text with the number of doors and their rough directions."""
     rough = sorted({round(bearing / COARSE) * COARSE % 360 for bearing in bearings})
     return f"{len(bearings)} door{'s' * (len(bearings) > 1)}: {' '.join(map(str, rough))}"
-
-
-def _star(
-    plan: Plan, stand: Stand, bearings: Sequence[float], spread: float
-) -> tuple[Sighted, ...]:
-    """The star of a room: its gateways, sorted by bearing, each with its opposite gateway."""
-    found = plan.gateways[stand.room]
-    order = sorted(range(len(found)), key=lambda k: bearings[k])
-    opposite = [found[k].opposite for k in order]
-    return tuple(
-        Sighted(bearings[k], spread, None if other is None else order.index(other))
-        for k, other in zip(order, opposite, strict=True)
-    )
-
-
-def _pose(plan: Plan, stand: Stand) -> Pose:
-    return (
-        *plan.rooms[stand.room].centre,
-        math.remainder(math.radians(90 - _heading(plan, stand)), math.tau),
-    )
-
-
-def _truth(plan: Plan, stand: Stand, pose: Pose) -> dict[str, object]:
-    """The truth about a step: dstate, place, path, direction and pose."""
-    door = plan.gateways[stand.room][stand.gateway].door
-    path, direction = plan.courses[stand.room, door]
-    place = f"room {stand.room}"
-    return {
-        "dstate": f"{place}, {'at' if stand.faces else 'from'} door {door}",
-        "place": place,
-        "path": f"path {path}",
-        "direction": direction if stand.faces else -direction,
-        "pose": [round(v, 5) for v in pose],
-    }

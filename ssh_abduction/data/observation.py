@@ -38,11 +38,6 @@ def checked_view(value: Any, where: str) -> View:
     return plain_text(value) if isinstance(value, str) else value
 
 
-def view_or_unknown(value: Any, where: str) -> View | None:
-    """Return None for an unknown view. Otherwise check the view as `checked_view` does."""
-    return None if value is None else checked_view(value, where)
-
-
 def checked_probability(value: Any, where: str) -> float:
     """Return a value as a float if it is a probability from 0 to 1, or raise TraceError."""
     mend = "leave it out if the probability is unknown"

@@ -14,7 +14,6 @@ from ssh_abduction.data.observation import (
     checked_probability,
     checked_view,
     frozen_image,
-    view_or_unknown,
 )
 from ssh_abduction.data.odometry import (
     Covariance,
@@ -120,10 +119,8 @@ class Step:
             TraceError: If a field is wrong.
         """
         a_text("where", where, TraceError)
-        seen = view_or_unknown(view, f"{where}: view")
-        openings = None if star is None else parse_star(star, f"{where}: star")
         with said_of(where):
-            return Step(seen, action, openings, displacement, covariance)  # type: ignore[arg-type]
+            return Step(view, action, star, displacement, covariance)  # type: ignore[arg-type]
 
     @property
     def openings(self) -> Openings | None:

@@ -25,7 +25,7 @@ from ssh_abduction.data.checks import a_list, a_path, a_text, a_whole_number, an
 from ssh_abduction.data.closure import Closure, checked_closures, closures_among
 from ssh_abduction.data.errors import RangeError, TraceError, brief, checked_index, named
 from ssh_abduction.data.files import json_line, save_file
-from ssh_abduction.data.observation import View, checked_probability, plain_text, view_or_unknown
+from ssh_abduction.data.observation import View, checked_probability, checked_view, plain_text
 from ssh_abduction.data.odometry import Covariance, Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.step import Step, as_list, of_actions
@@ -369,7 +369,7 @@ class Trace:
                 raise TraceError(f"{name}: {told}")
         checked = [
             (
-                view_or_unknown(view, f"views[{i}]"),
+                None if view is None else checked_view(view, f"views[{i}]"),
                 None if c is None else checked_probability(c, f"confidences[{i}]"),
             )
             for i, (view, c) in enumerate(zip(seen, sure, strict=True))

@@ -13,9 +13,7 @@ from ssh_abduction.data.action import Action, parse_action
 from ssh_abduction.data.closure import parse_closures
 from ssh_abduction.data.errors import TraceError, brief, said_of
 from ssh_abduction.data.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, parse_json
-from ssh_abduction.data.observation import checked_image, checked_view
 from ssh_abduction.data.odometry import Odometry
-from ssh_abduction.data.star import parse_star
 from ssh_abduction.data.step import Step
 
 FORMAT, VERSION = "ssh-trace", 1
@@ -185,11 +183,7 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
 def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> Step:
     """Make a step from the object on a line. Equal actions become one object, kept in `actions`."""
     given = {name: record.get(name) for name in _STEP_FIELDS}
-    if given["view"] is not None:
-        given["view"] = checked_view(given["view"], f"{where}: view")
-    if given["image"] is not None:
-        given["image"] = checked_image(given["image"], f"{where}: image")
-    elif "view" not in record:
+    if given["image"] is None and "view" not in record:
         raise TraceError(
             f"{where}: view: expected a text or an integer (or an image to make one from), "
             f"got none; say what the robot saw, or null where that was not logged"
@@ -198,7 +192,5 @@ def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> 
         action = parse_action(given["action"], f"{where}: action")
         known = action if action.extra else actions.setdefault(action.name, action)
         given["action"] = known if known == action else action
-    if given["star"] is not None:
-        given["star"] = parse_star(given["star"], f"{where}: star")
     with said_of(where):
         return Step(**given, extra={k: v for k, v in record.items() if k not in _STEP_FIELDS})
