@@ -206,7 +206,7 @@ def true_map(case: Case, theory: Theory, steps: int) -> SSHMap:
     """Make the true map of the first `steps` steps, with its faults."""
     trace = case.walk.trace
     faults = [(t, kind) for t, kind in case.faults if t + (kind == "slipped") < steps]
-    return answer_maps.faulty_map(case.walk.truth[:steps], trace.prefix(steps), faults, theory)
+    return answer_maps.causal_map(case.walk.truth[:steps], trace.prefix(steps), faults, theory)
 
 
 def cells(records: Sequence[Record]) -> list[str]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from ssh_abduction.data.groups import firsts, reached
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace, View
-from ssh_abduction.solver import observation
+from ssh_abduction.solver import Watch, observation
 from ssh_abduction.theory.evidence.alike import are_alike
 from ssh_abduction.theory.fields import IN_TOLERANCE
 from ssh_abduction.theory.settle import settle
@@ -32,13 +32,6 @@ Row: TypeAlias = tuple[int, ...]
 UNKNOWN = -1  # the state after an action for which a machine has no link
 # The greatest number of entries in the rows that are moved at once. They take about ten megabytes.
 CHUNK = 2**21
-
-
-class LimitCheck(Protocol):
-    """Limits of a search. `check` raises an exception once a limit is reached."""
-
-    def check(self) -> None:
-        """Raise an exception if a limit is reached."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,18 +315,16 @@ class Walk:
         table: All machines.
         group: The indices of the machines to follow.
         start: The state in which each of these machines begins.
-        limits: Limits of the search; None for none.
+        watch: The limits of the search.
 
     >>> blind = Machine((0, 0), ((("a", 1),), (("a", 0),)))
-    >>> walk = Walk(MachineTable([blind, blind], ["a"]), [0, 1], (0, 0), None)
+    >>> walk = Walk(MachineTable([blind, blind], ["a"]), [0, 1], (0, 0), Watch())
     >>> [layer.rows.tolist() for layer in walk.layers()], walk.way(1)
     ([[[0, 0]], [[1, 1]]], [0])
     """
 
-    def __init__(
-        self, table: MachineTable, group: Sequence[int], start: Row, limits: LimitCheck | None
-    ) -> None:
-        self.table, self.group, self._limits = table, np.array(group, np.int32), limits
+    def __init__(self, table: MachineTable, group: Sequence[int], start: Row, watch: Watch) -> None:
+        self.table, self.group, self._watch = table, np.array(group, np.int32), watch
         self._start = start
         # for each row, the row before it and the action between them
         self._came: list[tuple[int, int]] = [(0, 0)]
@@ -371,8 +362,7 @@ class Walk:
         for start in range(0, len(layer.rows), size):
             part = layer.rows[start : start + size]
             for action in range(self.table.ends.shape[2]):
-                if self._limits is not None:
-                    self._limits.check()
+                self._watch.check()
                 yield layer.first + start, action, *self.table.follow(self.group, part, action)
 
     def way(self, row: int) -> list[int]:

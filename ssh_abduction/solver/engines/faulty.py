@@ -18,7 +18,7 @@ short trace clingo is asked first, and maps are guessed if it does not end soon.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import chain
 
 from ssh_abduction.data.maps import SSHMap
@@ -163,7 +163,7 @@ class FaultyEngine:
             self.bound = max(self.bound or 0, answer.cost)
             labels, failed = (None, -1) if answer.is_open else self._followed(answer)
             if labels is not None:
-                yield self._found(labels, answer.slips, self._machine(answer)[0])
+                yield self._found(labels, answer.slips, self._machine(answer)[1].shows)
                 return
             self._control.learn_from(answer)
             self._control.give_around([failed, *doubted] if failed >= 0 else doubted)
@@ -183,7 +183,7 @@ class FaultyEngine:
                 labels, failed = (None, -1) if answer.is_open else self._followed(answer)
                 if labels is None:
                     break
-                found.append(self._found(labels, answer.slips, self._machine(answer)[0]))
+                found.append(self._found(labels, answer.slips, self._machine(answer)[1].shows))
             else:
                 yield from (one for one in found if one.map not in given)
                 return
@@ -289,28 +289,15 @@ class FaultyEngine:
             self._most_faults is not None and len(explained.faults) > self._most_faults
         ):
             return None
-        return self._found(labels, explained.slips, {}, shows)
+        return self._found(labels, explained.slips, shows)
 
-    def _found(
-        self,
-        labels: Sequence[int],
-        slips: Collection[int],
-        number: Mapping[int, int],
-        shows: Sequence[int] | None = None,
-    ) -> Found:
-        """Make a map of the whole trace, with its cost.
-
-        `number` has the number of each dstate by its name. `shows` has the view of each dstate;
-        None to derive it from the name.
-        """
-        view_of = dict(faulty_lp.faulty_names(self._control.names))
-        shown = self._shown_somewhere(labels, shows or [view_of[name] for name in number])
+    def _found(self, labels: Sequence[int], slips: Collection[int], shows: Sequence[int]) -> Found:
+        """Make a map of the whole trace, with its cost. `shows` has the view of each dstate."""
+        shown = self._shown_somewhere(labels, shows)
         misread = [t for t in range(self.size) if shown[labels[t]] != self._seen[t]]
         faults = [*((t, "misread") for t in misread), *((t, "slipped") for t in slips)]
-        return Found.of(
-            answer_maps.faulty_map(labels, self._task.trace, faults, self._task.theory),
-            self._task.theory,
-        )
+        trace, theory = self._task.trace, self._task.theory
+        return Found.of(answer_maps.causal_map(labels, trace, faults, theory), theory)
 
     def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
         """Return the views of dstates. If all steps of one are misread, take their usual view."""

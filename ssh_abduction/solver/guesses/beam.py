@@ -38,11 +38,11 @@ from ssh_abduction.data.drives import frames_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.guesses.completing import valid_map
 from ssh_abduction.solver.guesses.pieces import fitted, headings_by_turn
 from ssh_abduction.solver.guesses.reckoning import Hypothesis, HypothesisPoses, first_pose
 from ssh_abduction.solver.guesses.sights import DEAREST, Sights, nats_of_misread, right_view
-from ssh_abduction.solver.steps.faults import with_changes, with_faults
+from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
@@ -297,10 +297,8 @@ class Beam:
         """Yield the valid maps of a hypothesis, one for each way to rotate its unrelated frames."""
         ways = headings_by_turn(found)
         for facing in ways if theory.star == "frame" else islice(ways, 1):
-            ssh_map = completed(trace, theory, found.labels, found.places, facing)
-            changed = None if ssh_map is None else with_changes(ssh_map, trace, theory)
-            if changed is not None and next(violations(trace, changed, theory), None) is None:
-                yield changed
+            if ssh_map := valid_map(trace, theory, found.labels, found.places, facing):
+                yield ssh_map
 
     def _believed(self, found: Hypothesis) -> Trace:
         """Return the trace of a hypothesis, without the displacements that it treats as wrong."""

@@ -24,10 +24,12 @@ from dataclasses import replace
 from graphlib import CycleError, TopologicalSorter
 from itertools import combinations
 
+from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import gateways
 from ssh_abduction.data.gateways import Facing
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.steps.faults import with_changes
 from ssh_abduction.theory.theory import Theory
 
 # A path and one of its directions, 1 or -1.
@@ -74,6 +76,19 @@ def completed(
         turned = gateways.with_allowed_headings(trace, found, theory.axioms, bool(theory.changed))
         return None if turned is None else turned.renumbered()
     return found.renumbered()
+
+
+def valid_map(
+    trace: Trace,
+    theory: Theory,
+    labels: Sequence[int],
+    places: Sequence[int],
+    facing: Sequence[float],
+) -> SSHMap | None:
+    """Complete a map as `completed` does, with its changed gateways; None if it breaks an axiom."""
+    ssh_map = completed(trace, theory, labels, places, facing)
+    found = None if ssh_map is None else with_changes(ssh_map, trace, theory)
+    return None if found is None or next(violations(trace, found, theory), None) else found
 
 
 def _on(

@@ -25,18 +25,17 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.beam import Beam
-from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.guesses.completing import valid_map
 from ssh_abduction.solver.guesses.overlaying import Overlay, Part
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.steps.chart import numbered
-from ssh_abduction.solver.steps.faults import with_changes
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.evidence.loops import vectors_turned
 from ssh_abduction.theory.settle import Problem
 
 Array = NDArray[np.float64]
@@ -220,7 +219,7 @@ class Joining:
         for s, x, turn in _voted(first, second, ways, near):
             twist = facing[:, None] - turned - turn
             twist -= math.tau * np.round(twist / math.tau)
-            meets = _meeting(at, at[s] + _turned(there - there[x], turn), near)
+            meets = _meeting(at, at[s] + vectors_turned(there - there[x], turn), near)
             meets &= np.abs(twist) < TURNED
             good = (meets & alike).sum() - (meets & ~alike).sum()
             yield _Anchor(int(good), s, x, turn, by_places=False)
@@ -243,7 +242,7 @@ class Joining:
             ways += [(s, x, facing[s] + turn - turned[x]) for turn in turns]
         found = []
         for s, x, turn in _voted(first, second, ways, near):
-            moved = first.poses[0][s] + _turned(second.positions - second.poses[0][x], turn)
+            moved = first.poses[0][s] + vectors_turned(second.positions - second.poses[0][x], turn)
             meets = _meeting(first.positions, moved, near)
             good = (meets & same).sum() - (meets & ~same).sum()
             found.append(_Anchor(int(good), s, x, turn, by_places=True))
@@ -279,9 +278,7 @@ class Joining:
         trace, labels = self._of(part)
         order = list(dict.fromkeys(labels))  # of first visits
         places, facing = numbered(part.places[s] for s in order), part.poses[1][order].tolist()
-        ssh_map = completed(trace, self._bare, numbered(labels), places, facing)
-        found = None if ssh_map is None else with_changes(ssh_map, trace, self._bare)
-        return None if found is None or next(violations(trace, found, self._bare), None) else found
+        return valid_map(trace, self._bare, numbered(labels), places, facing)
 
     def _of(self, part: Part) -> tuple[Trace, list[int]]:
         """Return the trace of the drives of a part, and the labels of its steps."""
@@ -319,7 +316,7 @@ def _voted(
     turn = np.array([turn for _, _, turn in listed])
     s, x = np.array([way[:2] for way in listed]).T
     # Such ways put the centre of the second map into one cell.
-    centre = at[s] + _turned(there.mean(0) - there[x], turn)
+    centre = at[s] + vectors_turned(there.mean(0) - there[x], turn)
     around = np.round(turn / TURNED) % round(math.tau / TURNED)
     cells = np.column_stack([np.round(centre / near), around]).astype(int)
     _, one, votes = np.unique(cells, axis=0, return_index=True, return_counts=True)
@@ -330,9 +327,3 @@ def _meeting(here: Array, there: Array, near: float) -> NDArray[np.bool_]:
     """Flag the pairs of a point `here` and a point `there` that are nearer than `near`."""
     met: NDArray[np.bool_] = np.hypot(*np.moveaxis(here[:, None] - there, -1, 0)) < near
     return met
-
-
-def _turned(vectors: Array, angle: Array | float) -> Array:
-    """Turn vectors, (n, 2), counterclockwise by an angle in radians, or by n angles."""
-    x, y, cos, sin = vectors[:, 0], vectors[:, 1], np.cos(angle), np.sin(angle)
-    return np.stack([cos * x - sin * y, sin * x + cos * y], 1)

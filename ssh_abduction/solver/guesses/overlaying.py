@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.guesses.kept_apart import KeptApart
+from ssh_abduction.solver.guesses.pieces import poses_turned
 from ssh_abduction.solver.guesses.reckoning import BLUR, Hypothesis, conditioned
 from ssh_abduction.solver.guesses.sights import Sight, Sights
 from ssh_abduction.solver.steps.log import Log
@@ -284,17 +285,9 @@ class Overlay:
         at, there = (both.position[both.places[s]] for s in (old, new))
         equal = both.mean[both.heading[old]] - both.mean[both.heading[new]]
         angle = equal if turn is None else turn
-        cos, sin = math.cos(angle), math.sin(angle)
-        mean, covariance = both.mean.copy(), both.covariance.copy()
+        mean, covariance = poses_turned(both.mean, both.covariance, x, headings, there, angle)
         dx, dy = mean[x] - mean[there], mean[x + 1] - mean[there + 1]
-        dx, dy = cos * dx - sin * dy, sin * dx + cos * dy
         mean[x], mean[x + 1] = mean[at] + dx, mean[at + 1] + dy
-        mean[headings] += angle
-        for half in (covariance, covariance.T):  # the rows, and then the columns
-            half[x], half[x + 1] = (
-                cos * half[x] - sin * half[x + 1],
-                sin * half[x] + cos * half[x + 1],
-            )
         by = np.zeros((len(mean), 3))
         by[x, 0], by[x + 1, 1] = 1.0, 1.0
         by[x, 2], by[x + 1, 2] = -dy, dx

@@ -16,10 +16,15 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice, product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from ssh_abduction.solver.guesses.reckoning import Hypothesis
+
+Array: TypeAlias = NDArray[np.float64]
 
 # The direction from one position to another is too uncertain to use if they are closer than this
 # many metres.
@@ -135,15 +140,39 @@ def _turned(found: Hypothesis, angle: float, centre: int) -> Hypothesis:
     n, pieces = len(found.mean) - 3, found.pieces
     places = zip(found.position, pieces.of_place, strict=True)
     headings = zip(found.heading, pieces.of_heading, strict=True)
-    x = [n, *(at for at, piece in places if piece == pieces.here)]
-    y = [at + 1 for at in x]
-    facing = [n + 2, *(at for at, piece in headings if piece == pieces.here)]
-    cos, sin = math.cos(angle), math.sin(angle)
-    mean, covariance = found.mean.copy(), found.covariance.copy()
-    dx, dy = mean[x] - mean[centre], mean[y] - mean[centre + 1]
-    mean[x] += cos * dx - sin * dy - dx
-    mean[y] += sin * dx + cos * dy - dy
-    mean[facing] += angle
-    for half in (covariance, covariance.T):  # the rows, and then the columns
-        half[x], half[y] = cos * half[x] - sin * half[y], sin * half[x] + cos * half[y]
+    x = np.array([n, *(at for at, piece in places if piece == pieces.here)])
+    facing = np.array([n + 2, *(at for at, piece in headings if piece == pieces.here)])
+    mean, covariance = poses_turned(found.mean, found.covariance, x, facing, centre, angle)
     return replace(found, mean=mean, covariance=covariance)
+
+
+def poses_turned(
+    mean: Array,
+    covariance: Array,
+    x: NDArray[np.int_],
+    headings: NDArray[np.int_],
+    centre: int,
+    angle: float,
+) -> tuple[Array, Array]:
+    """Turn some poses of a Gaussian about one position, counterclockwise by radians.
+
+    Args:
+        mean: The means.
+        covariance: Their covariance.
+        x: The indices of the x of the positions to turn. That of y comes next.
+        headings: The indices of the headings to turn.
+        centre: The index of the x of the position to turn about.
+        angle: The angle.
+    """
+    cos, sin = math.cos(angle), math.sin(angle)
+    mean, covariance = mean.copy(), covariance.copy()
+    dx, dy = mean[x] - mean[centre], mean[x + 1] - mean[centre + 1]
+    mean[x] += cos * dx - sin * dy - dx
+    mean[x + 1] += sin * dx + cos * dy - dy
+    mean[headings] += angle
+    for half in (covariance, covariance.T):  # the rows, and then the columns
+        half[x], half[x + 1] = (
+            cos * half[x] - sin * half[x + 1],
+            sin * half[x] + cos * half[x + 1],
+        )
+    return mean, covariance

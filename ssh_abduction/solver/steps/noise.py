@@ -19,6 +19,7 @@ Noise(step=32, told_apart=32, without=4)
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -66,13 +67,11 @@ def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
     fewest = len(_clique(views, actions, len(views))) / 2
     # The clique grows with the number of first steps. Bisect for the step at which it passes half
     # of its final size.
-    short, long = 0, len(views)
-    while long - short > 1:
-        middle = (short + long) // 2
-        if len(_clique(views, actions, middle)) > fewest:
-            long = middle
-        else:
-            short = middle
+    sizes = range(len(views))
+    long = bisect_left(
+        sizes, True, lo=1, key=lambda size: len(_clique(views, actions, size)) > fewest
+    )
+    short = long - 1
     if long <= LEAST:
         return None
     before, up_to_there = len(_clique(views, actions, short)), len(_clique(views, actions, long))

@@ -427,7 +427,7 @@ def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
     return by_position, by_position + by_heading
 
 
-def vectors_turned(vectors: Array, angles: Array) -> Array:
+def vectors_turned(vectors: Array, angles: Array | float) -> Array:
     """Turn vectors of shape (..., 2) counterclockwise by angles in radians."""
     cos, sin = np.cos(angles), np.sin(angles)
     x, y = vectors[..., 0], vectors[..., 1]

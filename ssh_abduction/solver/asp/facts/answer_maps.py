@@ -10,8 +10,11 @@ from ssh_abduction.data.maps import FAULTS, DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.solver.asp.facts.atoms import read_atom
 from ssh_abduction.solver.steps import frames
-from ssh_abduction.solver.steps.faults import faults_of, links_of, view_at, with_changes
+from ssh_abduction.solver.steps.chart import numbered
+from ssh_abduction.solver.steps.faults import faults_of, links_of, with_changes
 from ssh_abduction.theory.theory import Theory
+
+CAUSAL = Theory.causal()
 
 
 def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
@@ -68,16 +71,15 @@ def _map(
     course: Mapping[int, tuple[int, int]],
     heading: Mapping[int, int],
     before: Iterable[tuple[int, int, int]],
-    excused: Iterable[tuple[int, int]] = (),
-    faults: Sequence[tuple[int, str]] = (),
-    theory: Theory | None = None,
+    excused: Iterable[tuple[int, int]],
+    faults: Sequence[tuple[int, str]],
+    theory: Theory,
 ) -> SSHMap:
     """Make a map from the atoms of an answer, which name a dstate or place by its first step.
 
     `course` has the path and the direction of each step that is along a path. `heading` has the
     heading of each step, if places have frames or gateways. `before` has triples of a path and two
-    places on it, the earlier one first. The theory has the costs of faults; None for a map without
-    faults.
+    places on it, the earlier one first. The theory has the costs of faults.
     """
     views = views_of(is_at, trace, faults)
     names = sorted(set(is_at.values()))
@@ -112,7 +114,7 @@ def _map(
         excused=tuple(
             sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)
         ),
-        faults=() if theory is None else faults_of(faults, is_at, views, trace, theory),
+        faults=faults_of(faults, is_at, views, trace, theory),
     )
 
 
@@ -131,33 +133,22 @@ def views_of(
     return views
 
 
-def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
-    """Make a causal map (no places) from the dstates of steps, numbered by first visit."""
-    number: dict[int, int] = {}
-    first: list[int] = []
-    for t, label in enumerate(labels):
-        if number.setdefault(label, len(number)) == len(first):
-            first.append(t)
-    found = tuple(number[label] for label in labels)
-    return SSHMap(
-        found,
-        tuple(DState(i, view_at(trace, t)) for i, t in enumerate(first)),
-        links_of(found, trace),
-    )
-
-
-def faulty_map(
-    labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]], theory: Theory
+def causal_map(
+    labels: Sequence[int],
+    trace: Trace,
+    faults: Sequence[tuple[int, str]] = (),
+    theory: Theory = CAUSAL,
 ) -> SSHMap:
-    """Make a causal map with faults (steps and kinds). Dstates are numbered by first visit."""
-    number: dict[int, int] = {}
-    found = tuple(number.setdefault(label, len(number)) for label in labels)
+    """Make a causal map (no places) from the dstates of steps, perhaps with faults.
+
+    The dstates are numbered by first visit. A fault is a step and a kind. The theory has its cost.
+    """
+    found = tuple(numbered(labels))
     is_at = dict(enumerate(found))
     views = views_of(is_at, trace, faults)
-    dstates = tuple(DState(i, views[i]) for i in range(len(number)))
     return SSHMap(
         found,
-        dstates,
+        tuple(DState(i, view) for i, view in views.items()),
         links_of(found, trace, faults),
         faults=faults_of(faults, is_at, views, trace, theory),
     )
