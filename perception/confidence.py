@@ -17,6 +17,7 @@ from scipy.spatial.distance import cdist
 from sklearn.utils import check_array
 
 from perception.errors import ImageWarning, PerceptionError, equal_length
+from ssh_abduction.data.words import first_few
 
 NOISE = -1  # The label that clusterers give to an image in no cluster.
 # An image with less confidence is doubtful. Good images of the paper's worlds have 0.93 or more,
@@ -115,9 +116,7 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
     rare = size <= (max(RARE * usual, FEW) if usual >= SEEN else 0)
     doubtful = np.flatnonzero((of == NOISE) | rare | ((certain < SURE) & (size > 1)))
     if len(doubtful):
-        named = ", ".join(map(str, doubtful[:NAMED].tolist())) + (
-            ", …" if len(doubtful) > NAMED else ""
-        )
+        named = first_few(doubtful.tolist(), NAMED)
         text = (
             f"{len(doubtful)} of {len(of)} images fit no view, or a view that "
             f"was rarely seen (image {named})"

@@ -18,6 +18,7 @@ from perception.errors import LogError
 from perception.readers.lines import copied, damages, is_full, no_room, packer, unpacked
 from perception.readers.salvage import Salvage
 from ssh_abduction.data.errors import named
+from ssh_abduction.data.words import first_few
 
 # First bytes of a file, with its format and the ending that rosbags expects.
 MAGICS = {
@@ -42,11 +43,125 @@ class Files:
         format: `ros1`, `ros2` or `mcap`.
         readers: A reader for each part of the drive, in order: one of rosbags, or a `Salvage`.
         notes: Sentences about the files that a user should know, such as that a part is missing.
+        folder: A temporary folder for links to the files, and for what is unpacked.
+        stack: It closes the readers.
     """
 
     format: str
+    folder: Path
+    stack: ExitStack
     readers: list[Any] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def open_folder(self, path: Path) -> None:
+        """Open a folder by its metadata.yaml, or else all files in it. Raises LogError."""
+        parts = sorted(
+            (part for part in path.iterdir() if NAMES.search(part.name) and part.is_file()),
+            key=_number,
+        )
+        self.format = "ros2"
+        if (path / "metadata.yaml").exists() and self._open_by_metadata(path, parts):
+            return
+        if not parts:
+            raise LogError(
+                f"{named(path)}: expected a folder of ROS 2 with metadata.yaml, or with files "
+                "*.mcap, *.db3 or *.bag, got none of these; name a file"
+            )
+        # Without metadata.yaml, only names show which files belong together.
+        if len({_drive(part) for part in parts}) > 1:
+            names = first_few([named(part.name) for part in parts], 4)
+            raise LogError(
+                f"{named(path)}: expected the parts of one drive, as drive_0.db3 and drive_1.db3, "
+                f"got {names}; name one of the files, or ros2 bag reindex the folder"
+            )
+        self.format = next((found for part in parts if (found := _format(part))), "ros2")
+        self._open_parts(parts)
+        if len(parts) > 1:
+            self.notes.append(
+                f"{named(path)} has no metadata.yaml that can be used: its {len(parts)} parts are "
+                f"read as one drive, from {named(parts[0].name)} to {named(parts[-1].name)}."
+            )
+        self.notes += _gaps(parts)
+
+    def _open_by_metadata(self, path: Path, parts: list[Path]) -> bool:
+        """Open a folder by its metadata.yaml. Return False, with a note, if that is not possible.
+
+        Raises LogError if the folder has no `parts` either.
+        """
+        try:
+            reader = self._by_rosbags(path)
+            self.readers.append(reader)
+            if len(reader.storage.storages) < len(parts):
+                self.notes.append(
+                    f"{named(path / 'metadata.yaml')} names {len(reader.storage.storages)} of "
+                    f"the {len(parts)} files beside it, and only these are read. To read all, "
+                    "run ros2 bag reindex."
+                )
+            return True
+        except Exception as error:  # Damaged bytes can raise any error in the library.
+            raise_if_disk_is_full(error, named(path))
+            if not parts:
+                raise LogError(
+                    f"{named(path)}: expected a bag of ROS 2, got one that cannot be opened "
+                    f"({cause(error)}); {REINDEX}"
+                ) from None
+            self.notes.append(
+                f"{named(path / 'metadata.yaml')} cannot be used ({cause(error)}): the bag is "
+                "read without it."
+            )
+            return False
+
+    def _open_parts(self, parts: list[Path]) -> None:
+        """Open each part of a drive that can be read, or raise the error of the first part."""
+        unread = []
+        for part in parts:
+            try:
+                self.open_part(part)
+            except OSError as error:
+                unread.append(_unreadable(part, error))
+            except LogError as error:
+                unread.append(error)
+        if not self.readers:
+            raise unread[0]
+        self.notes += [f"A part was not read. {error}" for error in unread]
+
+    def open_part(self, path: Path) -> None:
+        """Open one file, and add its reader and notes to those of the drive, or raise LogError."""
+        source = named(path)
+        here = (
+            self.folder / f"{len(list(self.folder.iterdir()))}{dict(MAGICS.values())[self.format]}"
+        )
+        with path.open("rb") as file:
+            if packer(file):
+                self.notes += _copied(file, here, source)
+            else:
+                here.symlink_to(path.resolve())
+        try:
+            self.readers.append(self._by_rosbags(here))
+            return
+        except Exception as error:  # Damaged bytes can raise any error in the library.
+            raise_if_disk_is_full(error, named(path))
+            why = cause(error).replace(str(here), source)
+        salvage = Salvage(here, self.format)
+        if not salvage.count:
+            raise LogError(
+                f"{source}: expected a bag ({self.format}), got one that cannot be opened "
+                f"({why}); {REINDEX}"
+            )
+        self.readers.append(salvage)
+        self.notes.append(
+            f"{source} is cut, or was never closed ({why}): its {salvage.count} whole messages "
+            f"are read, {salvage.seconds:.1f} s of the drive. What came after is lost."
+        )
+
+    def _by_rosbags(self, path: Path) -> Any:
+        """Open a file or folder with rosbags, and return the reader, which the stack closes."""
+        from rosbags import rosbag1, rosbag2
+
+        reader: Any = rosbag1.Reader(path) if self.format == "ros1" else rosbag2.Reader(path)
+        reader.open()
+        self.stack.callback(reader.close)
+        return reader
 
 
 def format_of(head: bytes) -> str | None:
@@ -73,49 +188,16 @@ def files_opened(path: Path, format: str) -> Iterator[Files]:
     with ExitStack() as stack:
         try:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            files = Files(format, folder, stack)
             if path.is_dir():
-                files = _of_folder(path, folder, stack)
+                files.open_folder(path)
             else:
-                files = Files(format)
-                _open_part(path, files, folder, stack)
+                files.open_part(path)
                 # Other parts of the drive may lie beside the file. The user may have meant all.
                 files.notes += _beside(path)
         except OSError as error:
             raise _unreadable(path, error) from None
         yield files
-
-
-def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
-    """Open a folder by its metadata.yaml, or else all files in it. Raises LogError."""
-    parts = sorted(
-        (part for part in path.iterdir() if NAMES.search(part.name) and part.is_file()), key=_number
-    )
-    files = Files("ros2")
-    if (path / "metadata.yaml").exists() and _open_by_metadata(path, parts, files, stack):
-        return files
-    if not parts:
-        raise LogError(
-            f"{named(path)}: expected a folder of ROS 2 with metadata.yaml, or with files "
-            "*.mcap, *.db3 or *.bag, got none of these; name a file"
-        )
-    # Without metadata.yaml, only names show which files belong together.
-    if len({_drive(part) for part in parts}) > 1:
-        names = ", ".join(named(part.name) for part in parts[:4]) + (
-            ", …" if len(parts) > 4 else ""
-        )
-        raise LogError(
-            f"{named(path)}: expected the parts of one drive, as drive_0.db3 and drive_1.db3, "
-            f"got {names}; name one of the files, or ros2 bag reindex the folder"
-        )
-    files.format = next((found for part in parts if (found := _format(part))), "ros2")
-    _open_parts(parts, files, folder, stack)
-    if len(parts) > 1:
-        files.notes.append(
-            f"{named(path)} has no metadata.yaml that can be used: its {len(parts)} parts are "
-            f"read as one drive, from {named(parts[0].name)} to {named(parts[-1].name)}."
-        )
-    files.notes += _gaps(parts)
-    return files
 
 
 def _unreadable(path: Path, error: OSError) -> LogError:
@@ -124,88 +206,6 @@ def _unreadable(path: Path, error: OSError) -> LogError:
     return LogError(
         f"{named(path)}: expected a readable bag: {error.strerror or error}; check the path"
     )
-
-
-def _open_by_metadata(path: Path, parts: list[Path], files: Files, stack: ExitStack) -> bool:
-    """Open a folder by its metadata.yaml. Return False, with a note, if only `parts` can be read.
-
-    Raises LogError if there are no parts either.
-    """
-    try:
-        reader = _by_rosbags(path, "ros2", stack)
-        files.readers.append(reader)
-        if len(reader.storage.storages) < len(parts):
-            files.notes.append(
-                f"{named(path / 'metadata.yaml')} names {len(reader.storage.storages)} of "
-                f"the {len(parts)} files beside it, and only these are read. To read all, "
-                "run ros2 bag reindex."
-            )
-        return True
-    except Exception as error:  # Damaged bytes can raise any error in the library.
-        raise_if_disk_is_full(error, named(path))
-        if not parts:
-            raise LogError(
-                f"{named(path)}: expected a bag of ROS 2, got one that cannot be opened "
-                f"({cause(error)}); {REINDEX}"
-            ) from None
-        files.notes.append(
-            f"{named(path / 'metadata.yaml')} cannot be used ({cause(error)}): the bag is "
-            "read without it."
-        )
-        return False
-
-
-def _open_parts(parts: list[Path], files: Files, folder: Path, stack: ExitStack) -> None:
-    """Open each part of a drive that can be read, or raise the error of the first part."""
-    unread = []
-    for part in parts:
-        try:
-            _open_part(part, files, folder, stack)
-        except OSError as error:
-            unread.append(_unreadable(part, error))
-        except LogError as error:
-            unread.append(error)
-    if not files.readers:
-        raise unread[0]
-    files.notes += [f"A part was not read. {error}" for error in unread]
-
-
-def _open_part(path: Path, files: Files, folder: Path, stack: ExitStack) -> None:
-    """Open one file, and add its reader and notes to those of the drive, or raise LogError."""
-    source = named(path)
-    here = folder / f"{len(list(folder.iterdir()))}{dict(MAGICS.values())[files.format]}"
-    with path.open("rb") as file:
-        if packer(file):
-            files.notes += _copied(file, here, source)
-        else:
-            here.symlink_to(path.resolve())
-    try:
-        files.readers.append(_by_rosbags(here, files.format, stack))
-        return
-    except Exception as error:  # Damaged bytes can raise any error in the library.
-        raise_if_disk_is_full(error, named(path))
-        why = cause(error).replace(str(here), source)
-    salvage = Salvage(here, files.format)
-    if not salvage.count:
-        raise LogError(
-            f"{source}: expected a bag ({files.format}), got one that cannot be opened "
-            f"({why}); {REINDEX}"
-        )
-    files.readers.append(salvage)
-    files.notes.append(
-        f"{source} is cut, or was never closed ({why}): its {salvage.count} whole messages "
-        f"are read, {salvage.seconds:.1f} s of the drive. What came after is lost."
-    )
-
-
-def _by_rosbags(path: Path, format: str, stack: ExitStack) -> Any:
-    """Open a file or folder with rosbags, and return the reader, which the stack closes."""
-    from rosbags import rosbag1, rosbag2
-
-    reader: Any = rosbag1.Reader(path) if format == "ros1" else rosbag2.Reader(path)
-    reader.open()
-    stack.callback(reader.close)
-    return reader
 
 
 def _copied(file: IO[bytes], here: Path, source: str) -> list[str]:
@@ -249,11 +249,10 @@ def _gaps(parts: list[Path]) -> list[str]:
     missing = sorted(set(range(max(numbers, default=-1))) - set(numbers))
     if not missing:
         return []
-    listed = ", ".join(map(str, missing[:5])) + (", …" if len(missing) > 5 else "")
     return [
         (
             f"{named(parts[-1].name)} is one part of a drive. These parts are not there: "
-            f"{listed}. Their scans are missing."
+            f"{first_few(missing, 5)}. Their scans are missing."
         )
     ]
 
@@ -273,9 +272,7 @@ def _beside(path: Path) -> list[str]:
         key=_number,
     )
     if with_it:
-        names = ", ".join(named(part.name) for part in with_it[:3]) + (
-            ", …" if len(with_it) > 3 else ""
-        )
+        names = first_few([named(part.name) for part in with_it], 3)
         return [
             (
                 f"{named(path)} is one part of a drive, and is read alone. Beside it lie {names}: "

@@ -12,6 +12,7 @@ from perception.readers import bag_files
 from perception.readers.bag_files import cause
 from perception.readers.scans import Damage
 from ssh_abduction.data.errors import named
+from ssh_abduction.data.words import first_few
 
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 NANO = 1e-9
@@ -56,9 +57,7 @@ class Bag:
         topics = dict.fromkeys(
             f"{c.topic} ({c.msgtype.rpartition('/')[2]})" for c in self.connections
         )
-        return (
-            ", ".join(list(topics)[:20]) + (", …" if len(topics) > 20 else "") if topics else "none"
-        )
+        return first_few([*topics], 20) or "none"
 
     def messages(self, topics: set[str]) -> Iterator[tuple[Any, int, float, Any]]:
         """Read the messages of some topics.

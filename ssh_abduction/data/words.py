@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from importlib import import_module
 from typing import Any
@@ -18,6 +18,11 @@ from ssh_abduction.data.errors import brief
 def counted(number: float, things: str) -> str:
     """Return a number with its noun: "8 dstates", "1 dstate"."""
     return f"{number} {things.removesuffix('s') if number == 1 else things}"
+
+
+def first_few(things: Sequence[object], most: int) -> str:
+    """List the first `most` things: "3, 4", or "3, 4, …" if there are more."""
+    return ", ".join([*map(str, things[:most]), *(["…"] if len(things) > most else [])])
 
 
 def meant(word: object, names: Iterable[str], most: int = 1) -> str:
