@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from perception.places.distinctive import find_visits
-from perception.places.local_map import CELL, Patch
+from perception.places.local_map import CELL, BeamCells, LocalMaps, Patch
+from perception.places.recent import Recent
 from perception.places.skeleton import junctions
 from perception.places.stays import joined
 from perception.places.track import Track
@@ -263,3 +264,21 @@ def test_drive_begins_and_ends_with_a_visit(begin: float, end: float, middles: l
     assert [float(visit.middle[0]) for visit in visits] == pytest.approx(middles, abs=0.5)
     for visit, way in zip(visits[:: max(1, len(visits) - 1)], ("arrived", "left"), strict=False):
         assert getattr(visit, way) is None
+
+
+@pytest.mark.parametrize(
+    ("beams", "is_open"),
+    [
+        pytest.param(1, False, id="one beam"),
+        pytest.param(3, False, id="three beams"),
+        pytest.param(20, True, id="a door"),
+    ],
+)
+def test_few_lost_beams_show_no_free_space_behind_a_wall(beams: int, is_open: bool) -> None:
+    laser = LaserScanner(-math.pi / 4, math.radians(1), 91, 30.0)
+    ranges = 3 / np.cos(laser.bearings)  # a wall 3 m ahead
+    ranges[45 : 45 + beams] = np.inf
+    recent = Recent()
+    recent.append(Scan(ranges, laser, (0.0, 0.0, 0.0)), (0.0, 0.0, 0.0))
+    patch = LocalMaps(recent, BeamCells(recent, 5.0), 5.0).around(0, (5.0, 0.0), 1.5)
+    assert patch.free.any() == is_open

@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from perception.places.recent import Recent
 from perception.places.track import Array
+from perception.readers.scans import Scan
 
 Bools = NDArray[np.bool_]
 Cells = NDArray[np.int32]
@@ -30,6 +31,9 @@ EIGHT = np.ones((3, 3), np.bool_)
 CELL = 0.1
 # Beams are ignored beyond this many metres, as gaps between them grow too wide.
 SIGHT = 12.0
+# Two walls less than NARROW metres apart hide what is between them: a robot cannot pass there. So a
+# beam without an echo between them was lost, and saw nothing.
+NARROW = 0.3
 # A cell is occupied if at least this share of the scans that looked there hit something. So passing
 # people soon disappear.
 OCCUPIED = 0.25
@@ -100,6 +104,15 @@ def _repeated(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.in
     return which, np.arange(len(which)) - (np.cumsum(counts) - counts)[which]
 
 
+def lost(scan: Scan) -> Bools:
+    """Find the beams without an echo whose neighbours met walls at most NARROW apart: (beams,)."""
+    met = np.isfinite(scan.ranges)
+    beams = np.flatnonzero(met)
+    nearer = np.minimum(scan.ranges[beams[:-1]], scan.ranges[beams[1:]])
+    narrow = np.diff(beams) * abs(scan.laser.step) * nearer <= NARROW
+    return ~met & np.pad(narrow, 1)[np.searchsorted(beams, np.arange(len(met)))]
+
+
 class BeamCells:
     """The cells that the beams of each recent scan passed and met, found once for each scan.
 
@@ -134,7 +147,7 @@ class BeamCells:
         y = pose[1] + sin * scan.laser.mount[0] + cos * scan.laser.mount[1]
         angles = pose[2] + scan.laser.mount[2] + scan.laser.bearings
         ahead, aside = np.cos(angles), np.sin(angles)
-        valid = ~np.isnan(scan.ranges)
+        valid = ~(np.isnan(scan.ranges) | lost(scan))
         ranges = np.minimum(np.where(valid, scan.ranges, 0.0), SIGHT)
         met = valid & (scan.ranges < min(SIGHT, scan.laser.reach))
         # Sample each beam along its free part.
