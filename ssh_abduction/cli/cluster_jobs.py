@@ -167,7 +167,7 @@ def _on_workers(
     appended to `killed`. This uses Dask directly, because joblib's backend for Dask hangs when a
     worker is killed.
     """
-    from distributed import KilledWorker, as_completed
+    from distributed import as_completed
 
     sent: dict[Future[Any], Task] = {}
     ready = as_completed(loop=client.loop)
@@ -188,20 +188,7 @@ def _on_workers(
                 return
             future = next(ready)
             task = sent.pop(future)
-            try:
-                yield future.result()
-            except KilledWorker:
-                killed.append(task)
-            except CancelledError:
-                yield question.failed(*task, SolverError(LOST))
-            except Exception as error:  # an error of the cluster: `answer` catches all others
-                mend = "install the same ssh-abduction where the scheduler and its workers run"
-                yield question.failed(
-                    *task,
-                    SolverError(
-                        f"cluster: expected an answer, got {type(error).__name__}: {error}; {mend}"
-                    ),
-                )
+            yield from _result(question, future, task, killed)
 
     for number, path in tasks:
         try:
@@ -221,6 +208,24 @@ def _on_workers(
     yield from received(0)
     for task in sent.values():  # tasks that were under way when the scheduler was lost
         yield question.failed(*task, SolverError(LOST))
+
+
+def _result(
+    question: FileQuestion, future: Future[Any], task: Task, killed: list[Task]
+) -> Iterator[Any]:
+    """Yield the answer of a task that is done. If its worker was killed, append it to `killed`."""
+    from distributed import KilledWorker
+
+    try:
+        yield future.result()
+    except KilledWorker:
+        killed.append(task)
+    except CancelledError:
+        yield question.failed(*task, SolverError(LOST))
+    except Exception as error:  # an error of the cluster: `answer` catches all others
+        mend = "install the same ssh-abduction where the scheduler and its workers run"
+        said = f"cluster: expected an answer, got {type(error).__name__}: {error}; {mend}"
+        yield question.failed(*task, SolverError(said))
 
 
 def _on_worker(question: FileQuestion, number: int, path: str, content: Any) -> Any:

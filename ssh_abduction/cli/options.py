@@ -357,8 +357,7 @@ def check_jobs(jobs: int | None, things: str, default: int = 1) -> None:
     if jobs == 0:
         raise AbductionError(
             f"--jobs: expected a number of {things}, or -1 for one per core, got 0; leave it out "
-            "for "
-            f"{default}"
+            f"for {default}"
         )
 
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import add_output, seed, write
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named, printable
+from ssh_abduction.data.files import save_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -140,8 +145,6 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    import math
-
     from simulator.robot import Body
     from simulator.tours import simulate
     from simulator.world import World
@@ -174,8 +177,6 @@ def run(options: argparse.Namespace) -> int:
 
 def _drive(options: argparse.Namespace) -> RecordedDrive:
     """Simulate the drive to write as a robot's log. Raise AbductionError for wrong options."""
-    import math
-
     from simulator.drive import EVERY
     from simulator.odometer import Odometer
     from simulator.plans import Plan
@@ -194,8 +195,7 @@ def _drive(options: argparse.Namespace) -> RecordedDrive:
         if given:
             raise AbductionError(
                 f"{name}: expected no such option with --format, as a robot's log is a file of "
-                "scans; "
-                "leave it out"
+                "scans; leave it out"
             )
     odometer = Odometer(scale=options.scale_error, bend=math.radians(options.bend_error))
     if options.odometry_noise is not None:
@@ -208,8 +208,7 @@ def _drive(options: argparse.Namespace) -> RecordedDrive:
         if getattr(options, name) is not None:
             raise AbductionError(
                 f"--{name}: expected no such option with a floor plan, whose rounds are drawn by "
-                "--seed; "
-                "leave it out"
+                "--seed; leave it out"
             )
     return record_plan(
         Plan.load(options.world), options.tours, options.seed, odometer=odometer, every=every
@@ -218,11 +217,7 @@ def _drive(options: argparse.Namespace) -> RecordedDrive:
 
 def _write_log(options: argparse.Namespace, drive: RecordedDrive) -> int:
     """Write a drive as a robot's log, and the truth to a file beside it. Return the exit code."""
-    import json
-    from pathlib import Path
-
     from perception.readers.writers import write_bag, write_carmen
-    from ssh_abduction.data.files import save_file
 
     target = Path(options.output)
     if options.log == "carmen":
@@ -286,9 +281,6 @@ def _camera(options: argparse.Namespace) -> Camera | None:
 
 def _with_table(trace: Trace, target: str) -> Trace:
     """Move the panoramas of a trace to an .npz file beside it. Images are then indices into it."""
-    from dataclasses import replace
-    from pathlib import Path
-
     from perception.images import images_of, save_images
 
     path = Path(target).with_suffix(".npz")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.floors import floors_in_words
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted as counted  # noqa: PLC0414 - the verbs have it from here
@@ -205,15 +206,11 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
     A table lists the steps that are one dstate in all maps. Then come pairs of steps that are one
     dstate, or at one place, in some maps only.
     """
-    steps: dict[int, list[int]] = {}
     names = named_steps(drives_of(trace), len(trace))
-    for t, number in zip(names, backbone.dstates.always, strict=True):
-        steps.setdefault(number, []).append(t)
-    views = [[v for t in some if (v := trace.steps[t].view) is not None] for some in steps.values()]
-    rows = [
-        [seen[0] if seen else "?", stretches(some)]
-        for seen, some in zip(views, steps.values(), strict=True)
-    ]
+    rows = []
+    for steps in gathered(zip(backbone.dstates.always, names, strict=True)).values():
+        seen = next((v for t in steps if (v := trace.steps[t].view) is not None), "?")
+        rows.append([seen, stretches(steps)])
     maps = "minimal maps" if backbone.proven else "maps found"
     parts = [table(["view", f"steps at one dstate in all {maps}"], rows)]
     for sort, pairs in (

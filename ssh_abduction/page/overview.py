@@ -23,34 +23,28 @@ class _Counts:
     """Counts the maps that have each dstate, place and street, given by its steps.
 
     `along` counts the maps in which a dstate or street is on a path with certain steps. Its keys
-    are pairs: the dstate or street, and a number that stands for the steps of the path.
+    are pairs: the dstate or street, and the steps of the path.
     """
 
     def __init__(self) -> None:
         self.dstates: Counter[Steps] = Counter()
         self.places: Counter[Steps] = Counter()
         self.streets: Counter[Pair] = Counter()
-        self.along: Counter[tuple[Steps | Pair, int]] = Counter()
-        self._numbers: dict[Steps, int] = {}  # of the steps along a path, as numbers hash faster
+        self.along: Counter[tuple[Steps | Pair, Steps]] = Counter()
 
-    def add(self, ssh_map: SSHMap, count: int) -> None:
-        """Add `count` maps that are the same as this one."""
+    def add(self, ssh_map: SSHMap) -> None:
+        """Count what a map has."""
         at = [ssh_map.dstates[label] for label in ssh_map.dstate_at]
         of_dstate = _members(ssh_map.dstate_at)
         of_place = _members([s.place for s in at])
-        of_path = {
-            h: self._numbers.setdefault(steps, len(self._numbers))
-            for h, steps in _members([s.path for s in at]).items()
-        }
-        for steps in of_dstate.values():
-            self.dstates[steps] += count
-            if (h := at[steps[0]].path) is not None:
-                self.along[steps, of_path[h]] += count
-        for steps in of_place.values():
-            self.places[steps] += count
+        of_path = _members([s.path for s in at])
+        self.dstates.update(of_dstate.values())
+        self.places.update(of_place.values())
+        paths = ((steps, at[steps[0]].path) for steps in of_dstate.values())
+        self.along.update((steps, of_path[h]) for steps, h in paths if h is not None)
         # Only streets that the robot travelled count: it went between two places along one path, or
         # in a map without paths. The order of other places on a path is one of many possible ones.
-        streets: dict[Pair, int | None] = {}
+        streets: dict[Pair, Steps | None] = {}
         for s, _, x in ssh_map.links:
             a, b = ssh_map.dstates[s], ssh_map.dstates[x]
             if None in (a.place, b.place) or a.place == b.place or a.path != b.path:
@@ -64,10 +58,8 @@ class _Counts:
                 for s, _, x in ssh_map.links
                 if s != x and s in of_dstate and x in of_dstate
             }
-        for pair, path in streets.items():
-            self.streets[pair] += count
-            if path is not None:
-                self.along[pair, path] += count
+        self.streets.update(streets.keys())
+        self.along.update((pair, path) for pair, path in streets.items() if path is not None)
 
 
 def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
@@ -79,14 +71,9 @@ def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
     largest number of maps that agree on all steps along its path. `streets` are lists [node, node,
     maps, path].
     """
-    # Count maps together if they are the same in everything that is counted here.
-    alike: dict[Any, list[SSHMap]] = {}
-    for ssh_map in maps:
-        key = (ssh_map.dstate_at, tuple((s.place, s.path) for s in ssh_map.dstates))
-        alike.setdefault(key, []).append(ssh_map)
     counts = _Counts()
-    for some in alike.values():
-        counts.add(some[-1], len(some))
+    for ssh_map in maps:
+        counts.add(ssh_map)
     agreed: dict[Any, int] = {}
     for (thing, _), count in counts.along.items():
         agreed[thing] = max(count, agreed.get(thing, 0))

@@ -144,13 +144,13 @@ class _Sheet:
 
     @classmethod
     def of(cls, log: RobotLog, imported: Imported, ssh_map: SSHMap | None) -> _Sheet:
-        track: list[Pose] = [_pose(row) for row in imported.track.poses]
+        track: list[Pose] = [(x, y, heading) for x, y, heading in imported.track.poses.tolist()]
         corrected = [scan.corrected for scan in log.scans if scan.corrected is not None]
         is_corrected = len(corrected) == len(log)
         poses = laid_over(corrected if is_corrected else track, imported, ssh_map)
         walls = _walls(log, poses)
         seen = _spots(poses, imported)
-        first = {visit: t for t, visit in reversed([*enumerate(_visit_of(imported))])}
+        first = firsts((visit, t) for t, visit in enumerate(_visit_of(imported)))
         spots = [seen[first[visit]][:2] for visit in range(len(imported.visits))]
         headings = [heading for _, _, heading in seen]
         extent = np.ptp(np.concatenate([walls, [pose[:2] for pose in poses]]), axis=0).max()
@@ -367,11 +367,6 @@ def _ends(scan: Scan, pose: Pose) -> Array:
     near = np.isfinite(scan.ranges) & (scan.ranges < min(DRAWN, scan.laser.reach))
     far, angles = scan.ranges[near], heading + scan.laser.bearings[near]
     return np.stack([x + far * np.cos(angles), y + far * np.sin(angles)], axis=1)
-
-
-def _pose(row: Array) -> Pose:
-    x, y, heading = row
-    return float(x), float(y), float(heading)
 
 
 def laid_over(poses: Sequence[Pose], imported: Imported, ssh_map: SSHMap | None) -> list[Pose]:

@@ -289,13 +289,11 @@ def draw_outcomes(
                 text = {"k chosen by M": str(o.k), "map right": "yes" if o.right else "no"}.get(
                     title, f"{table[i, j]:.2f}"
                 )
+                # Small values are dark in one colour map, and large ones in the other.
                 middle = (table.min() + table.max()) / 2
-                dark = (
-                    table[i, j] < max(middle, lowest[title])
-                    if colours == "viridis"
-                    else table[i, j] > middle
-                )
-                ink = "white" if dark else "black"
+                is_small = table[i, j] < max(middle, lowest[title])
+                is_dark = is_small if colours == "viridis" else table[i, j] > middle
+                ink = "white" if is_dark else "black"
                 axes.text(j, i, text, ha="center", va="center", fontsize=8, color=ink)
                 # As in the paper: four views, U = 1, the right map, and full recognition.
                 if o.k == 4 and o.uncertainty > 1 - 1e-9 and o.right and o.rate > 0.999:
