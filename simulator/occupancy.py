@@ -229,36 +229,7 @@ class _MapFileReader:
 
 def _cells(fields: MapFile, path: Path) -> Cells:
     """Read the image as cells, top row first: 100 occupied, 0 free, -1 unknown, or between."""
-    from PIL import Image, UnidentifiedImageError  # Imported here because it loads slowly.
-
-    where = f"{named(path)}: image: {named(fields.image)}"
-    kinds = "a PGM, PNG or BMP image"
-    try:
-        data = read_at_most(fields.image, LARGEST_IMAGE)
-        with (
-            warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning),
-            Image.open(io.BytesIO(data), formats=IMAGES) as image,
-        ):
-            if math.prod(image.size) > MOST_PIXELS:
-                raise Image.DecompressionBombError(f"got {image.width:,} x {image.height:,}")
-            shade, opaque = _shades(image, with_alpha=fields.mode == "trinary")
-    except UnidentifiedImageError:
-        raise SimulatorError(
-            f"{where}: expected {kinds}, got {brief(data[:20])}; convert it"
-        ) from None
-    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        raise SimulatorError(
-            f"{where}: expected at most {MOST_PIXELS:,} pixels: {error}; scale it down"
-        ) from None
-    except OSError as error:
-        raise SimulatorError(
-            f"{where}: expected {kinds}: {error.strerror or error}; check the path and the file"
-        ) from None
-    # Damaged images and impossible paths raise these.
-    except (ValueError, SyntaxError, IndexError, OverflowError) as error:
-        raise SimulatorError(
-            f"{where}: expected {kinds}: {error}; the file is damaged, or is no image"
-        ) from None
+    shade, opaque = _pixels(fields, path)
     if fields.mode == "raw":
         value = np.rint(shade * 255)
         return np.where(value <= OCCUPIED, value, UNKNOWN).astype(np.int8)
@@ -277,6 +248,40 @@ def _cells(fields: MapFile, path: Path) -> Cells:
         np.where(occupancy < fields.free_thresh, FREE, between),
     )
     return np.where(opaque, known, UNKNOWN).astype(np.int8)
+
+
+def _pixels(fields: MapFile, path: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_] | bool]:
+    """Read the brightness of the pixels, and the mask of opaque ones. Raises SimulatorError."""
+    from PIL import Image, UnidentifiedImageError  # Imported here because it loads slowly.
+
+    where = f"{named(path)}: image: {named(fields.image)}"
+    kinds = "a PGM, PNG or BMP image"
+    try:
+        data = read_at_most(fields.image, LARGEST_IMAGE)
+        with (
+            warnings.catch_warnings(action="error", category=Image.DecompressionBombWarning),
+            Image.open(io.BytesIO(data), formats=IMAGES) as image,
+        ):
+            if math.prod(image.size) > MOST_PIXELS:
+                raise Image.DecompressionBombError(f"got {image.width:,} x {image.height:,}")
+            return _shades(image, with_alpha=fields.mode == "trinary")
+    except UnidentifiedImageError:
+        raise SimulatorError(
+            f"{where}: expected {kinds}, got {brief(data[:20])}; convert it"
+        ) from None
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        raise SimulatorError(
+            f"{where}: expected at most {MOST_PIXELS:,} pixels: {error}; scale it down"
+        ) from None
+    except OSError as error:
+        raise SimulatorError(
+            f"{where}: expected {kinds}: {error.strerror or error}; check the path and the file"
+        ) from None
+    # Damaged images and impossible paths raise these.
+    except (ValueError, SyntaxError, IndexError, OverflowError) as error:
+        raise SimulatorError(
+            f"{where}: expected {kinds}: {error}; the file is damaged, or is no image"
+        ) from None
 
 
 def _shades(

@@ -284,15 +284,21 @@ def record_plan(
         f"{plan.name}, {counted(tours, 'tours')}, seed {seed}", laser, odometer or Odometer(), seed
     )
     come += come[-1:] * (len(drive) - len(come))
-    crossings = [
-        (number * len(tour.way) + at, door) for number in range(tours) for at, door in tour.doors
-    ]
+    return _judged(drive, rooms, tour, tours, come)
+
+
+def _judged(
+    drive: RecordedDrive, rooms: Rooms, tour: Round, tours: int, come: Sequence[int]
+) -> RecordedDrive:
+    """Add the truth to a drive. `come` has the point of the round at each scan."""
+    size = len(tour.way)
     return drive.judged(
         {_name(room): middle for room, middle in rooms.middles.items()},
-        [_name(int(tour.rooms[at % len(tour.way)])) for at in come],
+        [_name(int(tour.rooms[at % size])) for at in come],
         crossings=[
-            {"door": f"door {door}", "scan": int(np.searchsorted(come, at))}
-            for at, door in crossings
+            {"door": f"door {door}", "scan": int(np.searchsorted(come, begin + at))}
+            for begin in range(0, tours * size, size)
+            for at, door in tour.doors
         ],
         doors={
             f"door {number}": {

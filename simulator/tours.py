@@ -70,25 +70,7 @@ def simulate(
     Raises:
         SimulatorError: The route cannot be driven.
     """
-    if every is not None:
-        mend, what = "leave it out for images at dstates", "a number of metres"
-        a_number("every", every, SimulatorError, above=0, what=what, mend=mend)
-    a_flag("stars", stars, SimulatorError)
-    if camera is not None:
-        mend = "make one with Camera(), or leave it out for ranges"
-        an_instance("camera", camera, Camera, SimulatorError, mend=mend)
-    an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
-    if every is not None and world.lifts:
-        raise SimulatorError(
-            f"every: expected no distance in {world.name}, as evenly spaced images would join "
-            "the floors "
-            "at its lifts; leave it out"
-        )
-    if world.by_places:
-        raise SimulatorError(
-            f"{world.name}: route: expected actions, got places, and a robot that drives to places "
-            "writes a log of scans; write --format carmen, or give a route of actions"
-        )
+    _check(world, stars, every, camera)
     driver = _driver(world, tours, seed, laser, body, tolerance)
     body, tolerance = driver.robot.body, driver.tolerance
     log = OdometryLog(driver.robot)
@@ -110,6 +92,29 @@ def simulate(
         odometry=odometry,
         extra=extra,
     )
+
+
+def _check(world: World, stars: bool, every: float | None, camera: Camera | None) -> None:
+    """Check the arguments of `simulate` that other functions do not check."""
+    if every is not None:
+        mend, what = "leave it out for images at dstates", "a number of metres"
+        a_number("every", every, SimulatorError, above=0, what=what, mend=mend)
+    a_flag("stars", stars, SimulatorError)
+    if camera is not None:
+        mend = "make one with Camera(), or leave it out for ranges"
+        an_instance("camera", camera, Camera, SimulatorError, mend=mend)
+    an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
+    if every is not None and world.lifts:
+        raise SimulatorError(
+            f"every: expected no distance in {world.name}, as evenly spaced images would join "
+            "the floors "
+            "at its lifts; leave it out"
+        )
+    if world.by_places:
+        raise SimulatorError(
+            f"{world.name}: route: expected actions, got places, and a robot that drives to places "
+            "writes a log of scans; write --format carmen, or give a route of actions"
+        )
 
 
 def record(

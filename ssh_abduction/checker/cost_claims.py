@@ -102,7 +102,8 @@ def false_costs(
     if not isinstance(weighed, Mapping) or not maps:
         return
     nats, bound, rivals = (weighed.get(name) for name in ("nats", "bound", "rivals"))
-    if answer.get("status") == "optimal" and bound != nats:
+    is_optimal = answer.get("status") == "optimal"
+    if is_optimal and bound != nats:
         yield (
             f"weighed.bound: expected {nats}, the cost of map 1, as the status is optimal, got "
             f"{brief(bound)}"
@@ -110,8 +111,7 @@ def false_costs(
     if not isinstance(bound, int | float) or not isinstance(nats, int | float) or bound > nats:
         yield f"weighed.bound: expected a number up to {brief(nats)}, got {brief(bound)}"
         return
-    within = weighed.get("within")
-    if answer.get("status") != "optimal" and within:
+    if not is_optimal and (within := weighed.get("within")):
         yield (
             f"weighed.within: expected 0, as it is not proven which map is the best, got "
             f"{brief(within)}"
@@ -131,18 +131,34 @@ def false_costs(
         name = f"weighed.rivals[{i}]"
         courses.append((name, rival.get("nats"), rival["dstates"], at, there, of_rival))
     paths = theory.prices[2] * len(maps[0].paths)
-    laying = theory.price_of_laying * (_laying_factor(trace) if theory.star == "none" else 1.0)
     for name, claimed, dstates, at, count, faults in courses:
-        square, position = _least(trace, dstates, at, faults)
-        true = theory.prices[0] * len(set(dstates)) + theory.prices[1] * count + square / 2
-        tenths = [theory.fault_tenths(kind, trace.steps[step]) for kind, step in faults]
-        true += theory.prices[0] * sum(tenths) / 10
-        true += laying * _layings(trace, at)
-        if theory.level == "topological" and not theory.lifts and not theory.jumped:
-            true += theory.price_of_laying * _crowding(trace, dstates, at, position)
+        true, square = _nats(trace, theory, dstates, at, count, faults)
         true += paths if name == "weighed.nats" else 0.0
         if abs(true - claimed) > EXACT + SHARE * square:
             yield f"{name}: expected {true:.3f} nats, by the displacements, got {claimed}"
+
+
+def _nats(
+    trace: Trace,
+    theory: Theory,
+    dstates: Sequence[int],
+    at: Sequence[int],
+    places: int,
+    faults: Faults,
+) -> tuple[float, float]:
+    """Compute the cost of a map without its paths, in nats, and its misfit.
+
+    Each step is at a given dstate and place (`at`). The map has this number of places.
+    """
+    square, position = _least(trace, dstates, at, faults)
+    nats = theory.prices[0] * len(set(dstates)) + theory.prices[1] * places + square / 2
+    tenths = [theory.fault_tenths(kind, trace.steps[step]) for kind, step in faults]
+    nats += theory.prices[0] * sum(tenths) / 10
+    factor = _laying_factor(trace) if theory.star == "none" else 1.0
+    nats += theory.price_of_laying * factor * _layings(trace, at)
+    if theory.level == "topological" and not theory.lifts and not theory.jumped:
+        nats += theory.price_of_laying * _crowding(trace, dstates, at, position)
+    return nats, square
 
 
 def _layings(trace: Trace, places: Sequence[int]) -> int:

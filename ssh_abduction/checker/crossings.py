@@ -28,6 +28,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TypeAlias
 
+from ssh_abduction.data.groups import reached
 from ssh_abduction.data.star import Openings
 from ssh_abduction.theory.planarity import can_be_drawn, clockwise_orders, has_way, is_planar
 
@@ -78,45 +79,51 @@ class Edges:
         agree. If `turned`, turns must rotate the heading. If `distinct`, the dstates of a
         place must face different slots.
         """
-        options: list[list[Option]] = []
-        for here in self._at.values():
-            turns = (
-                [(s, QUARTERS[turn], t) for s, turn, t in self.turns if s in here] if turned else []
-            )
-            headings: list[dict[int, int]] = [{here[0]: 0}]
-            for t in here[1:]:
-                headings = [
-                    {**faced, t: k}
-                    for faced in headings
-                    for k in range(4)
-                    if not (distinct and k in faced.values())
-                ]
-                headings = [
-                    faced for faced in headings if all(_is_turned(faced, turn) for turn in turns)
-                ]
-            # headings that differ by a rotation of the place are one option
-            found: dict[tuple[int, ...], Option] = {}
-            for faced in headings:
-                if (
-                    len(
-                        {
-                            tuple(star[(k - faced[s]) % 4] for k in range(4))
-                            for s in here
-                            for star in stars.get(s, ())
-                        }
-                    )
-                    <= 1
-                ):
-                    option = {
-                        (s, side): (faced[s] + (1 - side)) % 4
-                        for s in here
-                        for side in (1, -1)
-                        if (s, side) in self._used
-                    }
-                    first = next(iter(option.values()), 0)
-                    found.setdefault(tuple((k - first) % 4 for k in option.values()), option)
-            options.append(list(found.values()))
+        options = [
+            self._options(here, stars, turned=turned, distinct=distinct)
+            for here in self._at.values()
+        ]
         return self._some_option_draws(options)
+
+    def _options(
+        self,
+        here: Sequence[int],
+        stars: Mapping[int, Iterable[Openings]],
+        *,
+        turned: bool,
+        distinct: bool,
+    ) -> list[Option]:
+        """List the positions that the arms of the dstates at one place may have in a frame."""
+        turns = [(s, QUARTERS[turn], t) for s, turn, t in self.turns if s in here] if turned else []
+        headings: list[dict[int, int]] = [{here[0]: 0}]
+        for t in here[1:]:
+            headings = [
+                {**faced, t: k}
+                for faced in headings
+                for k in range(4)
+                if not (distinct and k in faced.values())
+            ]
+            headings = [
+                faced for faced in headings if all(_is_turned(faced, turn) for turn in turns)
+            ]
+        # headings that differ by a rotation of the place are one option
+        found: dict[tuple[int, ...], Option] = {}
+        for faced in headings:
+            seen = {
+                tuple(star[(k - faced[s]) % 4] for k in range(4))
+                for s in here
+                for star in stars.get(s, ())
+            }
+            if len(seen) <= 1:
+                option = {
+                    (s, side): (faced[s] + (1 - side)) % 4
+                    for s in here
+                    for side in (1, -1)
+                    if (s, side) in self._used
+                }
+                first = next(iter(option.values()), 0)
+                found.setdefault(tuple((k - first) % 4 for k in option.values()), option)
+        return list(found.values())
 
     def can_be_drawn(self, *, crossing: bool) -> bool:
         """Tell whether some clockwise orders of gateways make a drawing without a crossing.
@@ -128,26 +135,7 @@ class Edges:
         one = self._gateways()
         if one is None:
             return False
-        at_edge = {s for s, _ in self._used}
-        while (
-            more := {
-                x
-                for s, turn, t in self.turns
-                if turn == "around" and {s, t} & at_edge
-                for x in (s, t)
-            }
-            - at_edge
-        ):
-            at_edge |= more
-        # for each place, sequences of gateways that are known to follow each other clockwise
-        sequences: dict[int, list[list[Arm]]] = defaultdict(list)
-        for s, turn, t in self.turns:
-            if turn != "around" and {s, t} <= at_edge:
-                side = 1 if turn == "right" else -1
-                arms = [(s, 1), (t, side), (s, -1), (t, -side)]
-                sequences[self.place_of[s]].append(
-                    [one[arm] for arm in arms if crossing or arm != (t, -1)]
-                )
+        sequences = self._sequences(one, crossing)
         edges = {
             frozenset(((self.place_of[s], one[s, 1]), (self.place_of[t], one[t, -1])))
             for s, t in self.travels
@@ -170,6 +158,24 @@ class Edges:
         return can_be_drawn(
             [(p, q) for (p, _), (q, _) in zip(ends[::2], ends[1::2], strict=True)], allows
         )
+
+    def _sequences(self, one: Mapping[Arm, Arm], crossing: bool) -> Mapping[int, list[list[Arm]]]:
+        """For each place, find gateways that are known to follow each other clockwise."""
+        around: dict[int, set[int]] = defaultdict(set)
+        for s, turn, t in self.turns:
+            if turn == "around":
+                around[s].add(t)
+                around[t].add(s)
+        at_edge = reached((s for s, _ in self._used), around.__getitem__).keys()
+        sequences: dict[int, list[list[Arm]]] = defaultdict(list)
+        for s, turn, t in self.turns:
+            if turn != "around" and {s, t} <= at_edge:
+                side = 1 if turn == "right" else -1
+                arms = [(s, 1), (t, side), (s, -1), (t, -side)]
+                sequences[self.place_of[s]].append(
+                    [one[arm] for arm in arms if crossing or arm != (t, -1)]
+                )
+        return sequences
 
     def _gateways(self) -> dict[Arm, Arm] | None:
         """Find the arms that are one gateway: a dict from each arm to the arm that represents it.

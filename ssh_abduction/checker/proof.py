@@ -9,7 +9,7 @@ ProvenBound(dstates=4, refuted=(), faults=())
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -51,7 +51,7 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
         raise MapError(
             "certificate: clique: expected a clique, got none; write the file with solve --json"
         )
-    steps, words, refuted = (certificate.get(name, []) for name in ("clique", "words", "refuted"))
+    steps, refuted = (certificate.get(name, []) for name in ("clique", "refuted"))
     if (
         not _integers(steps)
         or not all(0 <= step < len(trace) for step in steps)
@@ -66,21 +66,7 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
             f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got "
             f"{brief(refuted)}; write it with solve --json"
         )
-    # the word of each pair of steps for which the certificate has one
-    word_of: dict[frozenset[int], list[str]] = {}
-    has_words = "words" in certificate
-    for entry in words if isinstance(words, list) else [words]:
-        if (
-            not isinstance(entry, list)
-            or len(entry) != 3
-            or not _integers(entry[:2])
-            or not isinstance(entry[2], list)
-        ):
-            raise MapError(
-                f"certificate: words: expected [step, step, [action, …]], got {brief(entry)}; "
-                "write it with solve --json"
-            )
-        word_of[frozenset(entry[:2])] = entry[2]
+    word_of, has_words = _words_of(certificate), "words" in certificate
     pairs = list(combinations(steps, 2))
     reasons = (
         word_of.get(frozenset(pair), []) if has_words else _common_actions(trace, *pair)
@@ -92,6 +78,25 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
         if (fault := _not_apart(trace, i, j, word))
     ]
     return ProvenBound(len(steps), tuple(refuted), tuple(faults))
+
+
+def _words_of(certificate: Mapping[str, Any]) -> dict[frozenset[int], list[str]]:
+    """Return the word of each pair of steps for which a certificate has one."""
+    words = certificate.get("words", [])
+    found: dict[frozenset[int], list[str]] = {}
+    for entry in words if isinstance(words, list) else [words]:
+        if (
+            not isinstance(entry, list)
+            or len(entry) != 3
+            or not _integers(entry[:2])
+            or not isinstance(entry[2], list)
+        ):
+            raise MapError(
+                f"certificate: words: expected [step, step, [action, …]], got {brief(entry)}; "
+                "write it with solve --json"
+            )
+        found[frozenset(entry[:2])] = entry[2]
+    return found
 
 
 def _integers(values: Any) -> bool:

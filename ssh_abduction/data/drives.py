@@ -263,26 +263,14 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
     _warn_of_other_names(parts)
     _warn_of_other_units(parts)
     _warn_of_other_views(parts)
-    steps: list[Step] = []
     begins = accumulate([0, *map(len, parts[:-1])])
     closures = [
         replace(closure, first=begin + closure.first, last=begin + closure.last)
         for begin, trace in zip(begins, parts, strict=True)
         for closure in trace.closures
     ]
-    for name, drive in zip(called, drives, strict=True):
-        if steps:
-            steps[-1] = replace(steps[-1], action=Action(name, "start"))
-        begin = len(steps)
-        steps += [
-            replace(step, action=Action.that_slipped(begin + t))
-            if step.action is not None and step.action.slipped
-            else step
-            for t, step in enumerate(drive)
-        ]
-        steps[begin] = replace(steps[begin], displacement=None, covariance=None)
     return Trace(
-        tuple(steps),
+        tuple(_joined_steps(called, drives)),
         name=" + ".join(called),
         images=next((images for trace in parts if (images := _sidecar(trace))), None),
         odometry=next((trace.odometry for trace in parts if trace.odometry), None),
@@ -294,6 +282,23 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
             if all(trace.extra.get(name) == value for trace in parts)
         },
     )
+
+
+def _joined_steps(names: Sequence[str], drives: Sequence[Sequence[Step]]) -> list[Step]:
+    """Join the steps of drives. An action with the name of a drive leads to its first step."""
+    steps: list[Step] = []
+    for name, drive in zip(names, drives, strict=True):
+        if steps:
+            steps[-1] = replace(steps[-1], action=Action(name, "start"))
+        begin = len(steps)
+        steps += [
+            replace(step, action=Action.that_slipped(begin + t))
+            if step.action is not None and step.action.slipped
+            else step
+            for t, step in enumerate(drive)
+        ]
+        steps[begin] = replace(steps[begin], displacement=None, covariance=None)
+    return steps
 
 
 def _name(trace: Trace) -> str | None:

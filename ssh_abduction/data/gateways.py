@@ -286,30 +286,23 @@ def _fitted(
         if len(chosen) == len(sights):
             return tuple(chosen)
         sight = sights[len(chosen)]
-        for frame in _frames(sight.star, most):
-            if "gateway_end" in axioms and not all(
-                leads(frame, towards) for towards in sight.onward
+        for here in _readings(sight, axioms, most, turned=bool(chosen)):
+            look_at_clock()
+            on_drives = {**closed, sight.drive: _closed(here)} if most else closed
+            # The steps of a drive see the same gateways.
+            if most and (
+                closed.get(sight.drive, on_drives[sight.drive]) != on_drives[sight.drive]
+                or _changes(on_drives) > most
             ):
                 continue
-            # only shifts relative to the first sight matter
-            for shift in range(max(frame.slots, 1)) if chosen else (0,):
-                look_at_clock()
-                here = (frame, shift)
-                on_drives = {**closed, sight.drive: _closed(here)} if most else closed
-                # The steps of a drive see the same gateways.
-                if most and (
-                    closed.get(sight.drive, on_drives[sight.drive]) != on_drives[sight.drive]
-                    or _changes(on_drives) > most
-                ):
-                    continue
-                before = zip([*sights[: len(chosen)], sight], [*chosen, here], strict=True)
-                if all(
-                    _allowed(other, turned, sight, here, turns, axioms, headings is not None)
-                    for other, turned in before
-                ):
-                    read = extended([*chosen, here], on_drives)
-                    if read is not None:
-                        return read
+            before = zip([*sights[: len(chosen)], sight], [*chosen, here], strict=True)
+            if all(
+                _allowed(other, turned, sight, here, turns, axioms, headings is not None)
+                for other, turned in before
+            ):
+                read = extended([*chosen, here], on_drives)
+                if read is not None:
+                    return read
         return None
 
     if len(sights) > 1:
@@ -322,6 +315,16 @@ def _fitted(
         closed = {s.drive: _closed(read) for s, read in zip(sights, known, strict=False)}
         return extended([*known], closed if most else {}) or extended([], {})
     return extended([], {})
+
+
+def _readings(
+    sight: Sight, axioms: Collection[str], most: int, *, turned: bool
+) -> Iterator[Turned]:
+    """Yield the frames that a sight may have, in all shifts of its slots if it may be `turned`."""
+    for frame in _frames(sight.star, most):
+        if "gateway_end" not in axioms or all(leads(frame, way) for way in sight.onward):
+            # only shifts relative to the first sight matter
+            yield from ((frame, shift) for shift in range(max(frame.slots, 1) if turned else 1))
 
 
 @lru_cache(maxsize=2**12)

@@ -261,27 +261,25 @@ class SSHMap:
         floor = _numbered(s.floor for s in visited)
         # the direction in which each path was first faced
         faced = firsts((s.path, s.direction) for s in visited)
-        # Direction +1 becomes the one first faced. The order of the path is reversed accordingly.
+        flipped = {h for h, d in faced.items() if d == -1}
         dstates = tuple(
-            DState(
-                number[s.id],
-                s.view,
-                place.get(s.place),
-                path.get(s.path),
-                None if s.direction is None else 1 if s.direction == faced[s.path] else -1,
-                s.heading,
-                floor.get(s.floor),
+            replace(
+                s,
+                id=i,
+                place=place.get(s.place),
+                path=path.get(s.path),
+                direction=s.direction and (1 if s.direction == faced[s.path] else -1),
+                floor=floor.get(s.floor),
             )
-            for s in visited
+            for i, s in enumerate(visited)
         )
-        paths = []
-        for p in sorted(self.paths, key=lambda p: path[p.id]):
-            order = p.order[::-1] if faced.get(p.id, 1) == -1 else p.order
-            paths.append(MapPath(path[p.id], tuple(place[q] for q in order)))
+        paths = [
+            MapPath(path[p.id], tuple(place[q] for q in p.order[:: -1 if p.id in flipped else 1]))
+            for p in self.paths
+        ]
         fit = self.fit
         if fit and fit.poses:
             fit = replace(fit, poses=tuple(fit.poses[s.id] for s in visited))
-        flipped = {h for h, d in faced.items() if d == -1}
         regions, region = renumbered(self.regions or (), place, path, flipped)
         new = {"place": place, "path": path, "region": region}
         return SSHMap(
@@ -289,7 +287,7 @@ class SSHMap:
             dstates=dstates,
             links=tuple(sorted({(number[s], action, number[x]) for s, action, x in self.links})),
             places=tuple(sorted(place.values())),
-            paths=tuple(paths),
+            paths=tuple(sorted(paths, key=lambda p: p.id)),
             excused=tuple((path.get(h, h), path.get(g, g)) for h, g in self.excused),
             fit=fit,
             faults=tuple(replace(fault, place=place.get(fault.place)) for fault in self.faults),

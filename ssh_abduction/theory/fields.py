@@ -113,22 +113,7 @@ def normalise(theory: Theory) -> None:
         object.__setattr__(theory, name, _pairs(name, getattr(theory, name)))
     _check_rules(theory)
     if theory.level == "causal":
-        for name, values in (("boundary", ("none",)), ("star", ("none", "alike"))):
-            if getattr(theory, name) not in values:
-                raise TheoryError(
-                    f"{name}: expected {' or '.join(values)} with level=causal, got "
-                    f"{getattr(theory, name)}; take {CAUSAL}"
-                )
-        if set(theory.prefer) - {"dstates", *AUTO}:
-            raise TheoryError(
-                f"prefer: expected dstates with level=causal, got {', '.join(theory.prefer)}; "
-                f"take {CAUSAL}"
-            )
-    if theory.level == "causal" and theory.same_place:
-        raise TheoryError(
-            "same_place: expected a topological theory, as causal maps have no places, got "
-            "level=causal; say which steps are one dstate (same, --same)"
-        )
+        _check_causal(theory)
     if "auto" in theory.prefer and theory.prefer != AUTO:
         raise TheoryError(
             f"prefer: expected auto without other counts, got {', '.join(theory.prefer)}; name "
@@ -148,6 +133,26 @@ def normalise(theory: Theory) -> None:
 def choice(name: str, value: str) -> str:
     """Say how to set a field in Python and in the shell, such as "star=none (--set star=none)"."""
     return f"{name}={value} (--set {name}={value})"
+
+
+def _check_causal(theory: Theory) -> None:
+    """Check that the other fields suit a causal theory. Raises TheoryError."""
+    for name, values in (("boundary", ("none",)), ("star", ("none", "alike"))):
+        if getattr(theory, name) not in values:
+            raise TheoryError(
+                f"{name}: expected {' or '.join(values)} with level=causal, got "
+                f"{getattr(theory, name)}; take {CAUSAL}"
+            )
+    if set(theory.prefer) - {"dstates", *AUTO}:
+        raise TheoryError(
+            f"prefer: expected dstates with level=causal, got {', '.join(theory.prefer)}; "
+            f"take {CAUSAL}"
+        )
+    if theory.same_place:
+        raise TheoryError(
+            "same_place: expected a topological theory, as causal maps have no places, got "
+            "level=causal; say which steps are one dstate (same, --same)"
+        )
 
 
 def _check_weigh(theory: Theory) -> None:

@@ -100,16 +100,7 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
         several_drives=any(action.starts for action in trace.actions),
         lifts=any(action.changes_floor for action in trace.actions),
     )
-    if settled.lifts and settled.slipped:
-        raise TheoryError(
-            "slipped: expected no actions that slip where a trace has lifts, as they could lead to "
-            f"other floors, got {settled.slipped:g}; leave it out (--set slipped=0)"
-        )
-    if settled.changed and star not in ("frame", "gateways"):
-        raise TheoryError(
-            "changed: expected a trace with stars, read by star=frame or gateways, got "
-            f"star={star}; leave it out (--set changed=0)"
-        )
+    _check_faults(settled)
     if settled.changed and star == "gateways" and "gateway_end" not in settled.without:
         # A path may lead on by a gateway that is closed on a drive.
         settled = replace(settled, without=(*settled.without, "gateway_end"))
@@ -122,6 +113,20 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
     if displacement == "use" and not settled.returns:
         problem = problem.changed(theory=replace(settled, returns=count_returns(problem)))
     return problem
+
+
+def _check_faults(settled: Theory) -> None:
+    """Check that the trace has what faults need. Raises TheoryError."""
+    if settled.lifts and settled.slipped:
+        raise TheoryError(
+            "slipped: expected no actions that slip where a trace has lifts, as they could lead to "
+            f"other floors, got {settled.slipped:g}; leave it out (--set slipped=0)"
+        )
+    if settled.changed and settled.star not in ("frame", "gateways"):
+        raise TheoryError(
+            "changed: expected a trace with stars, read by star=frame or gateways, got "
+            f"star={settled.star}; leave it out (--set changed=0)"
+        )
 
 
 def count_returns(problem: Problem) -> int:
