@@ -630,6 +630,17 @@ def test_file_of_corrections_in_place_of_maps_is_an_error(
     assert f"got a file of corrections; name the folder: {building}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("text", [None, "places: 3\n", "format: ssh-corrections\nversion: ["])
+def test_other_yaml_in_place_of_maps_is_not_called_corrections(
+    text: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "maps.yaml"
+    if text is not None:
+        file.write_text(text)
+    assert main(["show", str(file)]) == 1
+    assert "corrections" not in capsys.readouterr().err
+
+
 def test_correction_can_leave_a_star_without_gateways() -> None:
     assert with_gateway((1, None, 0, 0), 90.0, is_open=True) == (1, 1, 0, 0)
     bearings = (0.0, Gateway(120.0, opposite=2), Gateway(240.0, opposite=1))

@@ -7,6 +7,7 @@ import gzip
 import itertools
 import json
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -213,7 +214,9 @@ def test_run_that_cannot_be_written_does_not_stop_other_logs(
 
     monkeypatch.setattr(cluster_jobs, "answers_here", here)
     monkeypatch.setattr(run_folders, "write_file", write)
+    monkeypatch.setattr(tempfile, "mkdtemp", lambda prefix: str(tmp_path / prefix))
     assert main(["map", *logs, "-o", str(tmp_path / "runs")]) == 1
+    assert (tmp_path / "ssh-abduction-" / "maps.json").read_bytes() == b"maps"
     told = capsys.readouterr()
     runs = tmp_path / "runs"
     assert told.out.splitlines() == [
@@ -221,7 +224,7 @@ def test_run_that_cannot_be_written_does_not_stop_other_logs(
         f"{runs / 'taken'}; name another one",
         f"{logs[0]}: mapped → {runs / 'good'}",
         f"{logs[2]}: error: {runs / 'full' / 'maps.json'}: cannot be written: No space left on "
-        "device; make room",
+        f"device; make room; until then the files of this run are in {tmp_path / 'ssh-abduction-'}",
         f"{logs[3]}: mapped → {runs / 'fine'}",
     ]
     assert asked == [logs[0], logs[2], logs[3]]

@@ -592,6 +592,25 @@ def test_maps_of_least_cost_are_listed_once() -> None:
     assert 1 < len(solution.maps) == len(set(solution.maps))
 
 
+@pytest.mark.parametrize(
+    ("laps", "measured", "confirmed"), [(2, {*range(1, 17)} - {5}, True), (1, {7, 8}, False)]
+)
+def test_join_across_missing_displacements_needs_another_join(
+    laps: int, measured: set[int], confirmed: bool
+) -> None:
+    """If nothing but one join connects two parts of a trace, no loop of displacements tests it."""
+    moved = [(10.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2)] * 4 * laps
+    said = [move if t in measured else None for t, move in enumerate(moved, 1)]
+    views = "abcdefgh" * laps + "a" if confirmed else "ababababa"
+    weighed = solve(
+        Trace.from_steps(views, ["travel", "left"] * 4 * laps, displacements=said), Theory.causal()
+    ).weighed
+    assert weighed is not None
+    assert weighed.proven
+    assert (weighed.confidence > 0.95) is confirmed
+    assert ("across a missing displacement" in weighed.sentence) is not confirmed
+
+
 @pytest.mark.slow
 def test_maps_of_equal_cost_are_all_minimal(tmp_path: Path) -> None:
     """Two drives share a corner of a square, but nothing says which. Paths cost nothing."""

@@ -33,6 +33,7 @@ from ssh_abduction.cli.run_folders import (
     folders_of,
     is_done,
     write_run,
+    written_elsewhere,
 )
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.corrections import Corrections
@@ -373,7 +374,8 @@ def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
         try:
             write_run(folder, answer.files)
         except OSError as error:
-            raise UnwrittenError(unwritten(error, folder)) from None
+            where = written_elsewhere(answer.files)
+            raise UnwrittenError(unwritten(error, folder) + where) from None
         _say(answer, folder)
         warn([warning for warning in answer.warnings if warning not in printed])
 
@@ -397,7 +399,8 @@ def _kept(
         try:
             write_run(folders[path], answer.files)
         except OSError as error:  # one full disk must not stop the other logs
-            print(f"{named(path)}: error: {unwritten(error, folders[path])}", flush=True)
+            why = unwritten(error, folders[path]) + written_elsewhere(answer.files)
+            print(f"{named(path)}: error: {why}", flush=True)
             code = EXIT_ERROR
         else:
             _say(answer, folders[path])

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ssh_abduction.cli.parsing import Parser, true_or_false
+from ssh_abduction.data.corrections_file import load_corrections
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
 from ssh_abduction.data.map_file import read_json
@@ -331,7 +332,11 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
 
 def _in_order(options: argparse.Namespace) -> None:
     """Warn and swap `maps` and `trace` if the trace came first, as in version 0.1.0."""
-    if options.maps == "-" or not _is_trace(options.maps) or _is_trace(options.trace):
+    if (
+        options.maps == "-"
+        or not _is_read(Trace.load, options.maps)
+        or _is_read(Trace.load, options.trace)
+    ):
         return
     print(
         "ssh-abduction: warning: a trace before its maps is deprecated; "
@@ -369,21 +374,23 @@ def read_maps(file: str, mend: str = "name the maps first, and then the trace") 
     try:
         return read_json(file)
     except MapError:
-        if Path(file).suffix in (".yaml", ".yml"):
+        if Path(file).suffix in (".yaml", ".yml") and _is_read(load_corrections, file):
             raise MapError(
                 f"{named(file)}: expected a file of maps or its folder, got a file of corrections; "
                 f"name the folder: {Path(file).parent}"
             ) from None
-        if file == "-" or not _is_trace(file):
+        if file == "-" or not _is_read(Trace.load, file):
             raise
         raise MapError(f"{named(file)}: expected a file of maps, got a trace; {mend}") from None
 
 
-def _is_trace(file: str) -> bool:
+def _is_read(load: Callable[[str], object], file: str) -> bool:
+    """Whether a function reads a file without an error."""
     try:
-        return bool(Trace.load(file))
+        load(file)
     except AbductionError:
         return False
+    return True
 
 
 def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theory:

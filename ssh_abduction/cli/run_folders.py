@@ -8,6 +8,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
+import tempfile
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
@@ -46,6 +48,22 @@ def write_run(folder: Path, files: Sequence[tuple[str, bytes]]) -> None:
         except OSError as error:
             error.filename = str(folder / name)  # the error may name the draft, or no file
             raise
+
+
+def written_elsewhere(files: Sequence[tuple[str, bytes]]) -> str:
+    """Write the files of a run into a temporary folder, as its own has no room. Say in words where.
+
+    Returns "" if they cannot be written there, either.
+    """
+    with suppress(OSError):
+        spare = tempfile.mkdtemp(prefix="ssh-abduction-")
+        try:
+            write_run(Path(spare), files)
+        except OSError:
+            shutil.rmtree(spare, ignore_errors=True)
+        else:
+            return f"; until then the files of this run are in {named(spare)}"
+    return ""
 
 
 def check_folder(folder: Path) -> None:

@@ -14,7 +14,7 @@ from dataclasses import replace
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, TypeAlias
 
-from ssh_abduction.data.drives import Drive, drive_of_steps, drives_of, step_name
+from ssh_abduction.data.drives import Drive, drive_of_steps, drives_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.observation import View
 from ssh_abduction.data.trace import Trace
@@ -93,40 +93,6 @@ def may_join_more(problem: Problem, rivals: Sequence[Rival]) -> bool:
         alike.setdefault(view, []).append(step)
     pairs = chain.from_iterable(combinations(steps, 2) for steps in alike.values())
     return any(group[i] != group[j] and i not in apart.get(j, ()) for i, j in pairs)
-
-
-def doubt_of(problem: Problem, best: SSHMap) -> str | None:
-    """Say why the costs of maps cannot be trusted; None if there is no such reason.
-
-    Two places cannot be at one position. If two drives have such places, they overlap by chance. If
-    views look alike nearly everywhere, drives that stay apart may share places all the same.
-    """
-    overlap = problem.overlap
-    if overlap.is_ambiguous and overlap.keeps_apart(best):
-        return "the views of the drives are too much alike to tell whether they share places"
-    if not overlap.near or not overlap.of_map(best):
-        return None
-    if best.fit is None:
-        from ssh_abduction.solver.geometry.fit import fit  # loads scipy
-
-        best = replace(best, fit=fit(problem.trace, best))
-    for *steps, _ in overlap.crowded_in(best):
-        names = (step_name(drives_of(problem.trace), step) for step in steps)
-        return f"{' and '.join(names)} are at one position, but at two places"
-    return None
-
-
-def misfit_of(problem: Problem, best: SSHMap) -> str | None:
-    """Say that the best map contradicts the displacements, if it does; else None.
-
-    A map that costs least may still be false: the displacements, or the axioms, may be wrong.
-    """
-    from ssh_abduction.solver.geometry.fit import fit  # loads scipy
-
-    believed = problem.trace.without_displacements_at(jumped(best))
-    if fit(believed, best).p >= problem.theory.reject:
-        return None
-    return "the best map does not fit the displacements"
 
 
 def maps_apart(

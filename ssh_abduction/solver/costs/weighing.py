@@ -43,15 +43,14 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.costs import repeats
 from ssh_abduction.solver.costs.beams import Beams
+from ssh_abduction.solver.costs.doubts import doubt_of, misfit_of
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
     ESTIMATING,
     Course,
-    doubt_of,
     dstates_and_places,
     least_places,
     may_join_more,
-    misfit_of,
     rival_of,
     rivals_of,
 )

@@ -16,9 +16,9 @@ from ssh_abduction.data.drives import drives_of, starts_of, together
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.costs.doubts import doubt_of
 from ssh_abduction.solver.costs.estimating import (
     ESTIMATING,
-    doubt_of,
     may_join_more,
     rival_of,
     rivals_of,
