@@ -332,11 +332,8 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
 
 def _in_order(options: argparse.Namespace) -> None:
     """Warn and swap `maps` and `trace` if the trace came first, as in version 0.1.0."""
-    if (
-        options.maps == "-"
-        or not _is_read(Trace.load, options.maps)
-        or _is_read(Trace.load, options.trace)
-    ):
+    is_trace = partial(_is_read, Trace.load)
+    if options.maps == "-" or not is_trace(options.maps) or is_trace(options.trace):
         return
     print(
         "ssh-abduction: warning: a trace before its maps is deprecated; "
@@ -386,11 +383,10 @@ def read_maps(file: str, mend: str = "name the maps first, and then the trace") 
 
 def _is_read(load: Callable[[str], object], file: str) -> bool:
     """Whether a function reads a file without an error."""
-    try:
+    with suppress(AbductionError):
         load(file)
-    except AbductionError:
-        return False
-    return True
+        return True
+    return False
 
 
 def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theory:
