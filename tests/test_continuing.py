@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from benchmarks.instances import maze
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.guesses import continuing
 from ssh_abduction.solver.guesses.continuing import labels_continued
 from ssh_abduction.solver.guesses.merging import dstates_merged
-from ssh_abduction.solver.steps.chart import Chart, numbered
+from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
 from tests.strategies import traces
 

@@ -2,6 +2,8 @@
 
 >>> gathered([("a", 1), ("b", 2), ("a", 3)]), firsts([("a", 1), ("b", 2), ("a", 3)])
 ({'a': [1, 3], 'b': [2]}, {'a': 1, 'b': 2})
+>>> numbered("caca"), indices_of("caca"), first_index_of("caca")
+([0, 1, 0, 1], {'c': [0, 2], 'a': [1, 3]}, {'c': 0, 'a': 1})
 """
 
 from __future__ import annotations
@@ -28,6 +30,22 @@ def firsts(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, Value]:
     for key, value in pairs:
         found.setdefault(key, value)
     return found
+
+
+def numbered(labels: Iterable[Hashable]) -> list[int]:
+    """Renumber labels from 0 in the order in which they first occur."""
+    number: dict[Hashable, int] = {}
+    return [number.setdefault(label, len(number)) for label in labels]
+
+
+def indices_of(labels: Iterable[Key]) -> dict[Key, list[int]]:
+    """Return the indices at which each label occurs."""
+    return gathered((label, i) for i, label in enumerate(labels))
+
+
+def first_index_of(labels: Iterable[Key]) -> dict[Key, int]:
+    """Return the index at which each label first occurs."""
+    return firsts((label, i) for i, label in enumerate(labels))
 
 
 def reached(starts: Iterable[Node], beside: Callable[[Node], Iterable[Node]]) -> dict[Node, None]:

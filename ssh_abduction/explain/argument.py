@@ -18,7 +18,8 @@ from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Assumption, Axioms
-from ssh_abduction.explain.derivation import Derivation, Inference, Link, clashes_of
+from ssh_abduction.explain.derivation import Derivation, Inference, Link
+from ssh_abduction.explain.no_map import clashes_of
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.wording import Words, that_path
 from ssh_abduction.solver import facts

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.checker.checker import Violation
-from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.words import attributes_of
-from ssh_abduction.explain.no_map import ClashingAxiom
+from ssh_abduction.explain.no_map import ClashingAxiom, clashes_of
 
 # If an inference has more reasons than IN_A_LINE, each gets a line of its own.
 IN_A_LINE, INDENT = 2, " " * 7
@@ -108,12 +107,6 @@ class Derivation:
     def to_dict(self) -> dict[str, Any]:
         """Return the argument as plain data, without the maps of the links."""
         return attributes_of(self, "steps", "clashes", "supposition", "inferences", "summary")
-
-
-def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[ClashingAxiom, ...]:
-    """Group links (pairs of an axiom and a step) by axiom, in the order of first links."""
-    steps = gathered(links)
-    return tuple(ClashingAxiom(axiom, tuple(sorted({*some}))) for axiom, some in steps.items())
 
 
 def _lines_of(inference: Inference, number: int) -> Iterator[str]:

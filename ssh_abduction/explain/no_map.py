@@ -14,11 +14,12 @@ stretch has a map.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import TheoryError, TraceError
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.axioms import Axioms
@@ -47,6 +48,12 @@ class ClashingAxiom:
     def to_dict(self) -> dict[str, object]:
         """Return the axiom and its steps as plain data."""
         return attributes_of(self, "axiom", "steps")
+
+
+def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[ClashingAxiom, ...]:
+    """Group links (pairs of an axiom and a step) by axiom, in the order of first links."""
+    steps = gathered(links)
+    return tuple(ClashingAxiom(axiom, tuple(sorted({*some}))) for axiom, some in steps.items())
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,17 +135,11 @@ def explain(
     end = begin + length
     first = end - (shortest(length, lambda n: has_no_map(end - n, end)) or length)
     last = end - 1
-    clashes: dict[str, list[int]] = {}
     piece = Piece.of(problem, range(first, last + 1))
     axioms = Axioms(piece, stop, relaxed=True)
     clash = axioms.smallest_clash()
-    for axiom, step in clash:
-        clashes.setdefault(axiom, []).append(piece.steps[step])
-    order = theory.axioms
-    found = tuple(
-        ClashingAxiom(name, tuple(sorted(clashes[name])))
-        for name in sorted(clashes, key=order.index)
-    )
+    in_order = sorted(clash, key=lambda pair: theory.axioms.index(pair[0]))
+    found = clashes_of((axiom, piece.steps[step]) for axiom, step in in_order)
     return Explanation(piece.steps[0], piece.steps[-1], found, axioms.sentences(clash))
 
 

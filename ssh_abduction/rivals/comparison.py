@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import MapError, printable
+from ssh_abduction.data.groups import indices_of
 from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.rivals.differences import Difference, difference
 from ssh_abduction.rivals.factors import deciding, independent, options_of
@@ -40,7 +41,6 @@ from ssh_abduction.rivals.questions import (
     AnsweredQuestion,
     Matter,
     Question,
-    members_of,
     questions_of,
 )
 from ssh_abduction.rivals.table import Table
@@ -342,7 +342,7 @@ def _choice(
     differing: dict[Matter, tuple[int, ...]],
 ) -> Choice:
     """Make a choice from the questions `asked`. `option` numbers the option of each map."""
-    members = members_of(option.tolist())
+    members = indices_of(option.tolist())
     options = [
         Option(tuple(bool(a.column[maps[0]]) for a in asked), tuple(i + 1 for i in maps))
         for maps in members.values()

@@ -24,7 +24,7 @@ import networkx as nx
 from ssh_abduction.data.checks import a_list, a_text, all_instances
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, printable
-from ssh_abduction.data.groups import firsts, gathered
+from ssh_abduction.data.groups import firsts, gathered, indices_of
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.rivals.known_sides import Beside, only_in
@@ -273,10 +273,10 @@ def _named_links(ssh_map: SSHMap, steps: Sequence[int]) -> set[Link]:
 
 def _unmoved(first: SSHMap, other: SSHMap) -> set[int]:
     """Find the dstates that have the same steps in both maps, each named by its first step."""
-    sets: list[set[Steps]] = []
-    for ssh_map in (first, other):
-        steps = gathered((label, t) for t, label in enumerate(ssh_map.dstate_at))
-        sets.append({tuple(some) for some in steps.values()})
+    sets = [
+        {tuple(some) for some in indices_of(ssh_map.dstate_at).values()}
+        for ssh_map in (first, other)
+    ]
     return {some[0] for some in sets[0] & sets[1]}
 
 

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.groups import indices_of
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.rivals.table import Bools, Table
@@ -129,11 +129,11 @@ def questions_of(
     places = [maps[0].dstates[label].place for label in maps[0].dstate_at] if same_places else []
     steps_by_class = {
         number: [table.steps[t] for t in steps]
-        for number, steps in members_of(table.classes.tolist()).items()
+        for number, steps in indices_of(table.classes.tolist()).items()
     }
     for sort in table.ones:
         heads = table.heads(sort).tolist()
-        together = members_of(heads)
+        together = indices_of(heads)
         for c, d, column in table.questions(sort):
             key = _key(column)
             # of questions with equal or opposite answers, keep the one about the earliest steps
@@ -166,11 +166,6 @@ def questions_of(
 def _key(column: Bools) -> bytes:
     """Compute a key of answers. Equal columns and opposite columns have the same key."""
     return np.packbits(column ^ column[0]).tobytes()
-
-
-def members_of(numbers: Sequence[int]) -> dict[int, list[int]]:
-    """Return a dict from each number to the list of its positions, from 0."""
-    return gathered((number, i) for i, number in enumerate(numbers))
 
 
 def _steps(steps: Sequence[int]) -> str:

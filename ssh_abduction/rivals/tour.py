@@ -29,6 +29,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import TypeAlias
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.rivals.flow import followed_from, nearest_of, reached_from, shortest_walk
@@ -104,10 +105,8 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
         if not more:
             break
         believed |= more
-    numbers: dict[tuple[Copy, int], int] = {}
-    labels = tuple(
-        numbers.setdefault(pair, len(numbers)) for pair in zip(at, ssh_map.dstate_at, strict=True)
-    )
+    copied = list(zip(at, ssh_map.dstate_at, strict=True))
+    labels = tuple(numbered(copied))
     places: dict[Copy, int] = {}
     off_paths = [replace(s, path=None, direction=None) for s in ssh_map.dstates]
     links = {
@@ -120,7 +119,7 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
         dstate_at=labels,
         dstates=tuple(
             replace(off_paths[label], id=n, place=places.setdefault(copy, n))
-            for (copy, label), n in numbers.items()
+            for n, (copy, label) in enumerate(dict.fromkeys(copied))
         ),
         links=tuple(sorted(links)),
         places=tuple(places.values()),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.geometry.ranking import in_order, noise_warning, units_warning
 from ssh_abduction.solver.parts import Parts
@@ -117,9 +118,6 @@ class Answer:
         task = self._parts.task
         if not row("clique").holds_for(task.theory):
             return None
-        number: dict[object, int] = {}
-        views = tuple(
-            number.setdefault(step.view, len(number)) for step in task.trace.steps[: max(size, 1)]
-        )
+        views = tuple(numbered(task.trace.views[: max(size, 1)]))
         actions = tuple(task.log.actions[: len(views) - 1])
         return Basis(views, actions, self._parts.known.bound.dstates or 0)

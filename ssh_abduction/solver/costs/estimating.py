@@ -15,14 +15,13 @@ from itertools import chain, combinations
 from typing import TYPE_CHECKING, TypeAlias
 
 from ssh_abduction.data.drives import Drive, drive_of_steps, drives_of
+from ssh_abduction.data.groups import gathered, indices_of, numbered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.observation import View
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.solution.weighed import CHANCE, Rival, groups_of_drives
-from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.overlap import groups_of_each
@@ -88,10 +87,8 @@ def may_join_more(problem: Problem, rivals: Sequence[Rival]) -> bool:
     if theory.level != "causal" or theory.misread or theory.unknown_views:
         return True
     apart = problem.pairs.apart
-    alike: dict[View | None, list[int]] = {}
-    for step, view in enumerate(problem.trace.views):
-        alike.setdefault(view, []).append(step)
-    pairs = chain.from_iterable(combinations(steps, 2) for steps in alike.values())
+    alike = indices_of(problem.trace.views).values()
+    pairs = chain.from_iterable(combinations(steps, 2) for steps in alike)
     return any(group[i] != group[j] and i not in apart.get(j, ()) for i, j in pairs)
 
 
@@ -155,10 +152,8 @@ def _apart(best: Rival, drive: Drive) -> Course:
 
 def _all_moved(best: Rival, begins: Sequence[int]) -> Iterator[Course]:
     """Yield the dstates and places of each map in which some visits to a place get a new place."""
-    visits: dict[int, list[int]] = {}  # the first steps of the visits to each place
-    for step, (name, begin) in enumerate(zip(best.places or best.dstates, begins, strict=True)):
-        if begin == step:
-            visits.setdefault(name, []).append(step)
+    at = best.places or best.dstates
+    visits = gathered((at[step], step) for step, begin in enumerate(begins) if begin == step)
     for firsts in visits.values():
         singly = [{begin} for begin in firsts[1:]]
         from_then_on = [set(firsts[i:]) for i in range(1, len(firsts) - 1)]

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from ssh_abduction.data.groups import gathered, indices_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.costs.misfit import Misfit
@@ -221,12 +222,11 @@ class _Joined:
         if self.fails:
             return
         # The links into each class: from which class and direction, by (class, action, direction).
-        self._into: dict[tuple[int, int, int], list[tuple[int, int]]] = defaultdict(list)
-        self._ways: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        for a, out, action, arrives, b in self._links.tolist():
-            self._into[b, action, arrives].append((a, out))
-            if (action, arrives) not in self._ways[b]:
-                self._ways[b].append((action, arrives))
+        links: list[list[int]] = self._links.tolist()
+        self._into = gathered(
+            ((b, action, arrives), (a, out)) for a, out, action, arrives, b in links
+        )
+        self._ways = gathered((b, (action, arrives)) for b, action, arrives in self._into)
         nodes, self._node_of = np.unique(
             np.column_stack([of[visits.visit], visits.direction]), axis=0, return_inverse=True
         )
@@ -303,7 +303,7 @@ class _Joined:
                 continue
             self._apart[r, a, b] = self._apart[-r % self._turns, b, a] = True
             added.append((r, a, b))
-            for action, arrives in self._ways[a]:
+            for action, arrives in self._ways.get(a, ()):
                 for c, out in self._into[a, action, arrives]:
                     for d, other in self._into.get((b, action, (arrives + r) % self._turns), ()):
                         waiting.append(((other - out) % self._turns, c, d))
@@ -330,9 +330,7 @@ class Forcing:
         dstate, place, _ = problem.theory.prices
         self._prices = dstate, place if problem.theory.level == "topological" else 0.0
         self.visits = Visits.of(problem, log, ssh_map)
-        at: dict[int, list[int]] = defaultdict(list)
-        for v, place in enumerate(self.visits.place.tolist()):
-            at[place].append(v)
+        at: dict[int, list[int]] = indices_of(self.visits.place.tolist())
         most = max(PAIRS // len(self.visits.place), 1)
         self._pairs = [
             (i, j)

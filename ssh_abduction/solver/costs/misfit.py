@@ -21,12 +21,11 @@ from __future__ import annotations
 from collections.abc import Collection, Hashable, Iterable, Sequence
 from typing import TypeAlias
 
-from ssh_abduction.data.groups import NodeClasses
+from ssh_abduction.data.groups import NodeClasses, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.geometry.equations import Equations
 from ssh_abduction.solver.geometry.fit import Array, Poses
-from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped

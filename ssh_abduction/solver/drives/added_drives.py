@@ -30,7 +30,7 @@ from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import drives_of, starts_of, step_name, together
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.gateways import with_allowed_headings
-from ssh_abduction.data.groups import firsts
+from ssh_abduction.data.groups import first_index_of, firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
@@ -237,7 +237,7 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, join
     other theories, they switch fast engines off.
     """
     place = [ssh_map.dstates[s].place for s in digest.labels]
-    first = {s: t for t, s in reversed([*enumerate(digest.labels)])}
+    first = first_index_of(digest.labels)
     apart, elsewhere = [], []
     for s, i in first.items():
         # If equal steps are asserted to be equal, one step of each dstate is enough.
@@ -344,7 +344,7 @@ def _contradiction(
     reason, drives = "no map keeps the existing map", drives_of(old)
     if found.maps:
         dstates, places = _broken(found.maps[0], digest, ssh_map)
-        first = {s: t for t, s in reversed([*enumerate(ssh_map.dstate_at)])}
+        first = first_index_of(ssh_map.dstate_at)
         pairs = [
             f"{step_name(drives, first[s])} and {step_name(drives, first[x])}" for s, x in places
         ]

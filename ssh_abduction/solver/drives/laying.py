@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from ssh_abduction.data.drives import drives_of, starts_of, together
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
@@ -31,7 +32,6 @@ from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.weighed import IMPROBABLE, Weighed
-from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.values import Bound, Cost, Effort, Seconds, Status, nats_of
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp.control import Asker, Control, mapped
+from ssh_abduction.solver.asp.control import Asker, mapped
 from ssh_abduction.solver.asp.facts.path_reader import PathReader
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.doubts import Settled
@@ -144,23 +144,18 @@ class LabellingEngine(Protocol):
 
 
 def maps_of_labels(
-    asker: Asker,
-    control: Control,
-    reader: PathReader,
-    theory: Theory,
-    mode: str,
-    conflicts: int = -1,
+    asker: Asker, reader: PathReader, theory: Theory, mode: str, conflicts: int = -1
 ) -> Generator[Found, None, bool]:
     """Yield maps with given dstates, and return whether clingo ended before the limit of conflicts.
 
-    The answers of the control are the places and paths that fit the dstates. The theory says what a
-    map costs. `mode` is clingo's opt-mode; "ignore" for a single map. -1 conflicts mean no limit.
+    The reader reads the places and paths that fit the dstates. The theory says what a map costs.
+    `mode` is clingo's opt-mode; "ignore" for a single map. -1 conflicts mean no limit.
     """
     answers = asker.answers(
         reader.read,
         mode,
         int(mode == "ignore"),
-        control=control,
+        control=reader.control,
         conflicts=conflicts,
         ahead=True,
     )

@@ -72,26 +72,19 @@ class Doubts:
 class Settled:
     """Answers questions about the best maps with given dstates, after the dstates are found."""
 
-    def __init__(
-        self,
-        asker: Asker,
-        control: Control,
-        mode: str,
-        reader: path_reader.PathReader,
-    ) -> None:
-        """Prepare the questions for a control whose answers are places and paths."""
-        self._asker, self._control, self._mode = asker, control, mode
-        self._reader = reader
-        self._doubts = Doubts(asker, control, reader.condition)
+    def __init__(self, asker: Asker, reader: path_reader.PathReader, mode: str) -> None:
+        """Prepare the questions for a reader of places and paths. `mode` is clingo's opt-mode."""
+        self._asker, self._reader, self._mode = asker, reader, mode
+        self._doubts = Doubts(asker, reader.control, reader.condition)
         self._any: SSHMap | None = None
 
     def any_map(self) -> SSHMap | None:
         """Return some map, always the same one; None if there is none."""
         if self._any is None:
-            with closing(
-                self._asker.answers(self._reader.read, self._mode, 1, control=self._control)
-            ) as answers:
-                self._any = next(map(self._reader.map_of, answers), None)
+            reader = self._reader
+            answers = self._asker.answers(reader.read, self._mode, 1, control=reader.control)
+            with closing(answers):
+                self._any = next(map(reader.map_of, answers), None)
         return self._any
 
     def map_with(self, doubts: Collection[Doubt]) -> SSHMap | None:

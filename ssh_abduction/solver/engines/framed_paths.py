@@ -88,25 +88,18 @@ class FramedPaths:
         self, naming: NodeLabels, mode: str, conflicts: int = -1
     ) -> Generator[Found, None, bool]:
         """Yield maps with these dstates, as `maps_of_labels` does."""
-        control = naming.control or self.control(naming.chart, naming.labels)
-        reader = self._reader(naming, control)
-        return (
-            yield from maps_of_labels(
-                self._asker, control, reader, self.task.theory, mode, conflicts
-            )
-        )
+        reader, theory = self._reader(naming), self.task.theory
+        return (yield from maps_of_labels(self._asker, reader, theory, mode, conflicts))
 
     def settled(self, naming: NodeLabels, mode: str) -> Settled:
         """Prepare questions about the best maps with these dstates. `mode` is clingo's opt-mode."""
-        control = naming.control or self.control(naming.chart, naming.labels)
-        reader = self._reader(naming, control)
-        return Settled(self._asker, control, mode, reader)
+        return Settled(self._asker, self._reader(naming), mode)
 
-    def _reader(self, naming: NodeLabels, control: Control) -> path_reader.PathReader:
-        """Make a reader of the places and paths in answers of a control."""
-        return path_reader.PathReader(
-            control, self.task.trace, self.task.theory, naming.chart, naming.labels
-        )
+    def _reader(self, naming: NodeLabels) -> path_reader.PathReader:
+        """Make a reader of the places and paths that fit these dstates."""
+        chart, labels = naming.chart, naming.labels
+        control = naming.control or self.control(chart, labels)
+        return path_reader.PathReader(control, self.task.trace, self.task.theory, chart, labels)
 
     def control(
         self,

@@ -28,13 +28,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import chain, islice
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.engines.base import Found, Task, listing, next_charted_size
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.frameless_paths import PARTS, PlacesAndPaths
 from ssh_abduction.solver.engines.refusing import all_accepted
-from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.theory.evidence import Equality
 
 # First list about this many maps whose dstates or places differ. They are kept in memory until all

@@ -182,7 +182,7 @@ class PlacesAndPaths:
             == "places"
         )
         reader, theory = self._reader(control, labels), self._task.theory
-        found = maps_of_labels(self._asker, control, reader, theory, "opt", TIGHTLY)
+        found = maps_of_labels(self._asker, reader, theory, "opt", TIGHTLY)
         best: Found | None = None
         with closing(found):
             while True:
@@ -308,8 +308,7 @@ class PlacesAndPaths:
 
     def settled(self, labels: Sequence[int], mode: str) -> Settled:
         """Prepare questions about the best maps with these dstates. `mode` is clingo's opt-mode."""
-        control = self._path_control(labels)
-        return Settled(self._asker, control, mode, self._reader(control, labels))
+        return Settled(self._asker, self._reader(self._path_control(labels), labels), mode)
 
     def improving_maps(self, labels: Sequence[int]) -> Iterator[Found]:
         """Yield maps with these dstates, none costlier than the one before; nothing if none fit."""
@@ -333,13 +332,9 @@ class PlacesAndPaths:
         `options` are those of clasp. Without `EACH` in `parts`, the parts of the program, there is
         one map for each choice of places.
         """
-        control = self._path_control(labels, options, parts)
-        reader = self._reader(control, labels)
-        return (
-            yield from maps_of_labels(
-                self._asker, control, reader, self._task.theory, mode, conflicts
-            )
-        )
+        reader = self._reader(self._path_control(labels, options, parts), labels)
+        theory = self._task.theory
+        return (yield from maps_of_labels(self._asker, reader, theory, mode, conflicts))
 
     def _reader(self, control: Control, labels: Sequence[int]) -> path_reader.PathReader:
         """Make a reader of the places and paths in answers of a control."""

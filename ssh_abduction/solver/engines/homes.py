@@ -20,12 +20,12 @@ to merge places (`engines/frameless_paths.py`).
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.asp.facts.paths_lp import Segments
 from ssh_abduction.solver.steps.apart import pairwise_distinct
@@ -49,9 +49,7 @@ def homes_of(segments: Segments) -> Mapping[int, list[int]] | None:
     may_be = ~different[:, columns]
     may_be[columns] = np.eye(len(fixed), dtype=bool)
     steps = [(segment, number[c], number[b]) for segment, c, b in segments.travels]
-    travels: dict[int, list[tuple[int, int]]] = defaultdict(list)
-    for segment, c, b in steps:
-        travels[segment].append((c, b))
+    travels = gathered((segment, (c, b)) for segment, c, b in steps)
     follows = {segment: _may_follow(pairs, columns) for segment, pairs in travels.items()}
     before = -1
     while before != (before := int(may_be.sum())):

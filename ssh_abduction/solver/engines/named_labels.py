@@ -36,6 +36,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import names_lp
 from ssh_abduction.solver.asp.limits import LimitError
@@ -44,7 +45,7 @@ from ssh_abduction.solver.engines.name_program import Fitting, NameProgram
 from ssh_abduction.solver.engines.name_search import Incumbent, NameSearch
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.steps.apart import Continuations
-from ssh_abduction.solver.steps.chart import Chart, Link, numbered
+from ssh_abduction.solver.steps.chart import Chart, Link
 
 # Before clingo has all links, any answer may show that a link is missing. So hold back the maps of
 # a list until it is complete. If it has this many maps, give clingo all links instead, and then

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import clingo
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import sides_lp, visits_lp
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
@@ -18,7 +19,7 @@ from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.framed_sides import FramedSides
 from ssh_abduction.solver.engines.transitive import Pair, PairOf, Three, intransitive
-from ssh_abduction.solver.steps.chart import FramedChart, numbered
+from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.solver.steps.localising import Located, State, faced, located
 from ssh_abduction.theory.pairs import pairs_in
 

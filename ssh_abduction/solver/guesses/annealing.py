@@ -39,9 +39,10 @@ from itertools import cycle
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver.guesses.sampling import Sampler, States
 from ssh_abduction.solver.steps.apart import clique
-from ssh_abduction.solver.steps.chart import FramedChart, numbered
+from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.solver.steps.localising import faced
 
 # The fewest spare names of a kind of place. With four, different places of mazes were merged.

@@ -35,6 +35,7 @@ from itertools import islice
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.action import Action
 from ssh_abduction.data.drives import frames_of
+from ssh_abduction.data.groups import first_index_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
@@ -311,7 +312,7 @@ class Beam:
         if not self._fault:
             return trace
         steps = list(trace.steps)
-        first = {number: t for t, number in reversed([*enumerate(self._sights.seen)])}
+        first = first_index_of(self._sights.seen)
         for t, label in enumerate(found.labels):
             right = self._trace.steps[first[right_view(found.seen[label])]]
             steps[t] = replace(steps[t], view=right.view)

@@ -15,13 +15,13 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.overlaying import Part
 from ssh_abduction.solver.guesses.sights import Sights
-from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence.loops import vectors_turned
 from ssh_abduction.theory.settle import Problem

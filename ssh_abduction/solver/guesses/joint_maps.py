@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.drives import Drive, drives_of
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
@@ -33,7 +34,6 @@ from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import valid_map
 from ssh_abduction.solver.guesses.overlaying import Overlay, Part
 from ssh_abduction.solver.guesses.sights import Sights
-from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence.loops import vectors_turned
 from ssh_abduction.theory.settle import Problem

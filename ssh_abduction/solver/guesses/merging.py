@@ -35,9 +35,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.steps.apart import Matrix
-from ssh_abduction.solver.steps.chart import Chart, Link, numbered
+from ssh_abduction.solver.steps.chart import Chart, Link
 
 # The demands on the merge of a step with a known dstate, from strict to lenient. The first number
 # is by how much its evidence has to exceed that for the next best merge of the step. The second

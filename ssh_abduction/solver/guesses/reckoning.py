@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.drives import frames_of
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
@@ -101,9 +102,7 @@ class HypothesisPoses:
         self._sigma = odometry.scale, odometry.bend
         steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
         self._noise = dict(zip(steps, noises(trace, steps), strict=True))
-        self._closures: dict[int, list[Closure]] = {}
-        for closure in trace.closures:
-            self._closures.setdefault(closure.last, []).append(closure)
+        self._closures = gathered((closure.last, closure) for closure in trace.closures)
         spreads = spreads_of(trace)
         self._is_off = bool(spreads.any())
         turns = np.array([noise[2, 2] for noise in self._noise.values()])

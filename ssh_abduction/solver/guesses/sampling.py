@@ -13,6 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.runtime.clock import look_at_clock
 
 # The weight of each state in the Dirichlet prior, in visits. One visit outweighs the whole prior.
@@ -50,12 +51,9 @@ class _Transitions:
 
         `leaves` has the slot and action at which each visit but the last ends.
         """
-        number: dict[int, int] = {}
         self._slot = np.array([slot for slot, _ in leaves], dtype=int)
-        self._action = np.array(
-            [number.setdefault(action, len(number)) for _, action in leaves], dtype=int
-        )
-        self._actions = max(1, len(number))
+        self._action = np.array(numbered(action for _, action in leaves), dtype=int)
+        self._actions = 1 + int(self._action.max(initial=0))
         self._states = states
         self._back = np.arange(states) ^ 2  # for each state, the one that faces the other way
         self._visits = np.arange(len(leaves))

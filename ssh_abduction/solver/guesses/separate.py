@@ -24,12 +24,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ssh_abduction.data.groups import NodeClasses
+from ssh_abduction.data.groups import NodeClasses, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.completing import completed
-from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
 

@@ -12,10 +12,10 @@ from typing import TypeAlias
 import numpy as np
 
 from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver.guesses.reckoning import Hypothesis
-from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.steps.frames import may_face, members, rotation_bits
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.theory import Theory

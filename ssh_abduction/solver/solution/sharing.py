@@ -26,6 +26,7 @@ from typing import Any, Literal, TypeAlias
 from ssh_abduction.data.checks import a_text, a_whole_number
 from ssh_abduction.data.drives import Drive, DriveStep, named_steps
 from ssh_abduction.data.errors import MapError, brief, is_whole
+from ssh_abduction.data.groups import first_index_of, indices_of, numbered
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.words import counted
 
@@ -157,8 +158,7 @@ class Backbone:
         for each dstate only.
         """
         labels = self.dstates.always
-        firsts = {number: t for t, number in reversed(list(enumerate(labels)))}
-        by_dstate = [firsts[number] for number in sorted(firsts)]
+        by_dstate = [t for _, t in sorted(first_index_of(labels).items())]
         record: dict[str, Any] = {
             sort: shared.to_dict(range(len(labels)) if sort == "dstates" else by_dstate)
             for sort, shared in self.sorts.items()
@@ -245,10 +245,7 @@ class Sharing:
 
     def firsts(self) -> list[int]:
         """List the first step of each class, in the order of the numbers of classes."""
-        first: dict[int, int] = {}
-        for t, number in enumerate(self.classes):
-            first.setdefault(number, t)
-        return list(first.values())
+        return list(first_index_of(self.classes).values())
 
     def sorts(self) -> Iterable[Sort]:
         """Return the sorts that are compared, such as "dstates"; none before the first map."""
@@ -267,17 +264,15 @@ class Sharing:
 
     def _shared(self, kept: Kept) -> Shared:
         """Turn what is kept about classes into what steps share."""
-        number: dict[int, int] = {}
-        always = tuple(number.setdefault(kept.always[c], len(number)) for c in self.classes)
-        first: dict[int, int] = {}
-        for t, n in enumerate(always):
-            first.setdefault(n, t)
+        always = [kept.always[c] for c in self.classes]
+        first = first_index_of(always)
         pairs = {
-            (first[number[kept.always[i]]], first[number[kept.always[j]]])
+            (first[kept.always[i]], first[kept.always[j]])
             for i, j in kept.together
             if kept.always[i] != kept.always[j] or (i == j and i in kept.unnamed)
         }
-        return Shared(always, tuple(sorted({(min(pair), max(pair)) for pair in pairs})))
+        in_order = sorted({(min(pair), max(pair)) for pair in pairs})
+        return Shared(tuple(numbered(always)), tuple(in_order))
 
 
 class Kept:
@@ -301,9 +296,7 @@ class Kept:
 
     def split(self, before: Sequence[int]) -> None:
         """Replace the classes by parts of them. `before` has the old class of each new class."""
-        parts: dict[int, list[int]] = {}
-        for new, old in enumerate(before):
-            parts.setdefault(old, []).append(new)
+        parts = indices_of(before)
         self.always = [self.always[old] for old in before]
         self.together = set(_split(self.together, parts))
         self.unnamed = {part for old in self.unnamed for part in parts[old]}
@@ -320,14 +313,9 @@ class Kept:
             (number, ("none", i) if name is None else name)
             for i, (number, name) in enumerate(zip(self.always, names, strict=True))
         ]
-        numbers = {pair: i for i, pair in enumerate(dict.fromkeys(both))}
-        self.always = list(map(numbers.__getitem__, both))
-        members: dict[Hashable, list[int]] = {}
-        for i, name in enumerate(names):
-            if name is None:
-                self.unnamed.add(i)
-            else:
-                members.setdefault(name, []).append(i)
+        self.always = numbered(both)
+        members = indices_of(names)
+        self.unnamed.update(members.pop(None, ()))
         for some in members.values():
             self.together.update((i, i) for i in some)
             self.together.update(combinations(some, 2))

@@ -32,6 +32,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.theory.pairs import Earlier
 
 # If the same actions lead from two steps to an excluded pair, these two are excluded, too. This is
@@ -70,10 +71,8 @@ class Continuations:
         self._seen = seen
         self._excluded = _spread(excluded, done) if excluded and steps <= COMPARED else None
         # For each step the steps that evidence excludes, if the trace is too long for a matrix.
-        self._partners: dict[int, list[int]] = {}
-        for i, j in excluded if self._excluded is None else ():
-            self._partners.setdefault(i, []).append(j)
-            self._partners.setdefault(j, []).append(i)
+        far = excluded if self._excluded is None else ()
+        self._partners = gathered(pair for i, j in far for pair in ((i, j), (j, i)))
         # Rank the steps by the first 1, 2, 4, … views and actions of their continuations.
         ranks = [_ranked(shown * (done.max() + 1) + done)]
         while ranks[-1].max() < steps - 1:

@@ -20,7 +20,8 @@ from itertools import combinations
 from typing import Any
 
 from ssh_abduction.data.errors import SolverError
-from ssh_abduction.data.trace import Trace, View, checked_trace
+from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.solver.steps.noise import Noise, noise_in
 
@@ -97,9 +98,7 @@ class Certificate:
 
     def _pairs_alike(self, trace: Trace) -> Iterator[tuple[int, int]]:
         """Yield only the pairs of steps of the clique that show the same view, in order."""
-        alike: dict[View | None, list[int]] = {}
-        for step in self.clique:
-            alike.setdefault(trace.steps[step].view, []).append(step)
+        alike = gathered((trace.steps[step].view, step) for step in self.clique)
         for i in self.clique:
             same = alike[trace.steps[i].view]
             yield from ((i, j) for j in same[bisect_right(same, i) :])

@@ -20,7 +20,7 @@ they are different dstates, as in `steps/apart.py`.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -320,12 +320,6 @@ class FramedChart(Chart):
 def _pairs_within(earlier: Earlier, size: int) -> list[tuple[int, int]]:
     """List the pairs of steps that are both among the first `size`, the earlier step first."""
     return [(i, t) for t, others in earlier.items() if t < size for i in others]
-
-
-def numbered(labels: Iterable[Hashable]) -> list[int]:
-    """Renumber labels from 0 in the order in which they first occur."""
-    number: dict[Hashable, int] = {}
-    return [number.setdefault(label, len(number)) for label in labels]
 
 
 def _views_around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int] | None:

@@ -19,6 +19,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.solver.steps.chart import FramedChart
 
 # After finding this many stretches of missed visits, let clingo solve again with them. Its next map
@@ -154,10 +155,7 @@ def _fitting(chart: FramedChart, states: Mapping[int, State]) -> NDArray[np.bool
     of known state has only this state.
     """
     fits = np.empty((len(chart.stars), 4 * (max(states.values()) // 4 + 1)), dtype=bool)
-    at: dict[int, list[int]] = {}
-    for visit, state in states.items():
-        at.setdefault(state // 4, []).append(visit)
-    for place, visits in at.items():
+    for place, visits in gathered((state // 4, visit) for visit, state in states.items()).items():
         turned = np.array([states[visit] % 4 for visit in visits])
         for slot in range(4):
             fits[:, 4 * place + slot] = ~chart.misfits[(slot - turned) % 4, :, visits].any(axis=0)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.theory.evidence import Evidence, pairs_of
 from ssh_abduction.theory.pairs import Pairs
@@ -83,10 +84,8 @@ class Log:
     ) -> None:
         """Number the actions and observations. Without `pairs`, find these when first used."""
         self._pairs, self._find = pairs, partial(pairs_of, trace, theory, evidence)
-        actions: dict[str, int] = {}
-        seen: dict[object, int] = {}
-        self.actions = [actions.setdefault(a.name, len(actions)) for a in trace.actions]
-        self.seen = [seen.setdefault(observation(step, theory), len(seen)) for step in trace.steps]
+        self.actions = numbered(action.name for action in trace.actions)
+        self.seen = numbered(observation(step, theory) for step in trace.steps)
 
     @property
     def pairs(self) -> Pairs:

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from clingo import Model
 
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import FAULTS, DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.solver.asp.facts.atoms import read_atom
 from ssh_abduction.solver.steps import frames
-from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.solver.steps.faults import faults_of, links_of, with_changes
 from ssh_abduction.theory.theory import Theory
 

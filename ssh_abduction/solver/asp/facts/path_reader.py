@@ -13,10 +13,12 @@ from dataclasses import dataclass
 from itertools import permutations
 from typing import TypeAlias
 
-from clingo import Control, Function, Model
+from clingo import Function, Model
 
+from ssh_abduction.data.groups import first_index_of, gathered, numbered
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts.answer_maps import places_in_order
 from ssh_abduction.solver.asp.facts.atoms import number_symbols, read_atom
 from ssh_abduction.solver.steps.chart import Chart
@@ -49,27 +51,26 @@ class PathReader:
     It asks clingo whether single atoms are in an answer, beginning with the atoms of the last
     answer. That takes a third of the time of reading all atoms. Values that follow from the labels
     are computed once.
+
+    Attributes:
+        control: The control whose answers are the places and paths.
     """
 
     def __init__(
         self, control: Control, trace: Trace, theory: Theory, chart: Chart, labels: Sequence[int]
     ) -> None:
+        self.control = control
         stands, runs = (
             {a: (b, c) for a, b, c in _literals(control, name)} for name in ("stands", "runs")
         )
-        first: dict[int, int] = {}  # for each label, the first step at its dstate
-        for t, node in enumerate(chart.node_of):
-            first.setdefault(labels[node], t)
-        number = {label: i for i, label in enumerate(first)}
-        self._labels = tuple(number[labels[node]] for node in chart.node_of)
+        where = [labels[node] for node in chart.node_of]
+        first = first_index_of(where)  # for each label, the first step at its dstate
+        self._labels = tuple(numbered(where))
         self._links = links_of(self._labels, trace)
         self._dstates = [(view_at(trace, t), *stands[label]) for label, t in first.items()]
         # For each segment, the dstates on it, and whether they face its direction (1) or not (-1).
-        self._runs: dict[int, list[tuple[int, int]]] = {}
-        for i, label in enumerate(first):
-            if label in runs:
-                segment, direction = runs[label]
-                self._runs.setdefault(segment, []).append((i, direction))
+        on_paths = [(i, *runs[label]) for i, label in enumerate(first) if label in runs]
+        self._runs = gathered((segment, (i, direction)) for i, segment, direction in on_paths)
         self._passes = {
             (segment, self._dstates[i][1]): None
             for segment, members in self._runs.items()
@@ -172,9 +173,8 @@ class _Choices:
 
     def __init__(self, control: Control, name: str) -> None:
         # For each first argument, the literals of its atoms, and their other arguments.
-        self._among: dict[int, list[tuple[int, tuple[int, int]]]] = {}
-        for (a, b, c), literal in _literals(control, name).items():
-            self._among.setdefault(a, []).append((literal, (b, c)))
+        literals = _literals(control, name).items()
+        self._among = gathered((a, (literal, (b, c))) for (a, b, c), literal in literals)
 
     def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
         """Return a dict from the first argument to the other two that an answer chooses for it."""

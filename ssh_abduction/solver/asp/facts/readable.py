@@ -133,22 +133,10 @@ def _gateway_facts(trace: Trace, start: int, stop: int, *, changes: bool) -> Ite
         for star in dict.fromkeys(found.stars[start:])
         for x in found.looks[star]
     )
-    yield from (
-        f"slots({x},{max(frame.slots, 1)})." for x, frame in enumerate(found.frames) if x >= known
-    )
-    yield from (
-        f"closed({x},{slot})."
-        for x, frame in enumerate(found.frames)
-        if x >= known
-        for slot in range(frame.slots)
-        if frame.is_closed(slot)
-    )
-    yield from (
-        f"ends({x},{way})."
-        for x, frame in enumerate(found.frames)
-        if x >= known
-        for way in frames.ends(frame)
-    )
+    for x, frame in enumerate(found.frames[known:], known):
+        yield f"slots({x},{max(frame.slots, 1)})."
+        yield from (f"closed({x},{k})." for k in range(frame.slots) if frame.is_closed(k))
+        yield from (f"ends({x},{way})." for way in frames.ends(frame))
     for x, y in product(range(len(found.frames)), repeat=2):
         for shift in found.fits(x, y) if max(x, y) >= known else ():
             yield f"fits({x},{y},{shift})."
