@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
-from ssh_abduction.data.errors import brief, is_finite
+from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.odometry import Displacement, Pose, displacement_between
 
 # Largest errors of odometry, as a share and in radians per metre. With larger ones, the robot does
@@ -45,17 +45,10 @@ class Body:
 
     def __post_init__(self) -> None:
         for name, least in (("odometry", 0.0), ("scale", -WORST), ("bend", -WORST)):
-            value = getattr(self, name)
-            if not is_finite(value) or not least <= value <= WORST:
-                unit = (
-                    f" radians per metre, which are {math.degrees(WORST):.1f} degrees"
-                    if name == "bend"
-                    else ""
-                )
-                raise SimulatorError(
-                    f"body.{name}: expected a number from {least} to {WORST}{unit}, got "
-                    f"{brief(value)}; choose a smaller error (--{OPTIONS[name]})"
-                )
+            mend = f"choose a smaller error (--{OPTIONS[name]})"
+            if name == "bend":
+                mend += f"; {WORST} radians per metre are {math.degrees(WORST):.1f} degrees"
+            a_number(f"body.{name}", getattr(self, name), SimulatorError, least, WORST, mend=mend)
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def test_memory_does_not_grow_with_the_drive() -> None:
 
 @pytest.mark.parametrize("width", [0, -1, math.nan, math.inf, "0.5"])
 def test_a_width_is_a_positive_number(width: object) -> None:
-    with pytest.raises(LogError, match="width: expected a positive number"):
+    with pytest.raises(LogError, match="width: expected metres above 0"):
         stream_visits([], width)  # type: ignore[arg-type]
 
 

@@ -26,7 +26,8 @@ from perception.places.units import LEAST_WAY, Units, units_of
 from perception.places.visits import Visit
 from perception.readers.scans import Damage, RobotLog, Scan
 from perception.readers.stored import ScanTable, without_ranges
-from ssh_abduction.data.errors import brief, is_finite, named
+from ssh_abduction.data.checks import a_function, a_number
+from ssh_abduction.data.errors import brief, named
 
 # The number of first scans over which the track is compared with the odometry.
 COMPARED = 400
@@ -64,20 +65,13 @@ class LiveLog:
         source: str = "",
     ) -> None:
         """Start before the first scan."""
-        if not (is_finite(width) and width > 0):
-            raise LogError(
-                f"width: expected a positive number of metres, got {brief(width)}"
-                "; give the width of the robot"
-            )
+        mend = "give the width of the robot"
+        a_number("width", width, LogError, above=0, what="metres", mend=mend)
         if not isinstance(items, Iterable) or isinstance(items, str | bytes):
             raise LogError(
                 f"scans: expected scans, got {brief(items)}; pass the scans of stream_log"
             )
-        if not callable(tell):
-            raise LogError(
-                f"tell: expected a function that takes a text, got {brief(tell)}"
-                "; give one, such as print"
-            )
+        a_function("tell", tell, LogError, what="a function that takes a text")
         self._items, self._width, self._source = items, width, source
         self._tell = Teller(tell)
         self._damaged: list[Damage] = []

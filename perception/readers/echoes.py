@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from perception.errors import LogError
 from perception.readers.scans import Scan, shared
 from perception.readers.stored import ScanTable, in_memory, in_turn
+from ssh_abduction.data.checks import a_number, numbers, one_of
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Pose, displacement_between
 
@@ -87,27 +88,15 @@ class LaserOptions:
                 "name the angle that the beams cover"
             )
         if self.mount is not None:
-            # A pose may be any sequence of three numbers.
-            values = tuple(self.mount) if isinstance(self.mount, Sequence | np.ndarray) else ()
-            if (
-                len(values) != 3
-                or not all(map(is_finite, values))
-                or max(map(abs, values[:2])) > FARTHEST_MOUNT
-            ):
-                raise LogError(
-                    "mount: expected metres ahead, metres to the left, and degrees, got "
-                    f"{brief(self.mount)}; name these three"
-                )
-        if self.no_return is not None and not (is_finite(self.no_return) and self.no_return > 0):
-            raise LogError(
-                f"no_return: expected metres above 0, got {brief(self.no_return)}; name the "
-                "range that means nothing came back"
-            )
-        if self.zero_is is not None and self.zero_is not in MEANINGS:
-            raise LogError(
-                f"zero_is: expected {' or '.join(MEANINGS)}, got {brief(self.zero_is)}; name "
-                "one of these"
-            )
+            what, mend = "metres ahead, metres to the left, and degrees", "name these three"
+            for number in numbers("mount", self.mount, LogError, 3, what, mend)[:2]:
+                least, most = -FARTHEST_MOUNT, FARTHEST_MOUNT
+                a_number("mount", number, LogError, least, most, what="metres", mend=mend)
+        if self.no_return is not None:
+            mend = "name the range that means nothing came back"
+            a_number("no_return", self.no_return, LogError, above=0, what="metres", mend=mend)
+        if self.zero_is is not None:
+            one_of("zero_is", self.zero_is, MEANINGS, LogError, mend="name one of these")
 
     def placed(self, scan: Scan) -> Scan:
         """Copy a scan, with the field of view and mount of the laser that the user gives."""
