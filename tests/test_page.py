@@ -246,8 +246,9 @@ def test_flags_shown_on_the_page_reproduce_the_theory() -> None:
             symmetric_sides=False,
         ),
         Theory.topological().replace(
-            without=("side_of_branch",), prefer=("dstates", "places"), joint=1, reject=0.01
+            without=("side_of_branch",), prefer=("dstates", "places"), joint=1, reject=0.00123456789
         ),
+        Theory(prices=(9, 8, 0.25), jumped=3),
     ):
         assert theory_of(parser.parse_args(flags_of(theory))) == theory
 

@@ -486,11 +486,9 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
             flag = f"--{field.name.replace('_', '-')}"
             flags += [part for i, j in value for part in (flag, f"{i},{j}")]
         else:
-            text = ",".join(value) if isinstance(value, tuple) else str(value)
-            if isinstance(value, bool):
-                text = text.lower()
-            elif isinstance(value, float):
-                text = f"{value:g}"
+            values = value if isinstance(value, tuple) else (value,)
+            text = ",".join(str(part).removesuffix(".0") for part in values)
+            text = text.lower() if isinstance(value, bool) else text
             flags += ["--set", f"{field.name}={text}"]
     return flags
 
