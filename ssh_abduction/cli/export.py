@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from ssh_abduction.cli.options import add_map, add_maps, output, trace_path
 from ssh_abduction.cli.outcome import warn
@@ -65,23 +66,13 @@ def run(options: argparse.Namespace) -> int:
 
     listing = Listing.load(options.maps)
     chosen = listing.maps[listing.number(options.map)]
-    turns = None if options.trace is None else Trace.load(options.trace)
+    how: dict[str, Any] = {"level": options.level, "hide_undecided": options.hide_undecided}
+    how["turns"] = None if options.trace is None else Trace.load(options.trace)
     with said_of(listing.source, MapError):
-        text = export_map(
-            chosen,
-            options.to,
-            level=options.level,
-            name=options.name,
-            frame=options.frame,
-            turns=turns,
-            hide_undecided=options.hide_undecided,
-        )
+        text = export_map(chosen, options.to, name=options.name, frame=options.frame, **how)
     if options.output == "-":
         print(text.removesuffix("\n"))
     else:
         write_map(options.output, text.removesuffix("\n"))
-    for doubt in export_doubts(
-        chosen, options.to, level=options.level, turns=turns, hide_undecided=options.hide_undecided
-    ):
-        warn([doubt])
+    warn(export_doubts(chosen, options.to, **how))
     return 0

@@ -18,6 +18,8 @@ _KINDS = ("travel", "turn", "lift", "stairs", "start")
 _TURNS = ("right", "left", "around")
 _FIELDS = ("name", "kind", "turn", "gateway", "bearing")
 _QUARTERS = (None, "right", "around", "left")
+# Degrees clockwise of the turns that have standard names.
+TURN_DEGREES = {"right": 90.0, "around": 180.0, "left": 270.0}
 
 
 @dataclass(frozen=True, slots=True)

@@ -171,9 +171,8 @@ def ladder(
         mend = "give what solve returned for this trace, or leave it out"
         an_instance("known", known, Solution, MapError, mend=mend)
     if under_way is not None:
-        an_instance(
-            "under_way", under_way, UnderWay, SolverError, mend="give an UnderWay, or leave it out"
-        )
+        mend = "give an UnderWay, or leave it out"
+        an_instance("under_way", under_way, UnderWay, SolverError, mend=mend)
     work = under_way or UnderWay()
 
     def climbed() -> Iterator[Rung]:

@@ -198,13 +198,8 @@ def evaluate_visits(
         a_number(name, value, TraceError, above=0, mend=mend)
     maps = checked_maps(maps)
     if relations is not None:
-        an_instance(
-            "relations",
-            relations,
-            Relations,
-            TraceError,
-            mend="make them with Relations.load, or leave them out",
-        )
+        mend = "make them with Relations.load, or leave them out"
+        an_instance("relations", relations, Relations, TraceError, mend=mend)
     truth: _PoseTruth | _Related = (
         _PoseTruth(trace) if relations is None else _Related(trace, relations)
     )

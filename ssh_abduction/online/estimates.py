@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ssh_abduction.data.action import STANDARD_ACTIONS
+from ssh_abduction.data.action import STANDARD_ACTIONS, TURN_DEGREES
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import SPREAD
@@ -29,8 +29,6 @@ from ssh_abduction.online.belief import Observation
 # A move of the robot: the name of an action, or a turn by whole degrees clockwise.
 Move: TypeAlias = str | int
 
-# Degrees of the turns that have standard names.
-STANDARD_TURNS = {"right": 90, "around": 180, "left": 270}
 # A turn leads to dstates that face within FACING standard deviations of the direction after it.
 FACING = 3.0
 
@@ -74,7 +72,7 @@ class Moves:
             return action.name
         if turned is not None:
             return round(-math.degrees(turned)) % 360
-        angle = STANDARD_TURNS.get(action.name) if action.bearing is None else action.bearing
+        angle = TURN_DEGREES.get(action.name) if action.bearing is None else action.bearing
         return action.name if angle is None else round(angle) % 360
 
     def links(self, move: Move) -> Links | None:

@@ -48,7 +48,7 @@ from ssh_abduction.data.checks import a_function, a_whole_number
 from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.evaluation import evaluate
 from ssh_abduction.online.mapper import OnlineMapper
 from ssh_abduction.online.return_doubts import ReturnDoubts
@@ -140,9 +140,8 @@ class Exploration:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""
-        record = {name: getattr(self, name) for name in ("steps", "ending", "is_unique", "is_true")}
-        record["rival"] = self.rival.to_dict() if self.rival else None
-        return {**record, "summary": self.sentence, "solution": self.solution.to_dict()}
+        record = attributes_of(self, "steps", "ending", "is_unique", "is_true", "rival")
+        return record | {"summary": self.sentence, "solution": self.solution.to_dict()}
 
 
 class Explorer:
@@ -194,12 +193,8 @@ class Explorer:
         a_whole_number("margin", margin, TraceError, what=what, mend=mend)
         check_limit("time_limit", "seconds", time_limit)
         for name in ("look", "can", "do"):
-            a_function(
-                f"robot.{name}",
-                getattr(robot, name, None),
-                TraceError,
-                what="a method of the robot",
-            )
+            method = getattr(robot, name, None)
+            a_function(f"robot.{name}", method, TraceError, what="a method of the robot")
         if theory is not None and checked_theory(theory).has_faults:
             raise TheoryError(
                 "theory: expected a theory without faults, got misread or slipped; leave them "

@@ -17,6 +17,7 @@ import networkx as nx
 import numpy as np
 from scipy.sparse import coo_array
 
+from ssh_abduction.data.action import TURN_DEGREES
 from ssh_abduction.data.checks import an_object
 from ssh_abduction.data.errors import MapError, brief, is_finite
 from ssh_abduction.data.groups import gathered
@@ -36,8 +37,6 @@ LEAST_MISSED = 0.02  # radians: turns with a smaller error all get the same weig
 EXACT = 1e-6  # radians: a turn with a smaller error agrees with the headings
 Turns: TypeAlias = Mapping[str, "str | float"]
 
-# Degrees clockwise that are assumed for turns to a known side.
-SIDES = {"right": 90.0, "around": 180.0, "left": 270.0}
 # The weights of a turn by known degrees, and of a turn to a known side.
 SURE, GUESSED = 1.0, 0.2
 
@@ -183,7 +182,7 @@ def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
     Raises:
         MapError: A value of `turns` is none of these.
     """
-    known: dict[str, str | float] = {name: name for name in SIDES}
+    known: dict[str, str | float] = {name: name for name in TURN_DEGREES}
     if isinstance(turns, Trace):
         known |= {
             action.name: (action.turn or "") if action.bearing is None else action.bearing
@@ -194,8 +193,8 @@ def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
         known |= an_object("turns", turns, MapError)
     degrees = {}
     for name, turn in known.items():
-        if isinstance(turn, str) and turn in SIDES:
-            degrees[name] = (SIDES[turn], GUESSED)
+        if isinstance(turn, str) and turn in TURN_DEGREES:
+            degrees[name] = (TURN_DEGREES[turn], GUESSED)
         elif is_finite(turn):
             degrees[name] = (float(turn), SURE)
         else:

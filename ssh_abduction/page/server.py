@@ -118,25 +118,13 @@ class PageServer(ThreadingHTTPServer):
         known = self._listing.maps
         with self._turn(watch):
             if pair is not None:
-                why = in_process(
-                    answers.pair_explained,
-                    self._trace,
-                    *pair,
-                    theory,
-                    known,
-                    self._limit,
-                    watch=watch,
-                )
+                asked = self._trace, *pair, theory, known, self._limit
+                why = in_process(answers.pair_explained, *asked, watch=watch)
                 text = "\n".join([*self._in_map(pair, theory), str(why)])
                 return {"text": text, "assuming": why.assuming}
+            limits = self._maps, self._limit
             found = in_process(
-                answers.solved_with,
-                self._trace,
-                theory,
-                known,
-                self._maps,
-                self._limit,
-                watch=watch,
+                answers.solved_with, self._trace, theory, known, *limits, watch=watch
             )
         if not found.maps:
             return {"text": found.headline}

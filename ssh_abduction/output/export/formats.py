@@ -24,7 +24,7 @@ from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.dot import to_dot
-from ssh_abduction.output.export.roads import Road, Roads, Stop
+from ssh_abduction.output.export.roads import DIGITS, Road, Roads, Stop
 from ssh_abduction.output.export.tmap2 import tmap2
 from ssh_abduction.output.graphs import in_text, to_graphml, to_networkx
 from ssh_abduction.output.headings import Turns, degrees_of
@@ -34,7 +34,6 @@ from ssh_abduction.output.undecided import undecided_places
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
 FOR_NAVIGATION = ("nav2", "tmap2")  # these need positions
 LEVELS = ("places", "dstates")
-DIGITS = 4  # of coordinates, in metres
 
 
 def export_map(

@@ -19,6 +19,7 @@ from ssh_abduction.output.layout import Layout, layout, travelled
 # Costs in metres: the least cost of a road, and the cost of a turn on the spot. A robot that drives
 # 0.5 m/s turns by 90 degrees in about a second.
 LEAST, TURN = 0.01, 0.5
+DIGITS = 4  # of coordinates in files, in metres
 # The action of a road, the path that the road is along, and the direction along this path.
 Way: TypeAlias = tuple[str | None, int | None, int | None]
 

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ssh_abduction.output.export.roads import Road, Roads, Stop
+from ssh_abduction.output.export.roads import DIGITS, Road, Roads, Stop
 
 ACTION = "NavigateToPose"
-DIGITS = 4  # of coordinates, in metres
 # Tolerances of goals in metres and radians, from the program's own examples. The robot has to reach
 # the heading of a dstate; at a place, any heading will do.
 NEAR, FACING = 0.3, {"dstates": 0.1, "places": 6.28}
