@@ -192,7 +192,7 @@ def test_solve_obeys_recorded_corrections(folder: Path, capsys: pytest.CaptureFi
     assert "obeying 2 corrections of" in capsys.readouterr().err
     assert main(solving(folder, "monday")) == 0
     assert "obeying 1 correction of" in (told := capsys.readouterr()).err
-    assert "1 more are about other drives" in told.err
+    assert "1 more is about other drives" in told.err
     elsewhere = ["solve", *solving(folder)[1:4], "--corrections", building, "--json"]
     assert main(elsewhere) == 0
     assert json.loads(capsys.readouterr().out)["theory"]["different"] == [[1, 4]]

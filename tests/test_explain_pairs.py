@@ -487,3 +487,15 @@ def test_prices_of_faults_are_no_misfit() -> None:
     )
     equal = replace(explanation, different=replace(two, nats=113.0 - 1e-9))
     assert equal.sentences[1].endswith(" and 0.0 nats of misfit")
+
+
+def test_explanation_says_what_the_user_said() -> None:
+    trace = Trace.from_steps("abab", ["travel"] * 3)
+    for field, said in (
+        ("different", "the user says that steps 0 and 2 are different dstates"),
+        ("elsewhere", "the user says that steps 0 and 2 are at different places"),
+    ):
+        explanation = explain_pair(trace, 0, 2, Theory().replace(**{field: [(0, 2)]}))
+        assert f"in short: {said}" in str(explanation)
+    known = str(explain_pair(trace, 0, 1))
+    assert "a dstate has one view, and step 0 sees 'a', step 1 sees 'b'" in known

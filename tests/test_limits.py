@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import os
 import re
 import signal
@@ -495,3 +496,14 @@ main(sys.argv[1:])
     solution = Solution.load(maps)
     assert (solution.stopped, len(solution)) == ("time limit", 1)
     assert json.loads(done.stdout)["cost"] == solution.to_dict()["cost"]
+
+
+def test_first_map_has_poses_after_a_limit_on_a_busy_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ssh_abduction.solver.search.overtime", lambda _: 0.0)
+    moves = [(2.0, 0.0, 0.0), (0.0, 0.0, math.pi), (2.0, 0.0, 0.0)]
+    trace = Trace.from_steps("abcd", ["travel", "around", "travel"], displacements=moves)
+    solution = solve(trace, time_limit=1e-9)
+    assert solution.stopped == "time limit"
+    assert solution[0].fit is not None

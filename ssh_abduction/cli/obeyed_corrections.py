@@ -56,7 +56,8 @@ def say_obeyed(said: Corrections, trace: Trace) -> None:
     here, all_of_them = (
         sum(1 for _ in sentences_of(some)) for some in (said.known_in(drives_of(trace)), said)
     )
-    aside = f"; {all_of_them - here} more are about other drives" * (here < all_of_them)
+    more = all_of_them - here
+    aside = f"; {more} more {'is' if more == 1 else 'are'} about other drives" if more else ""
     text = f"obeying {counted(here, 'corrections')} of {named(said.source)}{aside}"
     print(printable(text), file=sys.stderr)
 
@@ -138,8 +139,8 @@ class Obeying:
         return explain(trace[stretch.start : stretch.stop], part) is not None
 
     def _seen(self, said: Said | Passage) -> str:
-        """Say what the robot saw at the steps of a pair; empty for a gateway."""
-        if isinstance(said, Passage):
+        """Say what the robot saw at two steps that are said to be one dstate; else nothing."""
+        if isinstance(said, Passage) or said.kind != "same":
             return ""
         drives = drives_of(self.trace)
         views = [self.trace.steps[step_of(drives, step)].view for step in said.steps]

@@ -36,6 +36,13 @@ _WORDS = {
     "left": "step {0} {is} at a place to the left of {path1}",
     "turned": "steps {0} and {1} {are} at one place, and step {1} {faces} {turn} step {0}",
 }
+# What the user says of two steps, by the field of the theory.
+_SAID = {
+    "same": "are one dstate",
+    "different": "are different dstates",
+    "elsewhere": "are at different places",
+    "same_place": "are at one place",
+}
 # How a step faces relative to another step, if it is turned 0, 1, 2 or 3 quarters clockwise.
 _TURNED = (
     "the same way as",
@@ -127,6 +134,10 @@ class Words:
         """
         steps, sentence = self._piece.steps, self._sentences.get(axiom, axiom).rstrip(".")
         sentence = sentence[:1].lower() + sentence[1:]
+        if axiom == "functional_view" and None not in self._piece.trace.views:
+            sentence = sentence.partition(".")[0]  # the rest is about unknown views
+        if axiom == "asserted":
+            sentence = "; ".join(self._asserted(t, tuple(sorted(pair)))) or sentence
         if short:
             return sentence
         if axiom in OF_ACTIONS and t and (action := self._piece.trace.steps[t - 1].action):
@@ -158,6 +169,20 @@ class Words:
         ):
             return f"{sentence}; {apart}"
         return sentence
+
+    def _asserted(self, t: int, pair: tuple[int, ...]) -> list[str]:
+        """List what the user says of a pair of steps or, if nothing, of step t and earlier ones."""
+        said = [
+            (tuple(sorted(steps)), words)
+            for kind, words in _SAID.items()
+            for steps in getattr(self._piece.theory, kind)
+            if t == max(steps)
+        ]
+        said = [one for one in said if one[0] == pair] or said
+        names = self._piece.steps
+        return [
+            f"the user says that steps {names[i]} and {names[j]} {words}" for (i, j), words in said
+        ]
 
 
 def that_path(sentence: str) -> str:

@@ -61,7 +61,7 @@ SHORTEST = 0.05
 # Without a time limit, the proof of what all minimal maps share may take this many seconds, or as
 # long as the search took if that is more.
 REASONING = 5.0
-# After a limit, the cost of the best map may take at least this many seconds.
+# After a limit, the poses and the cost of the best map may each take at least this many seconds.
 LEAST_WEIGHING = 0.2
 if TYPE_CHECKING:
     from ssh_abduction.solver.costs.weighing import Weighing
@@ -257,7 +257,7 @@ class Search:
 
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
         """Yield the maps. `ranking` sorts maps of one cost; None keeps their order."""
-        drives, late = drives_of(self.trace), partial(overtime, self._parts)
+        drives, late = drives_of(self.trace), partial(_late, self._parts)
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
             for ssh_map in ranking.ranked(maps, self.over, late) if ranking else maps:
@@ -309,7 +309,7 @@ class Search:
         if self._weighing is not None:
             # If this takes too long after a limit, the map has no cost in nats.
             ended = known.stopped in ("time limit", "interrupted")
-            seconds = max(overtime(parts), LEAST_WEIGHING) if ended else math.inf
+            seconds = _late(parts) if ended else math.inf
             with suppress(LimitError), heeding(Watch().part(seconds).check):
                 self._weighing.keep_best()
         yield from best_map(parts)
@@ -462,3 +462,8 @@ def _with_names(ssh_map: SSHMap, trace: Trace, drives: Sequence[Drive]) -> SSHMa
     """Return a map with its floors, the starts of drives, and faults that name their drives."""
     complete = with_named_faults(with_floors(ssh_map, trace), drives)
     return replace(complete, starts=tuple(drive.first for drive in drives[1:]))
+
+
+def _late(parts: Parts) -> float:
+    """Return the seconds left to fit and weigh a map after a limit, on a busy machine too."""
+    return max(overtime(parts), LEAST_WEIGHING)
