@@ -21,7 +21,8 @@ from ssh_abduction.data import Action, Closure, Odometry, Step, together
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.star import Gateway, Star
 from ssh_abduction.solver.costs import beams
-from ssh_abduction.solver.costs.estimating import doubt_of, may_join_more, rival_of
+from ssh_abduction.solver.costs.doubts import doubt_of
+from ssh_abduction.solver.costs.estimating import may_join_more, rival_of
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.weighing import Weighing
 from ssh_abduction.solver.guesses.joint_maps import Joining

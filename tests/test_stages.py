@@ -117,6 +117,18 @@ def test_stage_limit_raises_once() -> None:
     watch.check()
 
 
+def test_stage_around_another_one_keeps_its_end() -> None:
+    watch = started(60)
+    with watch.stage(50):
+        with pytest.raises(StageTimeError), watch.stage(-1):
+            watch.check()
+        watch.check()
+        assert watch.stage_ends == 50
+        with watch.stage(70):
+            assert watch.stage_ends == 50
+    assert watch.stage_ends == float("inf")
+
+
 def test_shorten_never_extends_a_limit() -> None:
     watch = started(60)
     watch.shorten(70)

@@ -92,31 +92,8 @@ class Axioms:
         self._seen: list[_ArgumentModel] = []
         self._last_core: tuple[int, ...] = ()  # clingo's literals of the last unsat core
         self._control = Control(["--heuristic=Domain"] if relaxed else [])
-        names = [name for name in facts.encoding_names(theory) if name != "preference"]
-        for name in [*names, "explain", "derivation"] if relaxed else names:
-            self._control.load(encodings.path(name))
+        self._ground(piece, relaxed=relaxed)
         last = len(trace) - 1
-        self._control.add(
-            "base",
-            [],
-            facts.theory_facts(
-                theory, len(trace) if relaxed else facts.most_paths(trace, theory, len(trace))
-            )
-            + facts.trace_facts(piece.problem, 0, len(trace)),
-        )
-        self._control.add("base", [], facts.own_rules(theory))
-        self._control.add("base", [], piece.facts)
-        parts = [
-            ("base", list[clingo.Symbol]()),
-            *(("step", facts.number_symbols(t)) for t in range(len(trace))),
-            ("check", facts.number_symbols(last)),
-        ]
-        for start in range(0, len(parts), AT_A_TIME):
-            if stop():
-                raise Interrupted
-            self._control.ground(parts[start : start + AT_A_TIME])
-        self._control.assign_external(facts.query(last), True)
-        self._control.assign_external(facts.run_by_steps(), True)
         # Planarity is checked once, at the last step, and only if each dstate is at one place:
         # otherwise there is nothing to draw.
         pairs = (
@@ -131,8 +108,31 @@ class Axioms:
             symbol for symbol, (axiom, _) in self._pairs.items() if axiom == "one_place"
         ]
         if self._drawn:
-            self._control.add("placed", [], facts.rests_on(Planar.axiom, last, "one_place"))
-            self._control.ground([("placed", [])])
+            self._control.tell(facts.rests_on(Planar.axiom, last, "one_place"))
+
+    def _ground(self, piece: Piece, *, relaxed: bool) -> None:
+        """Ground the axioms for all steps. Raises Interrupted if `stop` returns True."""
+        trace, theory = piece.trace, piece.theory
+        names = [name for name in facts.encoding_names(theory) if name != "preference"]
+        for name in [*names, "explain", "derivation"] if relaxed else names:
+            self._control.load(encodings.path(name))
+        last = len(trace) - 1
+        paths = len(trace) if relaxed else facts.most_paths(trace, theory, len(trace))
+        self._control.add("base", [], facts.theory_facts(theory, paths))
+        self._control.add("base", [], facts.trace_facts(piece.problem, 0, len(trace)))
+        self._control.add("base", [], facts.own_rules(theory))
+        self._control.add("base", [], piece.facts)
+        parts = [
+            ("base", list[clingo.Symbol]()),
+            *(("step", facts.number_symbols(t)) for t in range(len(trace))),
+            ("check", facts.number_symbols(last)),
+        ]
+        for start in range(0, len(parts), AT_A_TIME):
+            if self._stop():
+                raise Interrupted
+            self._control.ground(parts[start : start + AT_A_TIME])
+        self._control.assign_external(facts.query(last), True)
+        self._control.assign_external(facts.run_by_steps(), True)
 
     @property
     def instances(self) -> tuple[clingo.Symbol, ...]:
@@ -169,11 +169,10 @@ class Axioms:
 
         The file encodings/derivation.lp defines the possible conclusions.
         """
-        self._control.add("told_of", [], facts.told_of(steps))
-        self._control.ground([("told_of", []), ("conclusions", [])])
+        self._control.tell(facts.told_of(steps))
+        self._control.ground([("conclusions", [])])
         self._conclusions = facts.conclusions_of(self._control)
-        self._control.add("may_fail", [], facts.may_fail(self._conclusions))
-        self._control.ground([("may_fail", [])])
+        self._control.tell(facts.may_fail(self._conclusions))
 
     def consequences(
         self,
@@ -335,10 +334,8 @@ class Axioms:
 
     def _forbid(self, refusal: Refusal, where: clingo.Symbol | None = None) -> None:
         """Add a constraint: while the atom `where` is true, these equalities do not all hold."""
-        name = f"told_{self._refusals}"
         self._refusals += 1
-        self._control.add(name, [], facts.forbidden_equalities(refusal, where))
-        self._control.ground([(name, [])])
+        self._control.tell(facts.forbidden_equalities(refusal, where))
 
     def sentences(self, clash: Sequence[tuple[str, int]]) -> tuple[str, ...]:
         """Describe the returns that displacements reject in a clash.

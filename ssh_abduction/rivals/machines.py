@@ -102,29 +102,19 @@ class Observations:
     """
 
     def __init__(self, maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> None:
-        self._numbers: dict[object, int] = {}
-        self.seen: list[Seen] = []
         reading = _reading(maps, trace, theory)
-        self.of: list[list[int]] = []
+        found: dict[object, Seen] = {}
+        keys: list[list[object]] = []
         for ssh_map in maps:
-            stars = _first_steps(ssh_map) if reading is not None else {}
-            self.of.append(
-                [self._number(s.view, stars.get(s.id), reading) for s in ssh_map.dstates]
-            )
-
-    def _number(self, view: View | None, step: int | None, reading: _StarReader | None) -> int:
-        """Return the number of an observation, from a view and the step that shows the star."""
-        if step is None or reading is None:
-            return self._add((view, None), Seen(view))
-        key, star = reading(step)
-        return self._add((view, key), Seen(view, star))
-
-    def _add(self, key: object, seen: Seen) -> int:
-        """Return the number of an observation. A key that is new gets the next number."""
-        number = self._numbers.setdefault(key, len(self._numbers))
-        if number == len(self.seen):
-            self.seen.append(seen)
-        return number
+            shown = _first_steps(ssh_map) if reading else {}
+            keys.append([])
+            for s in ssh_map.dstates:
+                key, star = reading(shown[s.id]) if reading and s.id in shown else (None, None)
+                found.setdefault((s.view, key), Seen(s.view, star))
+                keys[-1].append((s.view, key))
+        number = {key: i for i, key in enumerate(found)}
+        self.seen = list(found.values())
+        self.of = [[number[key] for key in of_map] for of_map in keys]
 
 
 class _StarReader:
@@ -148,13 +138,12 @@ def _reading(
     """Make the function that reads stars; None if stars are not used."""
     if trace is None or not trace.has_stars:
         return None
+    steps = sorted({t for ssh_map in maps for t in _first_steps(ssh_map).values()})
     if theory is not None:
         settled = settle(trace, theory).theory
         if settled.star == "none":
             return None
-        return _StarReader(
-            trace, settled, sorted({t for ssh_map in maps for t in _first_steps(ssh_map).values()})
-        )
+        return _StarReader(trace, settled, steps)
     # without a theory, stars are read as frames if each dstate has one star in each map
     if trace.in_quarters:
         reading = _StarReader(trace, Theory(star="frame"))
@@ -172,9 +161,7 @@ def _reading(
         for t, label in _sound(m)
     ):
         return None
-    return _StarReader(
-        trace, Theory(star="alike"), sorted({t for m in maps for t in _first_steps(m).values()})
-    )
+    return _StarReader(trace, Theory(star="alike"), steps)
 
 
 def _sound(ssh_map: SSHMap) -> list[tuple[int, int]]:

@@ -375,11 +375,9 @@ class Search:
         watch = self._parts.watch
         watch.start()
         spent = watch.elapsed()
-        is_unlimited = watch.left() == math.inf
-        watch.stage_ends = spent + max(REASONING, spent) if is_unlimited else math.inf
-        with heeding(watch.check):
+        ends = spent + max(REASONING, spent) if watch.left() == math.inf else math.inf
+        with heeding(watch.check), watch.stage(ends):
             self._parts.rivals.reason()
-        watch.stage_ends = math.inf
         watch.stop()
 
     def interrupt(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from contextlib import suppress
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.loggers import log_of
@@ -94,16 +94,12 @@ class Stages:
     def find_minimum_within(self, share: float) -> None:
         """Find the minimal cost as `find_minimum` does, in a share of the time left."""
         watch = self._parts.watch
-        if watch.left() < math.inf:
-            watch.stage_ends = watch.elapsed() + share * watch.left()
         try:
-            self.find_minimum()
-        except StageTimeError:
-            pass
+            with suppress(StageTimeError), watch.stage(watch.elapsed() + share * watch.left()):
+                self.find_minimum()
         except LimitError as limit:
             if limit.reason != "no proof":
                 raise
-        watch.stage_ends = math.inf
 
     def _mend(self) -> bool:
         """Look for maps by mending the trace. Return whether minimal ones were found and proven."""
@@ -131,17 +127,12 @@ class Stages:
     def _find_minimum_soon(self, seconds: float) -> bool:
         """Find the minimal cost by growing prefixes. Return False if that takes too long."""
         parts, watch = self._parts, self._parts.watch
-        whole = watch.stage_ends
         ends = watch.elapsed() + min(seconds, choosing.STEPWISE_SHARE * watch.left())
-        watch.stage_ends = min(ends, whole)
-        try:
+        with suppress(StageTimeError), watch.stage(ends):
             parts.prefixes.find_minimum()
-        except StageTimeError:
-            parts.prefixes.start = max(parts.prefixes.start, parts.engine.size)
-            return False
-        finally:
-            watch.stage_ends = whole
-        return True
+            return True
+        parts.prefixes.start = max(parts.prefixes.start, parts.engine.size)
+        return False
 
     def _settle_dstates_first(self) -> None:
         """If a map is known, continue from it with an engine that finds dstates first."""

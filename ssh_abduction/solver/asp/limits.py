@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Literal, TypeAlias
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
@@ -119,6 +119,19 @@ class Watch:
         part = Watch(seconds, self._memory, self.check, clock)
         part.start()
         return part
+
+    @contextmanager
+    def stage(self, ends: float) -> Iterator[None]:
+        """End the work in this context by StageTimeError when the clock shows `ends` seconds.
+
+        The end of a stage around this one remains as it was.
+        """
+        around = self.stage_ends
+        self.stage_ends = min(ends, around)
+        try:
+            yield
+        finally:
+            self.stage_ends = around
 
     def shorten(self, seconds: float) -> None:
         """Lower the time limit to this many seconds since the start."""

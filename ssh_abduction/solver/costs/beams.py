@@ -98,7 +98,6 @@ class Beams:
         may_have_map = self._search_widths(time, clashes)
         if may_have_map:
             self._search_without_axioms(time)
-        watch.stage_ends = math.inf
         return may_have_map
 
     def _search_widths(self, time: _Time, clashes: Callable[[], bool]) -> bool:
@@ -110,8 +109,7 @@ class Beams:
         shares = {w: min(end, JUMPED) if theory.jumped else end for w, end in WIDTHS.items()}
         widths = [width for width in WIDTHS if width <= BROAD or not several]
         if several and (joining := parts.candidates.joining()) is not None:
-            watch.stage_ends = time.end(JOINING)
-            with suppress(StageTimeError):
+            with suppress(StageTimeError), watch.stage(time.end(JOINING)):
                 nats = min(map(self._add, parts.candidates.maps_of(joining)), default=math.inf)
                 self._take(nats, -math.inf, joining.broken)
             self._keep_best()
@@ -123,10 +121,9 @@ class Beams:
             slack = time.end(shares[last]) - began - last * first
             if width < last and 0 < slack < width * first:
                 continue  # there is time for the last one, but not for both
-            watch.stage_ends = time.end(shares[width])
             if (beam := parts.candidates.beam(width)) is None:
                 break
-            if not self._ends(beam, width) and not self._ended:
+            if not self._ends(beam, width, time.end(shares[width])) and not self._ended:
                 parts.candidates.go_on(beam)
             self._keep_best()
             parts.report()
@@ -142,32 +139,31 @@ class Beams:
         parts, watch, nats = self._parts, self._parts.watch, math.inf
         while self._best[0] < nats - EQUAL and watch.elapsed() + WIDER * self._took[-1] < end:
             began, nats = watch.elapsed(), self._best[0]
-            watch.stage_ends = end
             beam = parts.candidates.beam(WIDER * self._ended)
-            if beam is None or not self._ends(beam, WIDER * self._ended):
+            if beam is None or not self._ends(beam, WIDER * self._ended, end):
                 break
-            watch.stage_ends = math.inf
             self._keep_best()
             parts.report()
             self._took.append(watch.elapsed() - began)
 
     def _search_without_axioms(self, time: _Time) -> None:
         """If `broken` is unknown, find it with the widest beam that ended."""
-        self._parts.watch.stage_ends = time.end(BREAKING)
         is_open = self._best[1] < math.inf and math.isinf(self.broken)
-        with suppress(StageTimeError):
+        with suppress(StageTimeError), self._parts.watch.stage(time.end(BREAKING)):
             if is_open and (beam := self._parts.candidates.beam(self._ended)):
                 self.broken = self._best[1] - beam.nats_without_axioms()
 
-    def _ends(self, beam: Beam, width: int) -> bool:
-        """Keep the maps that a beam ends with. Return whether it ended in time."""
+    def _ends(self, beam: Beam, width: int, end: float) -> bool:
+        """Keep the maps that a beam ends with. Return whether it ended by `end` on the clock."""
+        watch, found = self._parts.watch, dict[float, SSHMap]()
         try:
-            found = {self._add(one): one for one in self._parts.candidates.maps_of(beam)}
+            with watch.stage(end):
+                found |= {self._add(one): one for one in self._parts.candidates.maps_of(beam)}
         except StageTimeError:
             return False
         self._ended = width
         if width >= BROAD:
-            with suppress(StageTimeError):
+            with suppress(StageTimeError), watch.stage(end):
                 if found:
                     best, accepts = found[min(found)], self._parts.judging.accepts
                     merged = with_merged_places(best, self._misfit, accepts)

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from itertools import chain
 
 from ssh_abduction.data.maps import SSHMap
@@ -96,19 +97,14 @@ class FaultyEngine:
     def _asked_first(self) -> Iterator[Found]:
         """Yield maps of a short trace that clingo finds soon, before maps are guessed."""
         watch = self._task.watch
-        ends = watch.stage_ends
         if self.size >= GUESSED or not self._guesses():
             return
-        began, left = watch.elapsed(), watch.left()
-        watch.stage_ends = min(ends, began + min(ASKED_FIRST, ASKED_FIRST_SHARE * left))
-        try:
+        ends = watch.elapsed() + min(ASKED_FIRST, ASKED_FIRST_SHARE * watch.left())
+        with suppress(StageTimeError), watch.stage(ends):
             yield from self._asked()
-        except StageTimeError:
-            self._control.forget()
-            if watch.elapsed() > ends:
-                raise
-        finally:
-            watch.stage_ends = ends
+            return
+        self._control.forget()
+        watch.check()
 
     def _guessed(self) -> Iterator[Found]:
         """Yield guessed maps of the whole trace, each cheaper than the one before.
