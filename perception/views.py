@@ -318,17 +318,10 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 "few dozen are enough"
             )
         # scikit-learn takes seeds of 32 bits.
-        if self.random_state is not None and not isinstance(
-            self.random_state, np.random.RandomState
-        ):
+        seed, mend = self.random_state, "give a seed, a RandomState or None"
+        if not isinstance(seed, np.random.RandomState | None):
             a_whole_number(
-                "random_state",
-                self.random_state,
-                PerceptionError,
-                0,
-                2**32 - 1,
-                what="a seed",
-                mend="give a seed, a RandomState or None",
+                "random_state", seed, PerceptionError, 0, 2**32 - 1, what="a seed", mend=mend
             )
         one_of("by", self.by, ("M", "trimmed"), PerceptionError)
         if self.isolated is not None:
@@ -338,18 +331,17 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             raise PerceptionError(
                 f"k_max: expected at least k_min = {self.k_min}, got {self.k_max}; raise it"
             )
-        if self.clusterer is not None and not (
-            hasattr(self.clusterer, "fit") and hasattr(self.clusterer, "get_params")
-        ):
+        if self.clusterer is not None:
+            self._check_clusterer()
+
+    def _check_clusterer(self) -> None:
+        """Raise PerceptionError if the clusterer is none, or finds `k` itself."""
+        if not (hasattr(self.clusterer, "fit") and hasattr(self.clusterer, "get_params")):
             raise PerceptionError(
                 "clusterer: expected a scikit-learn clusterer, such as DBSCAN(), got "
                 f"{self.clusterer!r}; pass an object with fit and get_params"
             )
-        if (
-            self.k is not None
-            and self.clusterer is not None
-            and _count_parameter(self.clusterer) is None
-        ):
+        if self.k is not None and _count_parameter(self.clusterer) is None:
             raise PerceptionError(
                 f"k: {type(self.clusterer).__name__} finds the number of clusters itself; "
                 "leave k out"

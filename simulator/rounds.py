@@ -245,7 +245,6 @@ def record_plan(
     seed: int = 0,
     *,
     metres: float = METRES,
-    laser: Laser = LASER,
     body: Body | None = None,
     odometer: Odometer | None = None,
     every: float = EVERY,
@@ -272,7 +271,7 @@ def record_plan(
     x, y = tour.way[0].tolist()
     recorder = Recorder(every)
     robot = SimulatedRobot(body, (x, y, float(chance.uniform(-math.pi, math.pi))), motion)
-    driver = Driver(world, robot, laser, motion, recorder=recorder)
+    driver = Driver(world, robot, LASER, motion, recorder=recorder)
     recorder.note(world, robot.pose)
     # For each scan, the point of the round that was reached. Points are counted on from one round
     # to the next.
@@ -281,7 +280,7 @@ def record_plan(
         for at in drive_along(driver, rooms.space, tour.way):
             come += [number * len(tour.way) + at] * (recorder.taken - len(come))
     drive = recorder.drive(
-        f"{plan.name}, {counted(tours, 'tours')}, seed {seed}", laser, odometer or Odometer(), seed
+        f"{plan.name}, {counted(tours, 'tours')}, seed {seed}", LASER, odometer or Odometer(), seed
     )
     come += come[-1:] * (len(drive) - len(come))
     return _judged(drive, rooms, tour, tours, come)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -90,6 +91,21 @@ class Agreement:
         return abs(self.angle) > ANGLE
 
     @property
+    def differences(self) -> list[str]:
+        """How the trajectories differ, in words."""
+        found = [f"{self.scans:.0f} m by scans, {self.odometry:.0f} m by odometry"]
+        if self.has_other_turns:
+            found.append(f"turns by scans are {self.turning:.2f} times those by odometry")
+        if self.is_askew:
+            degrees, side = abs(math.degrees(self.angle)), "left" if self.angle > 0 else "right"
+            found.append(
+                f"the direction by scans is {degrees:.0f} degrees to the {side} of that by odometry"
+            )
+        if self.parted:
+            found.append(f"they diverge in {self.parted} of {self.of} stretches of a metre")
+        return found
+
+    @property
     def is_good(self) -> bool:
         """Whether the two trajectories nearly agree, or are too short to be compared."""
         if max(self.scans, self.odometry) < STRETCH:
@@ -144,50 +160,45 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
     looks = laser_direction(log) if covers is None and not found.has_other_turns else None
     if found.is_good and looks is None:
         return None
-    laser = log.scans[0].laser
-    differences = [f"{found.scans:.0f} m by scans, {found.odometry:.0f} m by odometry"]
-    causes: list[str] = []
+    causes = _causes(log.scans[0], found, covers, looks)
+    return (
+        f"Scan matching and odometry disagree: {'; '.join(found.differences)}. The map may be "
+        f"wrong. Likely causes: {'; '.join(causes)}."
+    )
+
+
+def _causes(
+    scan: Scan, found: Agreement, covers: float | None, looks: float | None
+) -> Iterator[str]:
+    """Yield the likely causes of a difference, each with an option that corrects it.
+
+    `covers` and `looks` are the field of view and the direction of the laser, in degrees, if they
+    are likely to be others than those of the scan.
+    """
+    fov, turning = _fov(scan), found.turning if found.has_other_turns else None
     # Turns show the field of view; a negative ratio means that left and right are swapped.
-    fov = _fov(log.scans[0])
-    if found.turning is not None and found.has_other_turns:
-        differences.append(f"turns by scans are {found.turning:.2f} times those by odometry")
-        if found.turning < 0:
-            causes.append(
-                f"the laser hangs upside down (--set fov={-math.copysign(fov, laser.step):.0f})"
-            )
-            covers = None
-        elif covers is None and fov / found.turning <= 360:
-            covers = fov / found.turning
+    if turning is not None and turning < 0:
+        covers = None
+        yield f"the laser hangs upside down (--set fov={-math.copysign(fov, scan.laser.step):.0f})"
+    elif turning is not None and covers is None and fov / turning <= 360:
+        covers = fov / turning
     if covers is not None:
-        causes.append(f"its beams cover about {covers:.0f} degrees, not {fov:.0f} (--set fov)")
-    if found.is_askew:
-        degrees, side = abs(math.degrees(found.angle)), "left" if found.angle > 0 else "right"
-        differences.append(
-            f"the direction by scans is {degrees:.0f} degrees to the {side} of that by odometry"
-        )
+        yield f"its beams cover about {covers:.0f} degrees, not {fov:.0f} (--set fov)"
     if looks is not None:
-        x, y, _ = laser.mount
+        x, y, _ = scan.laser.mount
         side = "left" if looks >= 0 else "right"
-        causes.append(
+        yield (
             f"the laser looks {abs(looks):.0f} degrees to the {side} of straight ahead "
             f"(--set mount={x:g},{y:g},{looks:.0f})"
         )
-    if not causes:
-        causes = [
-            (
-                'a range that means "nothing came back" is read as a wall (--set no_return, --set '
-                "zero_is)"
-            ),
-            "the laser sits or looks elsewhere on the robot (--set mount)",
-            "its field of view is another (--set fov)",
-        ]
-    causes.append("the odometer jumps, slips or is out of scale")
-    if found.parted:
-        differences.append(f"they diverge in {found.parted} of {found.of} stretches of a metre")
-    return (
-        f"Scan matching and odometry disagree: {'; '.join(differences)}. The map may be "
-        f"wrong. Likely causes: {'; '.join(causes)}."
-    )
+    if covers is None and looks is None and (turning is None or turning >= 0):
+        yield (
+            'a range that means "nothing came back" is read as a wall (--set no_return, --set '
+            "zero_is)"
+        )
+        yield "the laser sits or looks elsewhere on the robot (--set mount)"
+        yield "its field of view is another (--set fov)"
+    yield "the odometer jumps, slips or is out of scale"
 
 
 def laser_direction(log: RobotLog) -> float | None:

@@ -198,17 +198,13 @@ def _odometer(
     # Several programs may publish one topic: take the longest track, preferably from a frame odom.
     best = max(tracks, key=lambda source: (len(tracks[source].numbers), "odom" in source[0]))
     if len(tracks) > 1:
-
-        def described(source: tuple[str, str, str]) -> str:
-            """Name a source (frame, frame of the robot, sender) in a note."""
-            odom, base, sender = source
-            return f"from {odom} to {base}{f' by {sender}' if sender else ''}"
-
-        listed = ", ".join(
-            f"{len(track.table())} {described(source)}" for source, track in tracks.items()
-        )
+        named = {
+            source: f"from {source[0]} to {source[1]}{f' by {source[2]}' if source[2] else ''}"
+            for source in tracks
+        }
+        listed = ", ".join(f"{len(tracks[one].table())} {name}" for one, name in named.items())
         notes.append(
-            f"Several sources publish {topic}: {listed}. Those {described(best)} are read; record "
+            f"Several sources publish {topic}: {listed}. Those {named[best]} are read; record "
             "each source to a topic of its own."
         )
     return tracks[best], best[0], best[1]

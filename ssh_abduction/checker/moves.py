@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from ssh_abduction.data.maps import DState
+from ssh_abduction.data.regions import course_named
 from ssh_abduction.data.trace import Action
 
 # A path and a direction, +1 or -1.
@@ -48,15 +49,10 @@ def opposite(course: Course) -> Course:
     return course[0], -course[1]
 
 
-def along(course: Course) -> str:
-    """Describe a course in words: "path 2+" is path 2 in direction +1."""
-    return f"path {course[0]}{'+' if course[1] == 1 else '-'}"
-
-
 def going(s: DState) -> str:
     """Describe the course of a dstate in words; "no path" if it has none."""
     course = course_of(s)
-    return along(course) if course else "no path"
+    return course_named(course) if course else "no path"
 
 
 def heading_of(s: DState) -> int | None:

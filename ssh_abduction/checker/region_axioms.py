@@ -10,11 +10,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations
 from typing import TypeAlias
 
-from ssh_abduction.checker.moves import Course, along, course_of, opposite
+from ssh_abduction.checker.moves import Course, course_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.side_axioms import RightBranch, branches_right_of
 from ssh_abduction.data.groups import reached
-from ssh_abduction.data.regions import Region, list_in_words
+from ssh_abduction.data.regions import Region, course_named, list_in_words
 
 _Places: TypeAlias = frozenset[int]
 # ("place", its id), or ("path", its id, its floor); paths are links on one floor only.
@@ -55,7 +55,7 @@ def _beside(m: Reading) -> dict[_Places, str]:
     """For each course, find the region on its right, and a sentence that describes the region."""
     sides = m.once(known_sides)
     return {
-        frozenset(places): f"They are what is known to lie right of {along(course)}."
+        frozenset(places): f"They are what is known to lie right of {course_named(course)}."
         for course, places in sides.items()
         if places
     }

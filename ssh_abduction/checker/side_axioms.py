@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from ssh_abduction.checker.moves import Course, MapLink, along, course_of, opposite
+from ssh_abduction.checker.moves import Course, MapLink, course_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.data.regions import course_named
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,8 @@ class RightBranch:
     mirrored: bool
 
     def __str__(self) -> str:
-        where = f"leaves to the right of {along(self.course)} at place {self.place}"
-        return f"ahead on {along(self.branch)}, which {where} by {self.turn}"
+        where = f"leaves to the right of {course_named(self.course)} at place {self.place}"
+        return f"ahead on {course_named(self.branch)}, which {where} by {self.turn}"
 
 
 @dataclass(frozen=True)

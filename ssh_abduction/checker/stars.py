@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from ssh_abduction.checker.crossings import QUARTERS
-from ssh_abduction.checker.moves import Course, along, course_of, heading_of, opposite
+from ssh_abduction.checker.moves import Course, course_of, heading_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.data.drives import ALONE
 from ssh_abduction.data.maps import DState
+from ssh_abduction.data.regions import course_named
 from ssh_abduction.data.star import Openings
 
 
@@ -180,15 +181,15 @@ def path_goes_straight(m: Reading) -> Found:
             if other != way:
                 yield (
                     m.steps_of(a, s.id),
-                    f"By dstates {a} and {s.id}, both {along(other)} and {along(way)} leave place "
-                    f"{p} through slot {slot}.",
+                    f"By dstates {a} and {s.id}, both {course_named(other)} and "
+                    f"{course_named(way)} leave place {p} through slot {slot}.",
                 )
             through, b = ways.setdefault((p, way), (slot, s.id))
             if through != slot:
                 yield (
                     m.steps_of(b, s.id),
-                    f"By dstates {b} and {s.id}, {along(way)} leaves place {p} through both slots "
-                    f"{through} and {slot}.",
+                    f"By dstates {b} and {s.id}, {course_named(way)} leaves place {p} through "
+                    f"both slots {through} and {slot}.",
                 )
 
 

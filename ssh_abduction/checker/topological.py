@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections import defaultdict
 
-from ssh_abduction.checker.moves import Course, along, course_of, going, opposite
+from ssh_abduction.checker.moves import Course, course_of, going, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.data.groups import reached
+from ssh_abduction.data.regions import course_named
 from ssh_abduction.data.trace import View
 
 
@@ -119,7 +120,7 @@ def one_dstate_per_course(m: Reading) -> Found:
                 yield (
                     m.steps_of(first, s.id),
                     f"Dstates {first} and {s.id} are both at place {s.place} along "
-                    f"{along(course)}.",
+                    f"{course_named(course)}.",
                 )
 
 

@@ -52,8 +52,8 @@ class Closure:
                 f"steps: expected an earlier and a later step, got {first} and {last}; "
                 f"swap them, and invert the displacement"
             )
-        moved = checked_displacement(self.displacement, "displacement")
-        noise = checked_covariance(self.covariance, "covariance")
+        moved = checked_displacement(self.displacement)
+        noise = checked_covariance(self.covariance)
         for name, value in (
             ("first", first),
             ("last", last),

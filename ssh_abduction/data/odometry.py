@@ -101,7 +101,7 @@ class Odometry:
             Three rows of three numbers, in metres and radians, in the frame of the robot before it
             moved.
         """
-        dx, dy, turned = checked_displacement(displacement, "displacement")
+        dx, dy, turned = checked_displacement(displacement)
         # Variances along and across the way, turned into the frame of the robot.
         along = (self.along * dx) ** 2 + (self.along * dy) ** 2
         across = (self.across * dx) ** 2 + (self.across * dy) ** 2
@@ -120,51 +120,53 @@ class Odometry:
 NUMBERS = tuple(f.name for f in fields(Odometry) if f.name != "extra")
 
 
-def checked_displacement(value: Any, where: str) -> Displacement:
+def checked_displacement(value: Any) -> Displacement:
     """Return (dx, dy, dtheta) in metres and radians as floats, or raise TraceError."""
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
     if not _is_triple(value):
         raise TraceError(
-            f"{where}: expected [dx, dy, dtheta], got {brief(value)}; give metres, metres, radians"
+            f"displacement: expected [dx, dy, dtheta], got {brief(value)}; "
+            "give metres, metres, radians"
         )
-    dx, dy, turned = (finite(x, f"{where}[{i}]") for i, x in enumerate(value))
+    dx, dy, turned = (finite(x, f"displacement[{i}]") for i, x in enumerate(value))
     if max(abs(dx), abs(dy)) > FARTHEST:
         raise TraceError(
-            f"{where}: expected metres, at most {FARTHEST:,.0f} in a step, "
+            f"displacement: expected metres, at most {FARTHEST:,.0f} in a step, "
             f"got {brief(list(value))}; convert it to metres"
         )
     if abs(turned) > MOST_TURNED:
         raise TraceError(
-            f"{where}[2]: expected radians, from {-MOST_TURNED:.1f} to {MOST_TURNED:.1f}, "
+            f"displacement[2]: expected radians, from {-MOST_TURNED:.1f} to {MOST_TURNED:.1f}, "
             f"got {brief(value[2])}; convert it from degrees"
         )
     return dx, dy, turned
 
 
-def checked_covariance(value: Any, where: str) -> Covariance:
+def checked_covariance(value: Any) -> Covariance:
     """Return a symmetric, positive definite covariance as 3 x 3 floats, or raise TraceError."""
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
     if not _is_triple(value) or not all(map(_is_triple, value)):
         raise TraceError(
-            f"{where}: expected three rows of three numbers, got {brief(value)}; "
+            f"covariance: expected three rows of three numbers, got {brief(value)}; "
             f"give the covariance of [dx, dy, dtheta]"
         )
     (a, b, c), (d, e, f), (g, h, k) = (
-        [finite(x, f"{where}[{i}][{j}]") for j, x in enumerate(row)] for i, row in enumerate(value)
+        [finite(x, f"covariance[{i}][{j}]") for j, x in enumerate(row)]
+        for i, row in enumerate(value)
     )
     largest = max(abs(x) for x in (a, b, c, d, e, f, g, h, k))
     if max(abs(b - d), abs(c - g), abs(f - h)) > SYMMETRIC * largest:
         raise TraceError(
-            f"{where}: expected a symmetric matrix, got {brief(value)}; "
+            f"covariance: expected a symmetric matrix, got {brief(value)}; "
             f"mend the entries that differ"
         )
     # A matrix is positive definite if its leading minors are positive.
     minors = a, a * e - b * b, a * (e * k - f * f) - b * (b * k - f * c) + c * (b * f - e * c)
     if not all(minor > 0 for minor in minors) or not all(map(math.isfinite, minors)):
         raise TraceError(
-            f"{where}: expected a positive definite matrix, got {brief(value)}; "
+            f"covariance: expected a positive definite matrix, got {brief(value)}; "
             f"give variances above 0, in square metres and square radians"
         )
     return (a, b, c), (b, e, f), (c, f, k)

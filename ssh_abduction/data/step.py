@@ -77,7 +77,7 @@ class Step:
             object.__setattr__(self, "star", parse_star(self.star, "star"))
         object.__setattr__(self, "gateways", None if self.star is None else Star.of(self.star))
         if self.displacement is not None:
-            moved = checked_displacement(self.displacement, "displacement")
+            moved = checked_displacement(self.displacement)
             object.__setattr__(self, "displacement", moved)
         if self.covariance is not None:
             if self.displacement is None:
@@ -85,7 +85,7 @@ class Step:
                     "covariance: expected a displacement at the same step, got none; add the "
                     "displacement, or leave the covariance out"
                 )
-            noise = checked_covariance(self.covariance, "covariance")
+            noise = checked_covariance(self.covariance)
             object.__setattr__(self, "covariance", noise)
 
     def __repr__(self) -> str:
