@@ -611,6 +611,21 @@ def test_join_across_missing_displacements_needs_another_join(
     assert ("across a missing displacement" in weighed.sentence) is not confirmed
 
 
+@pytest.mark.parametrize("most", [1, 2, None])
+def test_limit_of_maps_says_whether_more_maps_cost_as_little(most: int | None) -> None:
+    """The first and the last way of a U may be along one path, in two orders of its places."""
+    go, left = (10, 0, 0), (0, 0, math.pi / 2)
+    trace = Trace.from_steps(
+        "abcdef",
+        ["travel", "left", "travel", "left", "travel"],
+        displacements=[go, left, go, left, go],
+    )
+    solution = solve(trace, Theory(boundary="none"), max_maps=most)
+    assert len(solution.maps) == (most or 2)
+    assert solution.complete is (most != 1)
+    assert solution.stopped == ("maps limit" if most == 1 else None)
+
+
 @pytest.mark.slow
 def test_maps_of_equal_cost_are_all_minimal(tmp_path: Path) -> None:
     """Two drives share a corner of a square, but nothing says which. Paths cost nothing."""

@@ -343,7 +343,8 @@ class Search:
                 return
         self._stages.find_minimum_within(COUNTING_SHARE)
         if self._parts.known.status is not Status.UNSATISFIABLE:
-            most = self.limits.most
+            # One more map shows that not all are listed.
+            most = self.limits.most and self.limits.most + 1
             weighing.search(lambda trace, theory, s: self._solve_mended(trace, theory, most, s))
 
     def _solve_mended(
