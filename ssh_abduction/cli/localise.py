@@ -24,6 +24,7 @@ from ssh_abduction.data.errors import LocaliserError, MapError, named, said_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import only_known
 
 if TYPE_CHECKING:
     from ssh_abduction.online.localiser import Localiser
@@ -115,7 +116,7 @@ def _localiser(options: argparse.Namespace) -> Localiser:
             f"{named(options.maps)}: the first of {len(maps)} maps is taken; choose one with --map",
             stacklevel=1,
         )
-    given = {name: getattr(options, name) for name in CHANCES if getattr(options, name) is not None}
+    given = only_known(**{name: getattr(options, name) for name in CHANCES})
     chances = replace(Chances.none() if options.zero_one else Chances(), **given)
     recogniser = None
     if options.recogniser:

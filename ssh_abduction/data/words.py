@@ -61,6 +61,15 @@ def attributes_of(value: Any, *names: str) -> dict[str, Any]:
     return {name: _plain(getattr(value, name)) for name in names}
 
 
+def only_known(**fields: Any) -> dict[str, Any]:
+    """Return the fields that are not None.
+
+    >>> only_known(floor=2, name=None)
+    {'floor': 2}
+    """
+    return {name: value for name, value in fields.items() if value is not None}
+
+
 def _plain(value: Any) -> Any:
     if hasattr(value, "to_dict"):
         return value.to_dict()

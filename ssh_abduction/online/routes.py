@@ -42,7 +42,7 @@ from ssh_abduction.data.map_parts import signed_path
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import Region, course_named, named_by_number, right_of
 from ssh_abduction.data.trace import View
-from ssh_abduction.data.words import attributes_of, counted
+from ssh_abduction.data.words import attributes_of, counted, only_known
 from ssh_abduction.online.move_graph import MoveGraph, Node
 from ssh_abduction.rivals.listing import Listing, Maps
 
@@ -382,9 +382,7 @@ class Leg:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the leg as plain data, without fields that are None."""
-        return {
-            name: value for name in self.__slots__ if (value := getattr(self, name)) is not None
-        }
+        return only_known(**{name: getattr(self, name) for name in self.__slots__})
 
 
 def coarse_route(ssh_map: SSHMap, start: int, goal: int) -> tuple[Leg, ...]:

@@ -14,6 +14,7 @@ from ssh_abduction.data.errors import MapError, xml_text
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.regions import ids_at
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import only_known
 from ssh_abduction.output.headings import Turns, degrees_of
 
 if TYPE_CHECKING:
@@ -124,7 +125,7 @@ def _causal(ssh_map: SSHMap) -> nx.MultiDiGraph[Any]:
         facts = {name: getattr(s, name) for name in s.__slots__[1:]} | {
             f"{kind}_name": ssh_map.name_of(kind, getattr(s, kind)) for kind in ("place", "path")
         }
-        graph.add_node(s.id, **{k: v for k, v in facts.items() if v is not None})
+        graph.add_node(s.id, **only_known(**facts))
     for source, action, target in ssh_map.links:
         graph.add_edge(source, target, key=action, action=action)
     return graph
@@ -152,8 +153,7 @@ def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
     for place in ssh_map.places:
         dstates = tuple(s.id for s in ssh_map.dstates if s.place == place)
         floor = ssh_map.dstates[dstates[0]].floor if dstates else None
-        more: dict[str, Any] = {} if floor is None else {"floor": floor}
-        more |= _named(ssh_map, "place", place)
+        more = only_known(floor=floor) | _named(ssh_map, "place", place)
         graph.add_node(place, pos=found.places[place], dstates=dstates, **more)
     for path in ssh_map.paths:
         streets = travelled(ssh_map, path)

@@ -137,6 +137,11 @@ class LogMap:
             for drive, (begin, stop) in zip(drives_of(trace), bounds, strict=True)
         ]
 
+    @property
+    def drove(self) -> float | None:
+        """The seconds that the robot drove; None if the clock of the log is unusable."""
+        return seconds_driven(self.log)
+
     def to_dict(self) -> dict[str, Any]:
         """The contents of run.json as a dict: settings, counts, and the time of each stage."""
         solution, trace = self.solution, self.imported.trace
@@ -165,7 +170,7 @@ class LogMap:
             "ladder": [rung.to_dict() for rung in self.rungs],
             "seconds": dict(self.seconds),
             "limit": round(self.limit, 1),
-            "drove": seconds_driven(self.log),
+            "drove": self.drove,
             **({"drives": self._drives()} if solution.joined else {}),
         }
 

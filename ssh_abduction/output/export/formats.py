@@ -23,6 +23,7 @@ from ssh_abduction.data.errors import MapError, brief, is_writable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import only_known
 from ssh_abduction.output.dot import to_dot
 from ssh_abduction.output.export.roads import DIGITS, Road, Roads, Stop
 from ssh_abduction.output.export.tmap2 import tmap2
@@ -71,10 +72,11 @@ def export_map(
     degrees_of(turns)
     one_of("to", to, FORMATS, MapError)
     hidden = a_flag("hide_undecided", hide_undecided, MapError)
-    if hidden and (to not in FOR_NAVIGATION or _level(ssh_map, to, level) != "places"):
+    nodes = _level(ssh_map, to, level)
+    if hidden and (to not in FOR_NAVIGATION or nodes != "places"):
         raise MapError(
-            f"hide_undecided: expected nav2 or tmap2 with places, got {to} with "
-            f"{_level(ssh_map, to, level)}; export places for navigation, or show all"
+            f"hide_undecided: expected nav2 or tmap2 with places, got {to} with {nodes}; "
+            "export places for navigation, or show all"
         )
     if to == "svg":
         if level is not None:
@@ -82,7 +84,7 @@ def export_map(
                 "level: expected none for svg, which shows places and dstates; leave it out"
             )
         return to_svg(ssh_map, turns)
-    level = one_of("level", _level(ssh_map, to, level), LEVELS, MapError, mend="say what nodes are")
+    level = one_of("level", nodes, LEVELS, MapError, mend="say what nodes are")
     for field, text in (("name", name), ("frame", frame)):
         if not isinstance(text, str) or not text or not is_writable(text):
             raise MapError(f"{field}: expected a text, got {brief(text)}; name it")
@@ -201,24 +203,15 @@ def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
         "metric": roads.metric,
         **stop.properties,
         "heading": round(stop.heading, DIGITS),
-        **({} if stop.floor is None else {"floor": stop.floor}),
-        **({} if stop.name is None else {"name": stop.name}),
+        **only_known(floor=stop.floor, name=stop.name),
     }
     return {"id": stop.id, "frame": frame, "metadata": metadata}
 
 
 def _edge(road: Road, number: int) -> dict[str, Any]:
     """Make an edge. Its metadata leave out what is unknown, as Nav2 reads no null."""
-    known = {
-        "action": road.action,
-        "path": road.path,
-        "direction": road.direction,
-        "path_name": road.name,
-    }
-    metadata = {
-        "travelled": road.action is not None,
-        **{field: value for field, value in known.items() if value is not None},
-    }
+    way = {"action": road.action, "path": road.path, "direction": road.direction}
+    metadata = {"travelled": road.action is not None, **only_known(**way, path_name=road.name)}
     return {
         "id": number,
         "startid": road.start,

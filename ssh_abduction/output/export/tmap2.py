@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from ssh_abduction.data.words import only_known
 from ssh_abduction.output.export.roads import DIGITS, Road, Roads, Stop
 
 ACTION = "NavigateToPose"
@@ -95,7 +96,7 @@ def _node(
                 "xy_goal_tolerance": NEAR,
                 "yaw_goal_tolerance": facing,
                 **stop.properties,
-                **({} if stop.name is None else {"place_name": stop.name}),
+                **only_known(place_name=stop.name),
             },
             "restrictions_planning": "True",
             "restrictions_runtime": "True",
@@ -128,8 +129,7 @@ def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
             "weight": _rounded(road.length),
             "length": _rounded(road.length),
             "travelled": road.action is not None,
-            **({} if road.action is None else {"robot_action": road.action}),
-            **({} if road.name is None else {"path_name": road.name}),
+            **only_known(robot_action=road.action, path_name=road.name),
         },
     }
 
