@@ -5,8 +5,9 @@
 >>> monday = Trace.from_steps("abc", ["travel", "travel"], name="monday")
 >>> tuesday = Trace.from_steps("cd", ["travel"], name="tuesday")
 >>> solution = solve([monday, tuesday], Theory.causal())
->>> print(*joins_of_drives(Listing.of(solution)), sep="; ")
-monday and tuesday: 1 dstate in common in all maps (monday:2 = tuesday:0)
+>>> print(*joins_of_drives(Listing.of(solution)))  # doctest: +NORMALIZE_WHITESPACE
+monday and tuesday: 1 dstate in common in all maps (monday:2 = tuesday:0);
+5 pairs of dstates joined in no map
 """
 
 from __future__ import annotations
