@@ -556,4 +556,4 @@ def test_import_reads_several_scan_topics(
         )
         == 1
     )
-    assert "record at least 30 beams per scan" in capsys.readouterr().err
+    assert "record at least 90 beams per scan" in capsys.readouterr().err

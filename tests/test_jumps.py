@@ -16,7 +16,7 @@ from perception.errors import LogError
 from perception.places import importing
 from perception.places.following import turned_wrongly
 from perception.places.importing import import_log, tracked
-from perception.places.jumps import Unknown, unknown_steps
+from perception.places.jumps import Unknown, describe_cuts, unknown_steps
 from perception.places.track import Track
 from perception.readers.scans import Pose, RobotLog, Scan
 from ssh_abduction.checker.checker import check
@@ -212,3 +212,17 @@ def test_scans_metres_apart_are_not_turned_around_against_the_odometry(
 ) -> None:
     log = RobotLog(scans[::3], source="drive")
     assert turned_wrongly(log, tracked(log)[1]) == []
+
+
+@pytest.mark.parametrize(("metres", "jumps"), [(0.5, 0), (5.0, 1)])
+def test_only_a_long_step_of_the_odometer_is_called_a_jump(
+    scans: tuple[Scan, ...], metres: float, jumps: int
+) -> None:
+    log = RobotLog(
+        stepwise(scans[:30], lambda i, step: (metres, 0.0, 0.0) if i == 20 else step),
+        source="drive",
+    )
+    track = replace(tracked(log)[1], cuts=(20,), breaks=(20,))
+    notes = describe_cuts(log, track, [])
+    assert sum("The odometry jumps once" in note for note in notes) == jumps
+    assert "The scans show nothing of what was seen before, once" in notes[-1]

@@ -261,11 +261,11 @@ def test_refusal_advises_more_beams_if_scans_have_few(
 ) -> None:
     monkeypatch.setattr(importing, "HOPELESS", -1.0)
     few = every_second_beam(every_second_beam(tuple(scans[:60])))
-    assert few[0].laser.beams < log_checks.FEW_BEAMS < scans[0].laser.beams
+    assert few[0].laser.beams < log_checks.FEW_BEAMS <= scans[0].laser.beams
     for some, advised in ((few, True), (scans[:60], False)):
         with pytest.raises(LogError, match="got 60, and") as refused:
             import_log(RobotLog(tuple(some), source="drive"))
-        assert ("record at least 30 beams per scan" in str(refused.value)) == advised
+        assert ("record at least 90 beams per scan" in str(refused.value)) == advised
         assert "; " in str(refused.value)  # there is advice
 
 

@@ -24,6 +24,7 @@ from ssh_abduction.robot_logs.edges import STEP, resampled
 from ssh_abduction.robot_logs.log_maps import LogMap, map_log
 from ssh_abduction.robot_logs.log_picture import BESIDE, EDGE, drawn_once, figure
 from ssh_abduction.robot_logs.log_report import report
+from ssh_abduction.solver import Status
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +147,13 @@ def test_report_shows_paths_only_if_the_theory_has_axioms_on_them(house: LogMap)
     assert figure(house.log, house.imported, planar).count(f'stroke="{EDGE}"') < figure(
         house.log, house.imported, solution
     ).count(f'stroke="{EDGE}"')
+
+
+def test_report_names_rival_maps_only_if_they_were_sought(house: LogMap) -> None:
+    for status, sought in ((Status.OPTIMAL, True), (Status.FEASIBLE, False)):
+        solution = replace(house.solution, status=status)
+        page = report(house.log, house.imported, solution, (), house.to_dict())
+        assert ("<h2>Rival maps</h2>" in page) == sought
 
 
 def test_picture_shows_probabilities_of_doubtful_joins(

@@ -145,13 +145,14 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
     carried. `turned` has the indices of scans at which the robot turned differently from the
     odometry, and the differences in radians. There is a note for each kind of error.
     """
-    # If the odometer moved at a cut, it jumped. Otherwise, it stood still while the robot moved.
+    # At a cut after a long step, the odometer jumped. After none, it stood still while the robot
+    # moved. At the end of a usual step, only the scans show that the robot was carried.
     steps = {
         cut: displacement_between(log.scans[cut - 1].odometry, log.scans[cut].odometry)
         for cut in track.cuts
     }
     far = {cut: math.hypot(x, y) for cut, (x, y, _) in steps.items()}
-    jumps = [cut for cut in track.cuts if far[cut] > STILL]
+    jumps = [cut for cut in track.cuts if far[cut] > FAR / 2]
     still = [cut for cut in track.cuts if far[cut] <= STILL and cut not in track.breaks]
     notes = []
     if jumps:

@@ -51,8 +51,8 @@ def report(
         "<h2>Doubtful joins</h2>" + _doubts(solution)
         if solution.weighed and not solution.weighed.doubt
         else "",
-        "<h2>Rival maps</h2>" + _paragraph(solution.summary or "There is no other minimal map.")
-        if solution.maps
+        "<h2>Rival maps</h2>" + _paragraph(f"{solution.summary}.")
+        if solution.status is Status.OPTIMAL
         else "",
         _faults(solution) if solution.maps else "",
         "<h2>Settings</h2>" + _settings(run),
