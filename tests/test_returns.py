@@ -18,6 +18,7 @@ from ssh_abduction.checker.geometry import refused_returns
 from ssh_abduction.data import DState, Odometry, together
 from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares
+from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.evidence.returns import Returns
 from ssh_abduction.theory.evidence.together import Together, joint_squares
 
@@ -138,9 +139,12 @@ def test_bounds_on_returns_change_no_refusal(noise: str, bend: float) -> None:
             assert (worst is None) == (excess.max() <= 0)
             if worst is not None:
                 best = rows[new][0], rows[int(excess.argmax())]
-                assert {tuple(row) for row in worst} == {tuple(row) for row in best}
+                assert worst == {
+                    Equality(int(i), int(j), "dstate" if one_dstate else "place")
+                    for i, j, one_dstate in best
+                }
                 refused += 1
-                only_together += all(square_alone(returns, row) < 2.5 for row in worst)
+                only_together += all(square_alone(returns, row) < 2.5 for row in best)
     assert refused > only_together
     assert only_together or noise != "white"
 

@@ -303,6 +303,16 @@ class _Errors:
 
     def _closings(self, z: Array) -> tuple[Array, Array]:
         """Compute c(z), by how much loops and closures are off, and its derivatives J."""
+        pose, own = self._reckoned(z)
+        found = [self._loop_gap(z, pose, own, *loop) for loop in self._loops]
+        found += [self._closure_gap(z, pose, own, k) for k in range(len(self._closures))]
+        if not found:
+            return np.zeros(0), np.zeros((0, self._size))
+        gaps, rows = zip(*found, strict=True)
+        return np.concatenate(gaps), np.concatenate(rows)
+
+    def _reckoned(self, z: Array) -> tuple[Array, Array]:
+        """Compute the pose at each step by dead reckoning, and the `_own_errors` of movements."""
         size = len(self._moved)
         scale, bend = self._sigma * z[-2:]
         noise = np.einsum("tij,tj->ti", self._root, z[: 3 * size].reshape(size, 3))
@@ -320,34 +330,38 @@ class _Errors:
         pose = np.column_stack([np.cumsum(onward, axis=0), heading])
         off_dstate = z[self._begin : self._begin + self._off.size].reshape(-1, 3) * self._off
         self.position = pose[:, :2] - (off_dstate[:, :2] if len(self._off) else 0.0)
-        own = self._own_errors(cos, sin, onward, 1 + scale)
-        rows: list[Array] = []
-        off: list[float] = []
-        for first, last, is_dstate in self._loops:
-            kept = 3 if is_dstate else 2
-            gap = pose[last] - pose[first]
-            row = self._row(pose, own, first, last)
-            for t, sign in ((last, -1.0), (first, 1.0)) if len(self._off) else ():
-                mine = slice(self._begin + 3 * t, self._begin + 3 * t + 3)
-                gap += sign * self._off[t] * z[mine]
-                row[range(3), range(mine.start, mine.stop)] += sign * self._off[t]
-            gap[2] = math.remainder(gap[2], math.tau)
-            rows.append(row[:kept])
-            off += gap[:kept].tolist()
-        for k, (closure, root) in enumerate(self._closures):
-            # The pose at the later step in the frame of the earlier one. Errors up to the earlier
-            # step move both poses alike.
-            first, last = closure.first, closure.last
-            cos, sin = math.cos(heading[first]), math.sin(heading[first])
-            back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-            mine = slice(3 * (size + k), 3 * (size + k) + 3)
-            row = back @ self._row(pose, own, first, last)
-            row[:, mine] = -root
-            gap = back @ (pose[last] - pose[first]) - closure.displacement - root @ z[mine]
-            gap[2] = math.remainder(gap[2], math.tau)
-            rows.append(row)
-            off += gap.tolist()
-        return np.array(off), np.concatenate(rows) if rows else np.zeros((0, self._size))
+        return pose, self._own_errors(cos, sin, onward, 1 + scale)
+
+    def _loop_gap(
+        self, z: Array, pose: Array, own: Array, first: int, last: int, is_dstate: bool
+    ) -> tuple[Array, Array]:
+        """Compute by how much a loop is off, and the derivatives."""
+        gap = pose[last] - pose[first]
+        row = self._row(pose, own, first, last)
+        for t, sign in ((last, -1.0), (first, 1.0)) if len(self._off) else ():
+            mine = slice(self._begin + 3 * t, self._begin + 3 * t + 3)
+            gap += sign * self._off[t] * z[mine]
+            row[range(3), range(mine.start, mine.stop)] += sign * self._off[t]
+        gap[2] = math.remainder(gap[2], math.tau)
+        kept = 3 if is_dstate else 2
+        return gap[:kept], row[:kept]
+
+    def _closure_gap(self, z: Array, pose: Array, own: Array, k: int) -> tuple[Array, Array]:
+        """Compute by how much closure k is off, and the derivatives.
+
+        It gives the pose at the later step in the frame of the earlier one. Errors up to the
+        earlier step move both poses alike.
+        """
+        (closure, root), size = self._closures[k], len(self._moved)
+        first, last = closure.first, closure.last
+        cos, sin = math.cos(pose[first, 2]), math.sin(pose[first, 2])
+        back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        mine = slice(3 * (size + k), 3 * (size + k) + 3)
+        row = back @ self._row(pose, own, first, last)
+        row[:, mine] = -root
+        gap = back @ (pose[last] - pose[first]) - closure.displacement - root @ z[mine]
+        gap[2] = math.remainder(gap[2], math.tau)
+        return gap, row
 
     def _own_errors(self, cos: Array, sin: Array, onward: Array, scale: float) -> Array:
         """Compute derivatives, (n, 3, 5), of movements by their three errors, scale and drift."""

@@ -157,7 +157,7 @@ def _check_causal(theory: Theory) -> None:
 
 def _check_weigh(theory: Theory) -> None:
     """Check that maps can be compared by cost. Raises TheoryError."""
-    if theory.prefer != AUTO and theory.prefer[:1] != ("dstates",):
+    if not _prefers_dstates(theory):
         raise TheoryError(
             "prefer: expected dstates first where maps are weighed, got "
             f"{', '.join(theory.prefer) or 'nothing'}; leave it out, or take "
@@ -172,13 +172,17 @@ def _check_weigh(theory: Theory) -> None:
 
 def can_weigh(theory: Theory) -> bool:
     """Whether the maps of a theory can be compared by their cost in nats."""
-    dstates_first = theory.prefer == AUTO or theory.prefer[:1] == ("dstates",)
-    return dstates_first and theory.boundary != "defeasible"
+    return _prefers_dstates(theory) and theory.boundary != "defeasible"
+
+
+def _prefers_dstates(theory: Theory) -> bool:
+    """Whether a theory minimises dstates first, or what fits the trace."""
+    return theory.prefer == AUTO or theory.prefer[:1] == ("dstates",)
 
 
 def _check_faults(theory: Theory) -> None:
     """Check that the other fields allow faults. Raises TheoryError."""
-    if theory.prefer != AUTO and theory.prefer[:1] != ("dstates",):
+    if not _prefers_dstates(theory):
         raise TheoryError(
             "prefer: expected dstates first where faults are allowed, got "
             f"{', '.join(theory.prefer) or 'nothing'}; faults cost dstates"

@@ -273,12 +273,8 @@ class Returns:
         if before:
             rows = np.concatenate([before.rows, rows])
         together = self._together(rows, before)
-        worst = together.worst(rows[:, 1] >= since if since else self._is_new(rows))
-        if worst is not None:
-            refused = frozenset(
-                Equality(int(i), int(j), "dstate" if one_dstate else "place")
-                for i, j, one_dstate in worst
-            )
+        refused = together.worst(rows[:, 1] >= since if since else self._is_new(rows))
+        if refused is not None:
             self._refused = [*self._refused[-REMEMBERED:], refused]
             return refused
         self._accepted[tested] = together
@@ -301,13 +297,7 @@ class Returns:
             for i, j, one_dstate in rows.tolist()
         ]
         rows = rows[[not is_refused for is_refused in refused]]
-        worst = self._together(rows).worst(rows[:, 1] == step)
-        if worst is None:
-            return None
-        return frozenset(
-            Equality(int(i), int(j), "dstate" if one_dstate else "place")
-            for i, j, one_dstate in worst
-        )
+        return self._together(rows).worst(rows[:, 1] == step)
 
     def refused_alone_at(
         self, labels: Sequence[int], places: Sequence[int | None], step: int

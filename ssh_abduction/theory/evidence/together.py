@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.evidence.loops import Array, Loops, Reckoning, Steps
+from ssh_abduction.theory.evidence.protocol import Equality
 
 Mask: TypeAlias = NDArray[np.bool_]
 
@@ -92,13 +93,14 @@ class Together:
         self._reckoning, self._thresholds = reckoning, thresholds
         self._alone: dict[int, _ReturnsAlone] = dict(before._alone) if before else {}
 
-    def worst(self, new: Mask) -> tuple[Steps, Steps] | None:
-        """Return the later and the earlier row of the pair that is rejected most clearly, or None.
+    def worst(self, new: Mask) -> frozenset[Equality] | None:
+        """Return the pair of returns that is rejected most clearly; None if there is none.
 
         Only pairs with a return that is `new` count.
         """
         rows = self.rows
-        worst, most = None, 0.0
+        worst: frozenset[Equality] | None = None
+        most = 0.0
         if not new.any():
             return None
         ends, starts = np.unique(rows[:, 1], return_index=True)
@@ -115,7 +117,11 @@ class Together:
                 excess = self._least_excess(end, *pairs)
                 if len(excess) and excess.max() > most:
                     best = int(excess.argmax())
-                    worst, most = (rows[pairs[0][best]], rows[pairs[1][best]]), float(excess[best])
+                    most = float(excess[best])
+                    worst = frozenset(
+                        Equality(int(i), int(j), "dstate" if one_dstate else "place")
+                        for i, j, one_dstate in (rows[some[best]] for some in pairs)
+                    )
         return worst
 
     def _overlapping(self, later: Steps, new: Mask) -> Sequence[Steps]:
