@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
     trace = solved_trace(options)
     data = read_json(options.maps)
     maps = some_maps(data, options.maps, "seek an experiment for")
-    sureness = Listing.from_dict(data, named(options.maps)).sureness
+    listing = Listing.from_dict(data, named(options.maps))
     found = written_theory(data)
     theory: Theory | None = theory_of(options, found)
     if found is None and options.theory is None and theory == Theory.topological():
@@ -87,8 +87,11 @@ def run(options: argparse.Namespace) -> int:
         print(json_line(experiment.to_dict()))
     else:
         print("\n".join(_lines(experiment)))
-        if sureness:
-            print(sureness)
+        if listing.sureness:
+            print(listing.sureness)
+        weighed = listing.weighed if len(maps) == 1 else None
+        if weighed and weighed.proven and not all(r.estimated for r in weighed.rivals[1:]):
+            print("to tell it from maps that cost little more, list them: solve --set within=5")
     if experiment.warning:
         warn([experiment.warning])
     if experiment.stopped == "interrupted":

@@ -189,12 +189,10 @@ class Experiment:
         """A warning if there may be more maps, or if a limit ended the search; otherwise None."""
         parts = []
         if not self.complete:
-            known = (
-                f"these {self.count} maps may not be all minimal ones"
-                if self.count > 1
-                else "this map may not be the only minimal one"
+            parts.append(
+                "there may be other maps that are as good or better, and the experiment ignores "
+                "them; let solve list all (-n 0), and search longer if a time limit stopped it"
             )
-            parts.append(f"{known}, and the experiment ignores others; list all (solve -n 0)")
         if self.stopped:
             parts.append(
                 f"the search for the experiment was stopped ({self.stopped}); there may be a "
