@@ -334,6 +334,26 @@ def test_solve_reports_corrections_that_contradict_the_trace(
     assert "tuesday:1" in json.loads(capsys.readouterr().out)["corrections"][0]
 
 
+def test_solve_names_a_contradicting_correction_without_an_explanation(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In long traces, no stretch that clashes is found."""
+    monkeypatch.setattr("ssh_abduction.cli.outcome.explain", lambda *_: None)
+    building = str(folder / "building")
+    assert main(["correct", building, "--same", "monday:1,tuesday:1"]) == 0
+    assert main(["correct", building, "--same-place", "monday:2,tuesday:1"]) == 0
+    assert main(solving(folder)) == 20
+    told = capsys.readouterr()
+    assert "same: monday:1, tuesday:1: it contradicts the trace (monday:1 shows b" in told.out
+    assert "same_place" not in told.out
+    assert "warning: views" not in told.err
+    assert main(["correct", building, "--different", "monday:1,tuesday:1"]) == 0
+    assert main(["correct", building, "--elsewhere", "monday:1,monday:2"]) == 0
+    assert main(solving(folder)) == 20
+    told = capsys.readouterr()
+    assert "elsewhere: monday:1, monday:2: perhaps it contradicts the trace" in told.out
+
+
 def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The gateway is seen from two steps at its place, in two directions."""
     assert main(solving(folder, "round")) == 0

@@ -335,7 +335,7 @@ def test_joins_of_drives_are_certain_possible_or_excluded(
 def test_possible_joins_have_a_probability_or_a_share_of_the_maps() -> None:
     join = DriveJoin(0, 1, 0.8)
     for of_maps, said in (
-        (None, "each with its probability (monday:0 = tuesday:1, 0.80)"),
+        (None, "with its probability (monday:0 = tuesday:1, 0.80)"),
         (5, "in some maps that were found (monday:0 = tuesday:1, 4 of 5 maps)"),
     ):
         pair = DrivePair("monday", "tuesday", "place", (), (join,), 1, False, of_maps)

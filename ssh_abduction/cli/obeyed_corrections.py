@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import argparse
 import sys
+import warnings
 from dataclasses import dataclass, replace
+from typing import Any
 
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.saved_map import sentences_of
 from ssh_abduction.data.corrections import Corrections, Passage, Said
 from ssh_abduction.data.corrections_file import beside, load_corrections
-from ssh_abduction.data.drives import drives_of, fingerprints_of, step_of
+from ssh_abduction.data.drives import drives_of, fingerprints_of, step_of, together
 from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.explain.no_map import Explanation, explain
-from ssh_abduction.solver import Solution, obeyed, solve, with_correction_warnings, with_names
+from ssh_abduction.solver import (
+    Solution,
+    Status,
+    obeyed,
+    solve,
+    with_correction_warnings,
+    with_names,
+)
+from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.theory import Theory
 
 
@@ -106,15 +116,28 @@ class Obeying:
 
         return with_correction_warnings(self.corrections, self.with_names(solution), limit, find)
 
-    def blamed(self, explanation: Explanation | None) -> list[str]:
+    def blamed(self, solution: Solution, explanation: Explanation | None) -> list[str]:
         """List the corrections that may be the reason why the trace has no map.
 
         Each correction is dropped in turn. If the steps of the explanation still have no map, this
-        correction is not to blame, and it is not listed.
+        correction is not to blame, and it is not listed. Without an explanation, two steps that
+        are said to be one are compared.
         """
-        said = self.corrections.known_in(drives_of(self.trace)) if self.corrections else None
-        if explanation is None or said is None:
+        if solution.maps or not self.corrections:
             return []
+        said = self.corrections.known_in(drives_of(self.trace))
+        source = named(said.source or "corrections")
+        if explanation is None:
+            wrong = filter(self._clashes, said.pairs)
+            sure = [
+                f"{source}: {pair}: it contradicts the trace{self._seen(pair)}" for pair in wrong
+            ]
+            if sure or solution.status is not Status.UNSATISFIABLE:
+                return sure
+            return [
+                f"{source}: {sentence}: perhaps it contradicts the trace"
+                for sentence in (*said.pairs, *said.gateways)
+            ]
         stretch = range(explanation.first, explanation.last + 1)
         kept = replace(said, pairs=(), gateways=())
         if self._has_no_map(kept, stretch):
@@ -124,12 +147,24 @@ class Obeying:
         for sentence in sentences:
             fewer = kept.without(sentence)
             kept = fewer if self._has_no_map(fewer, stretch) else kept
-        source = named(said.source or "corrections")
         return [
             f"{source}: {sentence}: it contradicts the trace{self._seen(sentence)}"
             for sentence in sentences
             if sentence in kept.pairs or sentence in kept.gateways
         ]
+
+    def _clashes(self, said: Said) -> bool:
+        """Whether two steps that are said to be one dstate or place cannot be so by themselves."""
+        if not said.kind.startswith("same"):
+            return False
+        drives = drives_of(self.trace)
+        steps = sorted(step_of(drives, step) for step in said.steps)
+        alone = [self.trace[t : t + 1].without_displacements() for t in steps]
+        nothing: dict[str, Any] = dict.fromkeys(ASSERTIONS, ())
+        theory = self.without.replace(displacement="none", **{**nothing, said.kind: ((0, 1),)})
+        with warnings.catch_warnings():  # ignore that two steps may show the same, or nothing alike
+            warnings.simplefilter("ignore")
+            return explain(together(alone, ["first", "second"]), theory) is not None
 
     def _has_no_map(self, said: Corrections, stretch: range) -> bool:
         trace, theory = obeyed(said, self.as_seen, self.without)

@@ -260,7 +260,7 @@ class _Text:
     def end(self, solution: Solution, explanation: Explanation | None) -> Callable[[], str]:
         """Make the whole output as text, and return a function that returns it."""
         lines = _lines(self._search, solution, explanation, self._search.backbone)
-        text = _text(chain(lines, self._obeying.blamed(explanation)))
+        text = _text(chain(lines, self._obeying.blamed(solution, explanation)))
         return lambda: text
 
     def last_words(self, solution: Solution) -> str:
@@ -326,7 +326,7 @@ class _Json:
     ) -> str:
         """Make the fields after the maps; `more` maps are not printed yet."""
         end = answer_ending(self._search, solution, explanation, self._maps + more, backbone)
-        if blamed := self._obeying.blamed(explanation):
+        if blamed := self._obeying.blamed(solution, explanation):
             end["corrections"] = blamed
         return f"\n],{json_line(end)[1:]}\n"
 

@@ -87,7 +87,8 @@ class DrivePair:
     def not_forced(self) -> str:
         """Say how many joins are possible, and what is known of them."""
         maps = "maps" if self.proven else "maps that were found"
-        known = "each with its probability" if self.of_maps is None else f"in some {maps}"
+        each = "each with" if len(self.possible) > 1 else "with"
+        known = f"{each} its probability" if self.of_maps is None else f"in some {maps}"
         return f"{counted(len(self.possible), 'possible joins')}, {known}"
 
     def __str__(self) -> str:
