@@ -110,9 +110,9 @@ def test_beam_keeps_hypotheses_with_other_places() -> None:
     (known,) = truth.mazes(3, 40, [700], DRIFTING)
     problem, width, others = settle(known.trace, Theory(star="none")), 8, 0
     beam = Beam(problem, Log(known.trace, problem.theory, problem.pairs), width)
-    kept = [beam._first()]
+    kept = [beam._extending.first()]
     for t in range(1, len(known.trace)):
-        options = beam._options_of(kept, t, joins=True)
+        options = beam._extending.options_of(kept, t, joins=True)
         kept = list(beam._best(options, t, width))
         assert [found.nats for found in kept[:width]] == [o.nats for o in options[:width]]
         at = [[found.places[s] for s in found.labels] for found in kept]

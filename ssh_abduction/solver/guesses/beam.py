@@ -12,9 +12,7 @@ A closure is the pose of a step relative to an earlier step, from a match of loc
 later step, the closure corrects the poses of a hypothesis, and the misfit of the closure adds to
 the cost.
 
-Each step extends each hypothesis in all ways that cost little: the robot is at a known dstate, at a
-new dstate of a known place, or at a new place. If faults are allowed, the action may have slipped,
-the displacement may be wrong, and the view may be misread, each at its price. The *beam* is the
+Each step extends each hypothesis in all ways that cost little (`extending.py`). The *beam* is the
 hypotheses of least cost, and some with other places. The checker checks them every few steps. So a
 hypothesis that breaks an axiom does not crowd out others for long.
 
@@ -29,7 +27,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 
 from ssh_abduction.checker.checker import violations
@@ -40,9 +38,10 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.completing import valid_map
-from ssh_abduction.solver.guesses.pieces import fitted, headings_by_turn
-from ssh_abduction.solver.guesses.reckoning import Hypothesis, HypothesisPoses, first_pose
-from ssh_abduction.solver.guesses.sights import DEAREST, Sights, nats_of_misread, right_view
+from ssh_abduction.solver.guesses.extending import Extending, Extension
+from ssh_abduction.solver.guesses.pieces import headings_by_turn
+from ssh_abduction.solver.guesses.reckoning import Hypothesis
+from ssh_abduction.solver.guesses.sights import nats_of_misread, right_view
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
@@ -70,20 +69,6 @@ UNSURE = 60.0
 STRAINED = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Extension:
-    """A way to extend a hypothesis by a step: to a known place and dstate, or to new ones (None).
-
-    In the hypothesis `of`, the robot has moved already: the last three entries of its mean vector
-    are the pose at the new step.
-    """
-
-    nats: float
-    place: int | None
-    dstate: int | None
-    of: Hypothesis
-
-
 class Beam:
     """The search for hypotheses of little cost.
 
@@ -94,27 +79,14 @@ class Beam:
 
     def __init__(self, problem: Problem, log: Log, width: int) -> None:
         """Prepare the search with this many hypotheses in the beam. `maps` runs it."""
-        trace, theory = problem.trace, problem.theory
-        self._trace, self._log, self._width, self._problem = trace, log, width, problem
-        self._bare = theory.without_faults().replace(
-            displacement="none", weigh="count", changed=theory.changed
-        )
-        has_places = theory.level == "topological"
-        self._stays = has_places and "turn_stays" in theory.hard
-        self._leaves = has_places and "travel_leaves" in theory.hard
-        # The prices of a dstate and of a place.
-        self._prices = theory.prices[0], theory.prices[1] if has_places else 0.0
-        self._reckoning, self._frames = HypothesisPoses(trace), frames_of(trace)
+        self._trace, self._width, self._problem = problem.trace, width, problem
+        self._extending = ways = Extending(problem, log)
+        self._bare, self._fault, self._prices = ways.bare, ways.fault, ways.prices
+        self._sights, self._reckoning = ways.sights, ways.reckoning
+        self._has_frames = bool(frames_of(problem.trace))
         self.hypotheses: list[Hypothesis] = []
         self.refuses = False
         self._kept: list[list[Hypothesis]] = []  # the beam after each check
-        self._sights = Sights(trace, self._bare, log, misreads=theory.misread > 0)
-        # For each kind of fault, its cost at each step in nats.
-        self._fault = {
-            kind: [self._prices[0] * theory.fault_tenths(kind, step) / 10 for step in trace.steps]
-            for kind in ("misread", "slipped", "jumped")
-            if getattr(theory, kind)
-        }
 
     def maps(self, most: float = math.inf) -> Iterator[SSHMap]:
         """Yield the maps of the hypotheses of the whole trace that satisfy the axioms, by cost.
@@ -126,7 +98,7 @@ class Beam:
         each step. If that does not help, extend this beam again with new dstates and places for
         free. Then go back twice as far.
         """
-        kept = self._kept = self._kept or [[self._first()]]
+        kept = self._kept = self._kept or [[self._extending.first()]]
         while (done := len(kept[-1][0].labels)) < len(self._trace):
             end = min(done + CHECKED_EVERY, len(self._trace))
             beam = self._extended(kept[-1], end)
@@ -160,7 +132,7 @@ class Beam:
         The search itself still lets each action at a dstate lead to one dstate, and stars at one
         place agree. Only if no hypothesis is left, the checker checks each step.
         """
-        beam = [self._first()]
+        beam = [self._extending.first()]
         while beam and (done := len(beam[0].labels)) < len(self._trace):
             end = min(done + CHECKED_EVERY, len(self._trace))
             beam = (
@@ -174,13 +146,13 @@ class Beam:
         """Extend a beam to `end` steps without checks. End early if it has many hypotheses."""
         most = max(CROWDED * self._width, 2 * len(beam))
         for t in range(len(beam[0].labels), end):
-            beam = list(self._best(self._options_of(beam, t, joins=True), t, self._width))
+            beam = list(self._best(self._extending.options_of(beam, t, joins=True), t, self._width))
             if len(beam) > most:
                 break
         return sorted(beam, key=lambda found: found.nats)
 
     def _best(
-        self, options: Sequence[_Extension], t: int, width: int, checked: bool = False
+        self, options: Sequence[Extension], t: int, width: int, checked: bool = False
     ) -> Iterator[Hypothesis]:
         """Yield the hypotheses to keep: the `width` cheapest, then some with other places.
 
@@ -191,7 +163,7 @@ class Beam:
         `options` are ways to extend the beam by step t, sorted by cost. If `checked`, drop what the
         checker refuses.
         """
-        most, several = width + int(OTHERS * width * (width > NARROW)), bool(self._frames)
+        most, several = width + int(OTHERS * width * (width > NARROW)), self._has_frames
         if several:
             width, most = min(width, ALIKE), LOST * min(width, ALIKE)
         count: Counter[tuple[object, ...]] = Counter()
@@ -204,7 +176,7 @@ class Beam:
             at = found.faults, option.place, *map(found.places.__getitem__, found.labels)
             if count[found.pieces.joins] >= width and (several or at in known):
                 continue
-            child = self._child(option, t)
+            child = self._extending.extended(option, t)
             price = self._price_of(child) - self._price_of(found)
             if several and child.nats > found.nats + price + STRAINED:
                 child = self._settled([child])[0]
@@ -258,27 +230,9 @@ class Beam:
         they are free, and the robot returns to a place only if it has to.
         """
         for t in range(len(beam[0].labels) if beam else end, end):
-            options = self._options_of(beam, t, joins)
+            options = self._extending.options_of(beam, t, joins)
             beam = list(self._best(options, t, WIDER * self._width, checked=True))
         return self._settled(beam)
-
-    def _first(self) -> Hypothesis:
-        """Make the hypothesis of the first step: one dstate at one place."""
-        mean, covariance = first_pose()
-        nowhere = Hypothesis([], [], [], {}, [], [], [], [], mean, covariance, self._prices[0])
-        n, met = len(mean) - 3, self._reckoning.met(nowhere, 0, None, None)
-        return replace(
-            nowhere,
-            labels=[0],
-            places=[0],
-            seen=[{self._sights.seen[0]: self._doubt(0)}],
-            drives=[0],
-            sights=self._sights.shown[:1],
-            position=[n],
-            heading=[n + 2],
-            mean=met[0],
-            covariance=met[1],
-        )
 
     def _map(self, found: Hypothesis, since: int) -> SSHMap | None:
         """Make the map of a hypothesis; None if it contradicts the axioms or the evidence."""
@@ -322,175 +276,3 @@ class Beam:
             if kind == "slipped":
                 steps[t] = replace(steps[t], action=Action.that_slipped(t))
         return replace(trace, steps=tuple(steps))
-
-    def _doubt(self, t: int) -> float:
-        """Return the cost in nats of treating the view of step t as misread; inf if forbidden."""
-        return self._fault["misread"][t] if "misread" in self._fault else math.inf
-
-    def _misread(self, found: Hypothesis, dstate: int, t: int) -> float:
-        """Return by how many nats the cost of misread views grows if step t is at a dstate."""
-        seen, number, doubt = found.seen[dstate], self._sights.seen[t], self._doubt(t)
-        if math.isinf(doubt):
-            return 0.0 if number in seen else math.inf
-        after = {**seen, number: seen.get(number, 0.0) + doubt}
-        return nats_of_misread(after) - nats_of_misread(seen)
-
-    def _options_of(self, beam: Sequence[Hypothesis], t: int, joins: bool) -> list[_Extension]:
-        """List the ways to extend the hypotheses of a beam by step t, sorted by cost."""
-        look_at_clock()
-        options = [
-            self._laid(option) if option.of.pieces is not moved.pieces else option
-            for found in beam
-            for moved in self._moves(found, t)
-            for option in self._options(moved, t, joins)
-        ]
-        return sorted(options, key=lambda option: option.nats)
-
-    def _laid(self, option: _Extension) -> _Extension:
-        """Return an option with the price for places that its drive shares with other drives."""
-        places = [option.of.places[s] for s in option.of.labels]
-        nats = self._problem.overlap.nats
-        price = nats([*places, option.place]) - nats(places)
-        return replace(option, nats=option.nats + price)
-
-    def _moves(self, found: Hypothesis, t: int) -> Iterator[Hypothesis]:
-        """Yield a hypothesis after the move to step t, without and with a fault of the move."""
-        moved = self._reckoning.moved(found, t)
-        yield moved
-        if "slipped" in self._fault and t not in self._frames:
-            faults, price = (*found.faults, (t - 1, "slipped")), self._fault["slipped"][t - 1]
-            yield replace(moved, faults=faults, nats=moved.nats + price)
-        if "jumped" in self._fault and self._trace.steps[t].displacement is not None:
-            faults, price = (*found.faults, (t, "jumped")), self._fault["jumped"][t]
-            moved = self._reckoning.moved(found, t, believes=False)
-            yield replace(moved, faults=faults, nats=moved.nats + price)
-
-    def _options(self, moved: Hypothesis, t: int, joins: bool) -> list[_Extension]:
-        """List the cheap ways to extend a hypothesis whose robot has moved to step t."""
-        here, action = moved.labels[-1], self._log.actions[t - 1]
-        slips = moved.slips(t)
-        known = None if slips else moved.links.get((here, action))
-        if known is not None:
-            place = moved.places[known]
-            moved = fitted(moved, place, known)
-            nats = (
-                moved.nats + self._misread(moved, known, t) + self._sights.changes(moved, place, t)
-            )
-            nats += float(self._reckoning.squares(moved, t, [place], known)[0]) / 2
-            option = _Extension(nats, place, known, moved)
-            return [option] if nats < math.inf and self._is_allowed(option, t) else []
-        stays = self._stays and self._trace.actions[t - 1].kind == "turn" and not slips
-        there = moved.places[here]
-        leaves = self._leaves and not slips and t not in self._frames
-        if stays:
-            places = [there]
-        else:
-            places = [
-                place
-                for place in range(len(moved.sights))
-                if (place != there or not leaves)
-                and self._sights.changes(moved, place, t) < math.inf
-            ]
-        dstate, new_place = self._prices if joins else (0.0, 0.0)
-        options = []
-        if not stays:
-            nats = moved.nats + dstate + new_place
-            options.append(_Extension(nats, None, None, moved))
-        for place, square, near in self._near(moved, t, places):
-            if square / 2 > DEAREST and not stays:
-                continue
-            changes = 0.0 if stays else self._sights.changes(moved, place, t)
-            if self._bare.level == "topological":
-                nats = moved.nats + changes + dstate + square / 2
-                options.append(_Extension(nats, place, None, near))
-            for s, p in enumerate(moved.places):
-                if p == place and (misread := self._misread(moved, s, t)) < math.inf:
-                    facing = fitted(moved, place, s)
-                    both = float(self._reckoning.squares(facing, t, [place], s)[0])
-                    nats = moved.nats + changes + misread + both / 2
-                    options.append(_Extension(nats, place, s, facing))
-        kept: list[_Extension] = []
-        for option in sorted(options, key=lambda option: option.nats):
-            if kept and option.nats > kept[0].nats + self._sights.dearest:
-                break
-            if self._is_allowed(option, t) and self._may_go_on(option, t):
-                kept.append(option)
-        return kept
-
-    def _near(
-        self, moved: Hypothesis, t: int, places: Sequence[int]
-    ) -> Iterator[tuple[int, float, Hypothesis]]:
-        """Yield the chi-square of the pose of the robot at each of some places at step t.
-
-        Items are triples (place, chi-square, hypothesis). If a place is in another piece (in
-        another frame), the piece of the robot is turned to fit it.
-        """
-        own = [place for place in places if moved.pieces.of_place[place] == moved.pieces.here]
-        squares = self._reckoning.squares(moved, t, own).tolist() if own else []
-        yield from ((place, square, moved) for place, square in zip(own, squares, strict=True))
-        for place in places:
-            if moved.pieces.of_place[place] != moved.pieces.here:
-                turned = fitted(moved, place)
-                yield place, float(self._reckoning.squares(turned, t, [place])[0]), turned
-
-    def _is_allowed(self, option: _Extension, t: int) -> bool:
-        """Whether the option agrees with the evidence about pairs of steps."""
-        labels, places = option.of.labels, option.of.places
-        if option.dstate is not None:
-            return self._log.pairs.allow(t, [*labels, option.dstate], places)
-        place = len(option.of.position) if option.place is None else option.place
-        return self._log.pairs.allow(t, [*labels, len(places)], [*places, place])
-
-    def _may_go_on(self, option: _Extension, t: int) -> bool:
-        """Whether the next displacements agree with the links of the dstate of an option."""
-        if option.dstate is None or "slipped" in self._fault or "jumped" in self._fault:
-            return True
-        actions = self._log.actions
-        return self._reckoning.square_ahead(option.of, t, option.dstate, actions) <= 2 * DEAREST
-
-    def _child(self, option: _Extension, t: int) -> Hypothesis:
-        """Make the hypothesis that an option leads to, with its pose at step t."""
-        moved = option.of
-        n = len(moved.mean) - 3
-        position, heading, places, seen = moved.position, moved.heading, moved.places, moved.seen
-        place, there, sights = option.place, option.dstate, moved.sights
-        drives, changes = moved.drives, moved.changes
-        pose = self._reckoning.met(
-            moved,
-            t,
-            None if place is None else position[place],
-            None if there is None else heading[there],
-        )
-        if place is None:
-            place = len(position)
-            position, sights = [*position, n], [*sights, self._sights.shown[t]]
-            drives = [*drives, self._sights.drive[t]]
-        elif drives[place] != self._sights.drive[t]:
-            changes += self._sights.changes(moved, place, t)
-            sights = [*sights[:place], self._sights.shown[t], *sights[place + 1 :]]
-            drives = [*drives[:place], self._sights.drive[t], *drives[place + 1 :]]
-        if there is None:
-            there = len(places)
-            places, seen = [*places, place], [*seen, {}]
-            heading = [*heading, len(pose[0]) - 4]
-        number, links = self._sights.seen[t], moved.links
-        if not moved.slips(t):
-            links = {**links, (moved.labels[-1], self._log.actions[t - 1]): there}
-        if number not in seen[there] or "misread" in self._fault:
-            doubt = self._doubt(t) + seen[there].get(number, 0.0)
-            seen = [*seen[:there], {**seen[there], number: doubt}, *seen[there + 1 :]]
-        return Hypothesis(
-            [*moved.labels, there],
-            places,
-            seen,
-            links,
-            sights,
-            drives,
-            position,
-            heading,
-            *pose,
-            option.nats,
-            changes,
-            moved.faults,
-            moved.pieces.grown(place=option.place is None, dstate=option.dstate is None),
-        )
