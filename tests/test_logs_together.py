@@ -30,9 +30,12 @@ from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.output.layout import layout
 from ssh_abduction.robot_logs import log_report
-from ssh_abduction.robot_logs.log_maps import map_log
+from ssh_abduction.robot_logs.log_maps import BARE, map_log
 from ssh_abduction.robot_logs.log_picture import ASIDE, colour_of, laid_over
 from ssh_abduction.solver import Solution, solve
+from ssh_abduction.solver.guesses.joint_maps import Joining
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 SHARED = 30  # scans that both drives have
@@ -119,6 +122,25 @@ def test_join_logs_keeps_a_single_log(
 ) -> None:
     part = joint[2][0]
     assert join_logs(halves[:1], [part]) == (halves[0], part)
+
+
+@pytest.mark.slow
+def test_places_that_fit_after_others_are_merged() -> None:
+    """Some pairs of places fit only after other pairs have made the poses more certain."""
+    logs = [
+        RobotLog(tuple(scans_of(record(World.named("doors"), seed=seed))), source=f"tour {seed}")
+        for seed in (1, 2)
+    ]
+    parts = [import_log(log, name=log.source) for log in logs]
+    problem = settle(join_logs(logs, parts)[1].trace, BARE)
+    joining = Joining(problem, Log(problem.trace, problem.theory, problem.pairs))
+    *_, ssh_map = joining.maps()
+    places = [
+        {ssh_map.place_of(t) for t in range(drive.first, drive.stop)}
+        for drive in drives_of(problem.trace)
+    ]
+    assert [len(some) for some in places] == [11, 13]
+    assert len(places[0] & places[1]) >= 10
 
 
 @pytest.mark.slow

@@ -233,15 +233,20 @@ class Overlay:
         of the drive is turned by it, in radians. Returns whether the two can be one dstate, or one
         place.
         """
-        self._state, self._changes = self._apart, self._costs.copy()
+        self._state = self._apart
         new += self._old[0]
         self._lay(old, new, turn)
         places = self._both.places[old], self._both.places[new]
         if not (self._tried([(old, new)]) if turn is None else self._tried([], places)):
             return False
-        while pair := self._surest():
-            if not self._tried([], pair):
-                self._changes[pair] = math.inf
+        merged = True
+        while merged:  # what was refused may fit now
+            merged, self._changes = False, self._costs.copy()
+            while pair := self._surest():
+                if self._tried([], pair):
+                    merged = True
+                else:
+                    self._changes[pair] = math.inf
         return True
 
     def part(self) -> Part:
