@@ -693,6 +693,7 @@ def test_errors_of_learning_verbs_are_one_line(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_processes")
 def test_reproduce_writes_the_page_and_its_data(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

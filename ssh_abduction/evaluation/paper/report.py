@@ -37,7 +37,6 @@ from ssh_abduction.evaluation.paper.experiments import (
 )
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output import to_svg
-from ssh_abduction.runtime import program
 from ssh_abduction.solver import workers
 
 # Depths of the notch in metres.
@@ -105,14 +104,6 @@ def reproduce(
 def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
     """Yield the results of `work` for these tasks, in their order, from `jobs` processes."""
     processes = min(effective_n_jobs(jobs), len(tasks))
-    if processes == 1:
-        for task in tasks:
-            result = work(*task)
-            # An interrupted search returns its best answer, which is no evidence for the claims.
-            if program.raised:
-                raise KeyboardInterrupt
-            yield result
-        return
     ready: dict[int, Any] = {}  # results that wait for earlier ones
     turn = 0
     numbered = [(number, work, task) for number, task in enumerate(tasks)]

@@ -26,11 +26,10 @@ NEAR, FACING = 0.3, {"dstates": 0.1, "places": 6.28}
 RADIUS = 0.75
 
 
-def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) -> str:
+def tmap2(roads: Roads, name: str, frame: str) -> str:
     """Write a map as the YAML text of a topological map.
 
-    `name` names the map and its pointset, `frame` the coordinate frame of the positions. `updated`
-    is the time when the map was made; None for now.
+    `name` names the map and its pointset, `frame` the coordinate frame of the positions.
     """
     title = {"places": "place", "dstates": "dstate"}[roads.level]
     names = {stop.id: f"{title}-{stop.id}" for stop in roads.stops}
@@ -43,7 +42,7 @@ def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) 
     # Edges name their action, which the map describes once.
     data = {
         "meta": {
-            "last_updated": (updated or datetime.now(UTC)).strftime("%Y-%m-%d_%H-%M-%S"),
+            "last_updated": datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S"),
             "positions": "metres" if roads.metric else "layout",
         },
         "metric_map": name,
