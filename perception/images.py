@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import zipfile
 from pathlib import Path
 from typing import BinaryIO
@@ -92,7 +93,9 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
     try:
         # numpy leaves a damaged file open, so open it here.
         with path.open("rb") as file:
-            _affordable(file)
+            if zipfile.is_zipfile(file):
+                refuse_huge(file, "images", "write fewer images to each file")
+            file.seek(0)
             data = np.load(file, allow_pickle=False)
             table = (
                 data
@@ -125,14 +128,11 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
     return table.astype(float)
 
 
-def _affordable(file: BinaryIO) -> None:
-    """Raise PerceptionError if an archive would unpack to more than LARGEST bytes."""
-    if zipfile.is_zipfile(file):
-        with zipfile.ZipFile(file) as archive:
-            unpacked = sum(part.file_size for part in archive.infolist())
-        if unpacked > LARGEST:
-            raise PerceptionError(
-                f"images: expected at most {LARGEST} bytes once unpacked, got {unpacked}; "
-                "write fewer images to each file"
-            )
-    file.seek(0)
+def refuse_huge(file: BinaryIO | str | os.PathLike[str], what: object, mend: str) -> None:
+    """Raise PerceptionError if the zip archive `what` would unpack to more than LARGEST bytes."""
+    with zipfile.ZipFile(file) as archive:
+        unpacked = sum(part.file_size for part in archive.infolist())
+    if unpacked > LARGEST:
+        raise PerceptionError(
+            f"{what}: expected at most {LARGEST} bytes once unpacked, got {unpacked}; {mend}"
+        )

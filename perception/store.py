@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import platform
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -22,7 +21,7 @@ from sklearn.pipeline import Pipeline
 
 from perception.appearance import PanoramaTransformer
 from perception.errors import PerceptionError
-from perception.images import LARGEST
+from perception.images import refuse_huge
 from perception.likelihood import ImageLikelihood
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecogniser
@@ -143,13 +142,7 @@ def load(path: str | os.PathLike[str]) -> Stored:
     """
     try:
         # Measure and check the types before reading any object.
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(part.file_size for part in archive.infolist())
-        if unpacked > LARGEST:
-            raise PerceptionError(
-                f"{path}: expected at most {LARGEST} bytes once unpacked, got {unpacked}; "
-                "train with fewer images"
-            )
+        refuse_huge(path, path, "train with fewer images")
         if foreign := _foreign(file=path):
             raise PerceptionError(
                 f"{path}: expected scikit-learn's and this package's types only, got "

@@ -206,6 +206,20 @@ def _driver(
         if given is not None:
             mend = f"make one with {kind.__name__}(), or leave it out"
             an_instance(name, given, kind, SimulatorError, mend=mend)
+    body = body or Body()
+    _check_world(world, body)
+    rng = np.random.default_rng(seed)
+    return Driver(
+        world.arranged(rng),
+        SimulatedRobot(body, world.start, rng),
+        laser or Laser(),
+        rng,
+        tolerance or Tolerance(),
+    )
+
+
+def _check_world(world: World, body: Body) -> None:
+    """Check that a robot can drive in a world. Raises SimulatorError."""
     if world.lifts and world.angles == "any":
         raise SimulatorError(
             f"{world.name}: lifts: expected a world whose streets meet at right angles, got one "
@@ -216,7 +230,6 @@ def _driver(
             f"{world.name}: route: expected at least one action, got none; add it to the "
             "world, or give one"
         )
-    body = body or Body()
     x, y, _ = world.start
     # The robot must fit where it starts.
     if not world.holds(x, y) or world.clearance(x, y) < body.radius:
@@ -224,14 +237,6 @@ def _driver(
             f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, "
             f"{y}); move it"
         )
-    rng = np.random.default_rng(seed)
-    return Driver(
-        world.arranged(rng),
-        SimulatedRobot(body, world.start, rng),
-        laser or Laser(),
-        rng,
-        tolerance or Tolerance(),
-    )
 
 
 def _at_dstates(

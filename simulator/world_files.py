@@ -119,20 +119,8 @@ class WorldReader(FieldReader):
             raise self.wrong(
                 "format", f'an object with "format": "{FORMAT}", "version": {VERSION}', data
             )
-        each = partial(self.each, data, optional=True)
-        walls = [
-            *each("polygons", self.loop),
-            *each("segments", self.segment),
-            *each("arcs", self.arc),
-        ]
-        if "occupancy" in data:
-            walls.append(self.occupancy(data["occupancy"]))
-        if not walls:
-            raise self.wrong(
-                "polygons", "at least one wall in polygons, segments, arcs or occupancy", []
-            )
+        segments, each = self.walls(data), partial(self.each, data, optional=True)
         # Places are those of dstates and those listed; routes may also lead through other points.
-        segments = np.vstack(walls)
         dstates = each("dstates", self.dstate)
         places = {state.place: state.pose[:2] for state in dstates} | self.points(
             data.get("places", {}), "places"
@@ -156,6 +144,22 @@ class WorldReader(FieldReader):
             "via": via,
             "lifts": lifts,
         }
+
+    def walls(self, data: Mapping[str, Any]) -> Array:
+        """Read all walls, as segments: (n, 4), metres."""
+        each = partial(self.each, data, optional=True)
+        walls = [
+            *each("polygons", self.loop),
+            *each("segments", self.segment),
+            *each("arcs", self.arc),
+        ]
+        if "occupancy" in data:
+            walls.append(self.occupancy(data["occupancy"]))
+        if not walls:
+            raise self.wrong(
+                "polygons", "at least one wall in polygons, segments, arcs or occupancy", []
+            )
+        return np.vstack(walls)
 
     def row(self, value: Any, count: int, name: str) -> Array:
         """Read a list of `count` finite numbers: (count,)."""

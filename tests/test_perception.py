@@ -806,7 +806,7 @@ def test_recogniser_file_that_unpacks_too_large_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store.save(fitted(), tmp_path / "a.skops")
-    monkeypatch.setattr(store, "LARGEST", 100)
+    monkeypatch.setattr("perception.images.LARGEST", 100)
     with pytest.raises(PerceptionError, match="expected at most 100 bytes once unpacked"):
         store.load(tmp_path / "a.skops")
 
