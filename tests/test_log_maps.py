@@ -333,6 +333,20 @@ def test_map_on_an_unreliable_track_has_no_probability(
         assert (solution.confidence == 0.0, said) == (not is_reliable, not is_reliable)
 
 
+def test_map_has_poses_if_the_search_left_no_time_to_fit_them(
+    hall: Path, runs: Path, imported_hall: Imported, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = Solution.load(runs / "hall" / "maps.json", imported_hall.trace)
+    without = replace(known, maps=tuple(replace(one, fit=None) for one in known.maps))
+    monkeypatch.setattr(log_maps, "import_log", lambda *_: imported_hall)
+    monkeypatch.setattr(log_maps.LogMapping, "solve", lambda *_, **__: without)
+    found, expected = map_log(read_log(hall), with_ladder=False).solution.maps[0], known.maps[0]
+    assert found.fit
+    assert expected.fit
+    for pose, other in zip(found.fit.poses, expected.fit.poses, strict=True):
+        assert (pose.x, pose.y) == pytest.approx((other.x, other.y), abs=0.01)
+
+
 @pytest.mark.parametrize(("limit", "searches"), [(None, 3), (5.0, 1)])
 def test_search_without_a_limit_continues_until_it_has_a_map(
     hall: Path,

@@ -54,7 +54,8 @@ class MoveGraph:
         if by == "metres" and self._poses is None:
             raise MapError(
                 "by: expected actions or places, got metres: the map has no poses; "
-                "solve a trace with displacements, or take --by actions"
+                "solve a trace with displacements, and without a short time limit, or take --by "
+                "actions"
             )
         if by == "places" and not ssh_map.paths:
             raise MapError(

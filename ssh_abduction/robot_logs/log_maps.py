@@ -31,12 +31,14 @@ from ssh_abduction.data.checks import all_instances
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.files import json_line
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import report
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import (
+    Ranking,
     Solution,
     Status,
     find_backbone,
@@ -327,6 +329,7 @@ def map_log(
         warnings = (*notes, ended) if ended else notes
         solution = solution if corrections is None else with_names(corrections, solution, trace)
         solution = solution if imported.track.is_reliable else _doubted(solution)
+        solution = _with_poses(solution, trace)
         return LogMap(
             log, imported, solution, tuple(climbed), dict(seconds), allowed, warnings, interrupted
         )
@@ -368,6 +371,14 @@ def map_log(
         )
         seconds["ladder"] = round(time.process_time() - begin, 3)
     return outcome(solution, mapping.interrupted)
+
+
+def _with_poses(solution: Solution, trace: Trace) -> Solution:
+    """Fit the poses of the first map, if the time limit left no time for it."""
+    if solution.theory.displacement != "use" or not solution.maps or solution.maps[0].fit:
+        return solution
+    first, *others = solution.maps
+    return replace(solution, maps=(Ranking(trace).fitted(first), *others))
 
 
 def _doubted(solution: Solution) -> Solution:

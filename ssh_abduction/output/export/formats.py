@@ -146,7 +146,7 @@ def export_doubts(
     if not roads.metric:
         found.append(
             "the map has no poses: its positions are of a layout, and no metres; "
-            "solve a trace with displacements"
+            "solve a trace with displacements, and without a short time limit"
         )
     if len(ssh_map.pieces) > 1:
         found.append(
