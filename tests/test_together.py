@@ -51,6 +51,7 @@ from ssh_abduction.rivals.drive_joins import DriveJoin
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.guesses.extending import Extending
 from ssh_abduction.solver.guesses.pieces import Pieces, headings_by_turn
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
@@ -400,7 +401,7 @@ def test_beam_keeps_a_true_join_that_costs_more_at_first(seed: int, steps: int) 
 def test_drive_that_shares_one_place_gets_four_headings() -> None:
     (known,) = of_mazes(3, 2, [0], truth.Noise(Odometry(**truth.NOISE)), drives=1)
     problem = settle(known.trace, Theory())
-    first = Beam(problem, Log(problem.trace, problem.theory, problem.pairs), 1)._first()
+    first = Extending(problem, Log(problem.trace, problem.theory, problem.pairs)).first()
     pieces = Pieces(here=5, of_heading=(0, 5), hinges={5: first.position[0]})
     found = replace(first, heading=first.heading * 2, pieces=pieces)
     one, other = zip(*headings_by_turn(found), strict=True)
