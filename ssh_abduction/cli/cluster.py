@@ -23,6 +23,7 @@ from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
+    from perception.views import ViewClusterer
     from ssh_abduction.learning.traces import Traces
 
 IMAGES = "images.npz"  # the common sidecar file of traces that are clustered together
@@ -101,6 +102,20 @@ def run(options: argparse.Namespace) -> int:
     clustered = traces.with_views(
         images, clusterer.labels_, clusterer.runner_up_labels_, clusterer.confidence_
     )
+    said = f"{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}"
+    _write(clustered, files, options, f"{_choice_of_k(clusterer, uncertainty)}\n{said}")
+    warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
+    warn(runner_up_doubts(clustered))
+    if options.plot:
+        sys.stdout.flush()  # print first, in case drawing fails
+        from ssh_abduction.evaluation.paper.figures import draw_quality
+
+        draw_quality(options.plot, clusterer.quality_, uncertainty, clusterer.k_)
+    return 0
+
+
+def _choice_of_k(clusterer: ViewClusterer, uncertainty: dict[int, float]) -> str:
+    """Return a table of the measures by which k was chosen."""
     columns = {"M": clusterer.quality_, "trimmed": clusterer.trimmed_}
     columns |= {"U": uncertainty} if uncertainty else {}
     words = {clusterer.k_: "chosen", clusterer.runner_up_: "runner-up"}
@@ -112,17 +127,7 @@ def run(options: argparse.Namespace) -> int:
         ]
         for k in clusterer.quality_
     ]
-    chosen = table(["k", *columns, ""], rows)
-    said = f"{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}"
-    _write(clustered, files, options, f"{chosen}\n{said}")
-    warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
-    warn(runner_up_doubts(clustered))
-    if options.plot:
-        sys.stdout.flush()  # print first, in case drawing fails
-        from ssh_abduction.evaluation.paper.figures import draw_quality
-
-        draw_quality(options.plot, clusterer.quality_, uncertainty, clusterer.k_)
-    return 0
+    return table(["k", *columns, ""], rows)
 
 
 def _files(options: argparse.Namespace) -> dict[str, str]:
