@@ -57,8 +57,8 @@ class Recent:
         return np.array(self._poses[begin - self._base : end - self._base]).reshape(-1, 3)
 
     def way(self, index: int) -> float:
-        """Return the metres driven up to a scan, or up to the first one that is kept."""
-        return self._ways[max(index, self.begin) - self._base]
+        """Return the metres driven up to a scan, or up to the first one that is kept; 0 if none."""
+        return self._ways[max(index, self.begin) - self._base] if self._ways else 0.0
 
     def at(self, way: float, side: Literal["left", "right"] = "left") -> int:
         """Find the first kept scan at which the robot has driven `way` metres.
