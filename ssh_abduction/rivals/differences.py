@@ -189,25 +189,10 @@ def difference(
     )
     if len(called) != 2:
         raise MapError(f"names: expected two, one for each map, got {brief(names)}; name both")
-    if len(first.dstate_at) != len(other.dstate_at):
-        raise MapError(
-            f"maps: expected two of one trace, got one of {len(first.dstate_at)} steps and one of "
-            f"{len(other.dstate_at)}; take maps of the same trace"
-        )
-    first, other = first.renumbered(), other.renumbered()
     named = all_instances("drives", drives, Drive, MapError, mend="take those of a solution")
-    if named and named[-1].stop != len(first.dstate_at):
-        raise MapError(
-            f"drives: expected drives of {len(first.dstate_at)} steps in all, as the maps have, "
-            f"got {named[-1].stop}; use the drives of the solution"
-        )
+    _check_steps(first, other, named)
+    first, other = first.renumbered(), other.renumbered()
     table = Table([first, other], named)
-    links = (_named_links(first, table.steps), _named_links(other, table.steps))
-    unmoved = _unmoved(first, other)
-    only = [
-        tuple(sorted(k for k in mine - theirs if k[0] in unmoved and k[2] in unmoved))
-        for mine, theirs in (links, links[::-1])
-    ]
     faults = [
         tuple(f for f in mine.faults if f not in theirs.faults)
         for mine, theirs in ((first, other), (other, first))
@@ -217,12 +202,26 @@ def difference(
         names=(called[0], called[1]),
         sizes=(_size(first), _size(other)),
         changes=tuple(_all_changes(table)),
-        links=(only[0], only[1]),
+        links=_links_only_in(first, other, table.steps),
         faults=(faults[0], faults[1]),
         chi2=(first.fit.chi2, other.fit.chi2) if first.fit and other.fit else None,
         has_places=(bool(first.places), bool(other.places)),
         sides=only_in(first, other, table.steps),
     )
+
+
+def _check_steps(first: SSHMap, other: SSHMap, drives: Sequence[Drive]) -> None:
+    """Raise MapError unless two maps, and the drives if there are any, have as many steps."""
+    if len(first.dstate_at) != len(other.dstate_at):
+        raise MapError(
+            f"maps: expected two of one trace, got one of {len(first.dstate_at)} steps and one of "
+            f"{len(other.dstate_at)}; take maps of the same trace"
+        )
+    if drives and drives[-1].stop != len(first.dstate_at):
+        raise MapError(
+            f"drives: expected drives of {len(first.dstate_at)} steps in all, as the maps have, "
+            f"got {drives[-1].stop}; use the drives of the solution"
+        )
 
 
 def _all_changes(table: Table) -> list[Change]:
@@ -261,6 +260,18 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
 def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
     """Group classes that a map joins. `ones` is its row in `Table.ones`; NONE is left out."""
     return list(gathered((ones[c], c) for c in classes if ones[c] != NONE).values())
+
+
+def _links_only_in(
+    first: SSHMap, other: SSHMap, steps: Sequence[int]
+) -> tuple[tuple[Link, ...], tuple[Link, ...]]:
+    """Find the links that only one map has, between dstates that have the same steps in both."""
+    unmoved = _unmoved(first, other)
+    here, there = (
+        {(s, action, x) for s, action, x in _named_links(m, steps) if {s, x} <= unmoved}
+        for m in (first, other)
+    )
+    return tuple(sorted(here - there)), tuple(sorted(there - here))
 
 
 def _named_links(ssh_map: SSHMap, steps: Sequence[int]) -> set[Link]:

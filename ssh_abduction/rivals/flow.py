@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
@@ -89,13 +90,42 @@ def shortest_flow(
     Returns:
         A count for each move; None if there is no walk, or none was found in time.
     """
+    costs, bounds, rules = _program(moves, start, due, unseen)
+    for _ in range(rounds):
+        found = milp(
+            costs,
+            constraints=rules,
+            integrality=np.ones(len(costs)),
+            bounds=bounds,
+            options={"time_limit": patience},
+        )
+        if found.x is None:
+            return None
+        times = np.round(found.x[: len(moves)]).astype(int)
+        used = [move for move, n in zip(moves, times, strict=True) if n]
+        if not (cut_off := _parts_cut_off(used, start)):
+            break
+        for part in cut_off:
+            entering = [float(x.target in part and x.source not in part) for x in moves]
+            entering += [0.0] * (len(costs) - len(moves))
+            rules.append(LinearConstraint(np.array([entering]), 1, np.inf))
+    near = reached_from(used, start)
+    return [int(n) if move.source in near else 0 for move, n in zip(moves, times, strict=True)]
+
+
+def _program(
+    moves: Sequence[StanceMove], start: int, due: set[int], unseen: set[int]
+) -> tuple[NDArray[np.float64], Bounds, list[LinearConstraint]]:
+    """Make the integer program of a flow: costs, bounds and constraints of its variables.
+
+    The variables are the count of each move, and for each stance whether it is the last one.
+    """
     number = {n: i for i, n in enumerate(sorted(reached_from(moves, start)))}
     m, size = len(moves), len(number)
     sources, targets = (
         np.array([number[n] for n in ends])
         for ends in ([x.source for x in moves], [x.target for x in moves])
     )
-    # variables: the count of each move, and for each stance whether it is the last one
     kinds = [np.arange(m), np.arange(m), m + np.arange(size)]
     balance = coo_array(
         (
@@ -117,20 +147,7 @@ def shortest_flow(
         np.r_[[float(k in due) for k in range(m)], np.zeros(size)],
         np.r_[np.full(m, float(size)), np.ones(size)],
     )
-    for _ in range(rounds):
-        limit, whole = {"time_limit": patience}, np.ones(m + size)
-        found = milp(costs, constraints=rules, integrality=whole, bounds=bounds, options=limit)
-        if found.x is None:
-            return None
-        times = np.round(found.x[:m]).astype(int)
-        used = [move for move, n in zip(moves, times, strict=True) if n]
-        if not (cut_off := _parts_cut_off(used, start)):
-            break
-        for part in cut_off:
-            entering = [float(x.target in part and x.source not in part) for x in moves]
-            rules.append(LinearConstraint(np.r_[entering, np.zeros(size)][None], 1, np.inf))
-    near = reached_from(used, start)
-    return [int(n) if move.source in near else 0 for move, n in zip(moves, times, strict=True)]
+    return costs, bounds, rules
 
 
 def _parts_cut_off(used: Sequence[StanceMove], start: int) -> list[set[int]]:

@@ -116,16 +116,7 @@ def questions_of(
     They are in the order of causes (faults, dstates, places, paths, courses), and then of
     steps. `same_places` says whether all maps have the same places.
     """
-    found: dict[bytes, AnsweredQuestion] = {}
-    faults = {fault for ssh_map in maps for fault in ssh_map.faults}
-    for fault in sorted(faults, key=lambda f: (f.step, f.kind, str(f.seen), str(f.expected))):
-        column = np.array([fault in ssh_map.faults for ssh_map in maps])
-        if not column.all():
-            at = (fault.step,)
-            yes = int(column.sum())
-            question = Question("faults", fault.step, fault.step, yes, at, at, fault=fault)
-            asked = found.setdefault(_key(column), AnsweredQuestion(question, column, {}))
-            asked.steps.setdefault("faults", set()).add(fault.step)
+    found = _about_faults(maps)
     places = [maps[0].dstates[label].place for label in maps[0].dstate_at] if same_places else []
     steps_by_class = {
         number: [table.steps[t] for t in steps]
@@ -161,6 +152,20 @@ def questions_of(
         found.values(),
         key=lambda a: (MATTERS.index(a.question.sort), a.question.later, a.question.first),
     )
+
+
+def _about_faults(maps: Sequence[SSHMap]) -> dict[bytes, AnsweredQuestion]:
+    """Find the questions about faults that distinguish maps, by the keys of their answers."""
+    found: dict[bytes, AnsweredQuestion] = {}
+    faults = {fault for ssh_map in maps for fault in ssh_map.faults}
+    for fault in sorted(faults, key=lambda f: (f.step, f.kind, str(f.seen), str(f.expected))):
+        column = np.array([fault in ssh_map.faults for ssh_map in maps])
+        if not column.all():
+            at, yes = (fault.step,), int(column.sum())
+            question = Question("faults", fault.step, fault.step, yes, at, at, fault=fault)
+            asked = found.setdefault(_key(column), AnsweredQuestion(question, column, {}))
+            asked.steps.setdefault("faults", set()).add(fault.step)
+    return found
 
 
 def _key(column: Bools) -> bytes:

@@ -276,6 +276,32 @@ class Search:
         engine = type(parts.engine).__name__
         _log.info("search of %r under %r, with %s", self.trace, self.theory, engine)
         watch.start()
+        yield from self._searched()
+        fall_back(parts, self._answer)
+        self.clash = self.clash or late_clash(
+            parts, lambda trace, theory: self._solve_mended(trace, theory, 1, CLASHING)
+        )
+        if self._weighing is not None:
+            # If this takes too long after a limit, the map has no cost in nats.
+            ended = known.stopped in ("time limit", "interrupted")
+            seconds = _late(parts) if ended else math.inf
+            with suppress(LimitError), heeding(Watch().part(seconds).check):
+                self._weighing.keep_best()
+        yield from best_map(parts)
+        if self._reasons:
+            _reason(parts)
+        _log.info(
+            "ended after %.2f s%s: %s, %s%s",
+            watch.elapsed(),
+            f" ({self.stopped})" if self.stopped else "",
+            self.status.value,
+            counted(self.count, "maps"),
+            "" if self.complete else ", perhaps not all",
+        )
+
+    def _searched(self) -> Iterator[Priced]:
+        """Yield the maps of the search until it is complete. Store why it stops earlier, if so."""
+        parts, known, watch = self._parts, self._parts.known, self._parts.watch
         try:
             _begin_with(self._known_maps, parts, self._weighing)
             with heeding(watch.check):
@@ -302,27 +328,6 @@ class Search:
             raise
         finally:
             parts.end_clingo()
-        fall_back(parts, self._answer)
-        self.clash = self.clash or late_clash(
-            parts, lambda trace, theory: self._solve_mended(trace, theory, 1, CLASHING)
-        )
-        if self._weighing is not None:
-            # If this takes too long after a limit, the map has no cost in nats.
-            ended = known.stopped in ("time limit", "interrupted")
-            seconds = _late(parts) if ended else math.inf
-            with suppress(LimitError), heeding(Watch().part(seconds).check):
-                self._weighing.keep_best()
-        yield from best_map(parts)
-        if self._reasons:
-            self._reason()
-        _log.info(
-            "ended after %.2f s%s: %s, %s%s",
-            watch.elapsed(),
-            f" ({self.stopped})" if self.stopped else "",
-            self.status.value,
-            counted(self.count, "maps"),
-            "" if self.complete else ", perhaps not all",
-        )
 
     def _weigh(self, weighing: Weighing) -> None:
         """Find the maps of least cost: guess some, find one with the fewest dstates, then prove."""
@@ -370,16 +375,6 @@ class Search:
             self.interrupt()
         is_listed = most == 1 or search.complete or search.stopped == "maps limit"
         return maps, is_listed and search.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
-
-    def _reason(self) -> None:
-        """Prove what all minimal maps share, if not all of them are listed."""
-        watch = self._parts.watch
-        watch.start()
-        spent = watch.elapsed()
-        ends = spent + max(REASONING, spent) if watch.left() == math.inf else math.inf
-        with heeding(watch.check), watch.stage(ends):
-            self._parts.rivals.reason()
-        watch.stop()
 
     def interrupt(self) -> None:
         """End the search soon, with the best answer so far.
@@ -455,6 +450,17 @@ def _begin_with(maps: Sequence[SSHMap], parts: Parts, weighing: Weighing | None)
             weighing.add(ssh_map)
     if weighing is not None and maps:
         weighing.keep_best()
+
+
+def _reason(parts: Parts) -> None:
+    """Prove what all minimal maps share, if not all of them are listed."""
+    watch = parts.watch
+    watch.start()
+    spent = watch.elapsed()
+    ends = spent + max(REASONING, spent) if watch.left() == math.inf else math.inf
+    with heeding(watch.check), watch.stage(ends):
+        parts.rivals.reason()
+    watch.stop()
 
 
 def _with_names(ssh_map: SSHMap, trace: Trace, drives: Sequence[Drive]) -> SSHMap:

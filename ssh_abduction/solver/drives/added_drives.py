@@ -115,25 +115,32 @@ def solve_onto(
         found, maps = replace(found, status=Status.FEASIBLE, cost=Cost.of(grown)), (grown,)
     if not maps:
         raise _contradiction(old, trace, ssh_map, digest, found)
+    solution = _of_joint_trace(found, maps, theory, joint, solving.watch)
+    support = Support(
+        odometry_warning=found.support.odometry_warning,
+        weigh_warning=found.support.weigh_warning,
+        weighed=None if short or not kept else _weighed(found, len(old), ssh_map),
+        onto=tuple(drive.name for drive in drives_of(old)),
+    )
+    return _named(replace(solution, support=support), ssh_map, corrections)
+
+
+def _of_joint_trace(
+    found: Solution, maps: tuple[SSHMap, ...], theory: Theory, joint: Trace, watch: Watch
+) -> Solution:
+    """Turn the solution for a digest and a new drive into one for all drives, with these maps."""
     assert found.cost is not None
-    solution = replace(
+    return replace(
         found,
         maps=maps,
         # The theory for the digest has assertions about its steps.
         theory=found.theory.replace(**{kind: getattr(theory, kind) for kind in ASSERTIONS}),
         steps=len(joint),
-        effort=_effort(found, len(joint), solving.watch),
+        effort=_effort(found, len(joint), watch),
         levels=(Level(found.cost, len(maps), found.complete),) if found.within else (),
         shared=None,
         trace=joint,
-        support=Support(
-            odometry_warning=found.support.odometry_warning,
-            weigh_warning=found.support.weigh_warning,
-            weighed=None if short or not kept else _weighed(found, len(old), ssh_map),
-            onto=tuple(drive.name for drive in drives_of(old)),
-        ),
     )
-    return _named(solution, ssh_map, corrections)
 
 
 def _of_all_drives(

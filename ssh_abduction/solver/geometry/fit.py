@@ -327,28 +327,23 @@ class Poses:
         predicted, cos, sin = self._predicted(unknown)
         scale = 1 + unknown[-2] * self._sigma[0] * self._scaled
         m, heading = len(self._moved), 2 * self._positions
-        zero, one = np.zeros(m), np.ones(m)
+        zero, turn = np.zeros(m), np.tile([0.0, 0.0, 1.0], (m, 1))
         ahead, left = predicted[:, 0], predicted[:, 1]
         by_x = np.stack([scale * cos, -scale * sin, zero], 1)
         by_y = np.stack([scale * sin, scale * cos, zero], 1)
         by_facing = np.stack([left, -ahead, zero], 1)
+        by_scale = np.stack([ahead, left, zero], 1)
+        by_scale *= (self._sigma[0] * self._scaled / scale)[:, None]
+        by_bend = (-by_facing / 2 + turn) * self._way[:, None] * self._sigma[1]
         columns = [
             (2 * self._place[self._to], by_x),
             (2 * self._place[self._to] + 1, by_y),
             (2 * self._place[self._from], -by_x),
             (2 * self._place[self._from] + 1, -by_y),
-            (heading + self._from, by_facing - np.stack([zero, zero, one], 1)),
-            (heading + self._to, np.stack([zero, zero, one], 1)),
-            (
-                np.full(m, self._size - 2),
-                np.stack([ahead, left, zero], 1) * (self._sigma[0] * self._scaled / scale)[:, None],
-            ),
-            (
-                np.full(m, self._size - 1),
-                (-by_facing / 2 + np.stack([zero, zero, one], 1))
-                * self._way[:, None]
-                * self._sigma[1],
-            ),
+            (heading + self._from, by_facing - turn),
+            (heading + self._to, turn),
+            (np.full(m, self._size - 2), by_scale),
+            (np.full(m, self._size - 1), by_bend),
         ]
         rows = np.arange(3 * m)
         values = [

@@ -144,11 +144,7 @@ class Explainer:
             better = best <= now
             came[t][better], now[better] = source[better], best[better]
             spent = now + wrong[self.seen[t]] * misread[t]
-        labels = [int(spent.argmin())]
-        for t in range(steps - 1, 0, -1):
-            labels.append(int(came[t, labels[-1]]))
-        labels.reverse()
-        return self._explained(machine, labels)
+        return self._explained(machine, _traced_back(int(spent.argmin()), came))
 
     def completed(self, machine: PartialMachine) -> Explained:
         """Add links to a machine until no step of the trace lacks one, and explain the trace by it.
@@ -338,13 +334,18 @@ class _Model:
             ways = spent[:, None] + matrices[self._actions[t - 1]]
             came[t] = ways.argmax(axis=0)
             spent = ways[came[t], np.arange(len(spent))] + sees[t]
-        labels = [int(spent.argmax())]
-        for t in range(len(sees) - 1, 0, -1):
-            labels.append(int(came[t, labels[-1]]))
-        return labels[::-1]
+        return _traced_back(int(spent.argmax()), came)
 
     def _normal(self, counts: Floats) -> Floats:
         """Turn counts into transition probabilities. Slips lead to each state equally often."""
         chances: Floats = counts / counts.sum(axis=2, keepdims=True)
         slipping: Floats = (1 - self._slip) * chances + self._slip / counts.shape[2]
         return slipping
+
+
+def _traced_back(last: int, came: NDArray[np.int32]) -> list[int]:
+    """List the states of all steps. `came` has the state before each state, (steps, states)."""
+    states = [last]
+    for before in came[:0:-1]:
+        states.append(int(before[states[-1]]))
+    return states[::-1]

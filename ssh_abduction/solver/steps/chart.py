@@ -20,7 +20,7 @@ they are different dstates, as in `steps/apart.py`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -177,13 +177,7 @@ class Chart:
             node_of.append(here)
             if t and action.kind != "turn":
                 travels.append((node_of[-2], log.actions[t - 1], here))
-        rotations = [
-            (s, -((k - j) % 4), x)
-            for (v, j), s in node.items()
-            for k in range(4)
-            if k != j and (x := node.get((v, k))) is not None
-        ]
-        links = sorted([*travels, *rotations], key=lambda link: max(link[0], link[2]))
+        links = sorted([*travels, *_rotations(node)], key=lambda link: max(link[0], link[2]))
         facing = tuple(node)
         away = {(node_of[i], node_of[j]) for i, j in _pairs_within(log.pairs.elsewhere, size)}
         excluded = {
@@ -315,6 +309,14 @@ class FramedChart(Chart):
                     alike = ((leaves[i] + r) % 4 == leaves) & (action == action[i])
                     row[:-1] |= alike[:-1] & misfits[0, i + 1, 1:]
         return misfits
+
+
+def _rotations(node: Mapping[tuple[int, int], int]) -> Iterator[Link]:
+    """Yield the links between the nodes of each visit. Their actions are minus the quarters."""
+    for (visit, slot), s in node.items():
+        for k in range(4):
+            if k != slot and (x := node.get((visit, k))) is not None:
+                yield s, -((k - slot) % 4), x
 
 
 def _pairs_within(earlier: Earlier, size: int) -> list[tuple[int, int]]:

@@ -6,7 +6,7 @@ Facts and rules are text in the language of clingo.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import product
 
 from clingo import Function, Symbol
@@ -89,31 +89,11 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
     done = {t: action for t, action in led.items() if not action.starts}
     facts += [f"act({t},{constant(action.name)})." for t, action in done.items()]
     facts += [f"unlinked({t})." for t, action in done.items() if action.slipped]
-    if theory.misread:
-        facts += [
-            f"price(misread,{t},{theory.fault_tenths('misread', trace.steps[t])})."
-            for t in range(start, stop)
-        ]
-    if theory.jumped:
-        moved = [t for t in range(max(start, 1), stop) if trace.steps[t].displacement is not None]
-        facts += [
-            f"moved({t}). price(jumped,{t},{theory.fault_tenths('jumped', trace.steps[t])})."
-            for t in moved
-        ]
-    if theory.changed:
-        starts, price = starts_of(trace), round(10 * theory.changed)
-        facts += [
-            f"drive({t},{bisect_right(starts, t)}). price(changed,{t},{price})."
-            for t in range(start, stop)
-        ]
+    facts += _fault_facts(problem, start, stop, done)
     if theory.lifts:
         stretches = stretches_of(trace)
         facts += [f"stretch({t},{stretches[t]})." for t in range(start, stop)]
         facts += [f"lifted({t + 1})." for t, action in done.items() if action.changes_floor]
-    if theory.slipped:
-        facts += [
-            f"price(slipped,{t},{theory.fault_tenths('slipped', trace.steps[t])})." for t in done
-        ]
     if theory.level == "topological":
         facts += [
             _kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None
@@ -121,6 +101,27 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
     if theory.star == "gateways":
         facts += _gateway_facts(trace, start, stop, changes=bool(theory.changed))
     return "\n".join([*facts, *_evidence_facts(problem, start, stop)])
+
+
+def _fault_facts(problem: Problem, start: int, stop: int, done: Iterable[int]) -> Iterator[str]:
+    """Yield the prices of the faults that the theory allows. `done` has the steps with actions."""
+    trace, theory = problem.trace, problem.theory
+    at: dict[str, Iterable[int]] = {
+        "misread": range(start, stop),
+        "jumped": [
+            t for t in range(max(start, 1), stop) if trace.steps[t].displacement is not None
+        ],
+        "changed": range(start, stop),
+        "slipped": done,
+    }
+    for kind, steps in at.items():
+        for t in steps if getattr(theory, kind) else ():
+            yield f"price({kind},{t},{theory.fault_tenths(kind, trace.steps[t])})."
+    if theory.jumped:
+        yield from (f"moved({t})." for t in at["jumped"])
+    if theory.changed:
+        starts = starts_of(trace)
+        yield from (f"drive({t},{bisect_right(starts, t)})." for t in range(start, stop))
 
 
 def _gateway_facts(trace: Trace, start: int, stop: int, *, changes: bool) -> Iterator[str]:
