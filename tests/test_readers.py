@@ -285,6 +285,20 @@ def test_beam_angles_and_reach_of_carmen_lines(
     assert np.isinf(scan.ranges[1]) == (reach < 6)
 
 
+@pytest.mark.parametrize(
+    ("ranges", "note"),
+    [
+        ("81.91 40 3 2 1", "81.91 m, a code of SICK lasers for no echo. So the laser is taken to"),
+        ("39.5 30 3 2 1", "39.5 m, which occurs 1 time. So the laser is taken to reach 40 m."),
+    ],
+)
+def test_note_says_why_a_laser_is_taken_to_reach_so_far(
+    tmp_path: Path, ranges: str, note: str
+) -> None:
+    log = read_text(tmp_path / "a.log", flaser(START, START, ranges=ranges))
+    assert note in " ".join(log.notes)
+
+
 @pytest.mark.parametrize("lines", [[], ["PARAM robot_front_laser_max 81.92 host 1"]])
 def test_error_codes_of_a_sick_laser_mean_no_return(tmp_path: Path, lines: list[str]) -> None:
     scan = read_text(

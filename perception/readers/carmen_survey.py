@@ -33,6 +33,7 @@ from perception.readers.messages import (
     vertex_of,
 )
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
+from ssh_abduction.data.words import counted
 
 # Meaning of the poses of the scans. The first four are the cases in the docstring of `carmen`, in
 # its order. `lines` means that scans have no poses, and ODOM lines between scans give them.
@@ -325,9 +326,15 @@ def reach_of(found: Findings, survey: Survey, kind: str, assumed: dict[str, str]
     )
     if reach <= 0:  # no beam measured anything, which another note says
         return math.inf
+    what = (
+        "a code of SICK lasers for no echo"
+        if reach < survey.most
+        else f"which occurs {counted(survey.repeated, 'times')}"
+    )
     assumed["no_return"] = (
-        "The log does not say how far the laser reaches. By its largest range, "
-        f"{survey.most:g} m, which occurs {survey.repeated} times, it is {reach:g} m."
+        "The log does not say how far the laser reaches. Its largest range is "
+        f"{survey.most:g} m, {what}. So the laser is taken to reach {reach:g} m. If it reaches "
+        "farther, or less far, say so: --set no_return=METRES."
     )
     return reach
 
