@@ -466,7 +466,7 @@ def test_interrupted_explanation_says_so(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("ssh_abduction.explain.pair_reasons.derive", interrupted)
+    monkeypatch.setattr("ssh_abduction.explain.pair_reasons.Argument", interrupted)
     RECTANGLE.prefix(5).save(tmp_path / "rectangle.jsonl")
     assert main(["explain", str(tmp_path / "rectangle.jsonl"), "0", "4"]) == 130
     assert capsys.readouterr().out.endswith(

@@ -48,24 +48,6 @@ _PREFERRED = (
 )
 
 
-def derive(
-    piece: Piece,
-    trace: Trace,
-    first: int,
-    second: int,
-    *,
-    one: bool,
-    stop: Callable[[], bool] = lambda: False,
-) -> Derivation:
-    """Find an argument that two steps are one dstate in all maps (if `one`), or else in none.
-
-    The caller must have proved that the steps of `piece` suffice for the proof. The argument may
-    cite displacements of the whole trace. `stop` is called now and then. If it returns True,
-    Interrupted is raised.
-    """
-    return Argument(piece, trace, first, second, one, stop).derivation()
-
-
 @dataclass(frozen=True)
 class _Line:
     """A line of an argument: the conclusions that follow from its links and the lines before it.
@@ -80,22 +62,32 @@ class _Line:
 
 
 class Argument:
-    """The search for an argument about two steps.
+    """The search for an argument that two steps are one dstate in all maps, or else in none.
 
     Inside this class steps have their numbers in the piece. Sentences give their numbers in the
-    whole trace. Parameters as in `derive`.
+    whole trace.
     """
 
     def __init__(
         self,
         piece: Piece,
         trace: Trace,
-        first: int,
-        second: int,
+        pair: tuple[int, int],
+        *,
         one: bool,
         stop: Callable[[], bool],
     ) -> None:
+        """Find the links of the argument. `derivation` finds its lines.
+
+        Args:
+            piece: A piece whose steps suffice for the proof. The caller must have proved that.
+            trace: The whole trace. The argument may cite its displacements.
+            pair: The two steps.
+            one: Whether they are one dstate in all maps; False if in none.
+            stop: Called now and then. If it returns True, Interrupted is raised.
+        """
         self._piece, self._trace, self._one = piece, trace, one
+        first, second = pair
         self._pair = piece.steps.index(first), piece.steps.index(second)
         self._axioms = Axioms(piece, stop, relaxed=True)
         self._supposed: Assumption = (facts.are_one(*self._pair), not one)

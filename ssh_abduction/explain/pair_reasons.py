@@ -27,7 +27,7 @@ from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain.argument import derive
+from ssh_abduction.explain.argument import Argument
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.derivation import Derivation
 from ssh_abduction.explain.no_map import Explanation, check_two_steps, explain
@@ -226,9 +226,10 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
                 self._ask_pieces(one, LARGE)
             if one in self._ruling_out:
                 piece = self._shrunk(self._ruling_out[one], one)
-                self._derivation = derive(
-                    piece, self.trace, self.first, self.second, one=not one, stop=self._over
-                )
+                pair = self.first, self.second
+                self._derivation = Argument(
+                    piece, self.trace, pair, one=not one, stop=self._over
+                ).derivation()
         if self._best:
             ssh_map, side = self._best
             places = [ssh_map.place_of(step) for step in (self.first, self.second)]

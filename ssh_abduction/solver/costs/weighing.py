@@ -35,6 +35,7 @@ from typing import TypeAlias
 from scipy.special import gammaincc
 
 from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.groups import first_index_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
@@ -449,7 +450,7 @@ def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
     It asserts which dstates are at different places, but not which are at one place.
     """
     labels = ssh_map.dstate_at
-    first = {label: labels.index(label) for label in dict.fromkeys(labels)}
+    first = first_index_of(labels)
     same = [(first[label], t) for t, label in enumerate(labels) if t != first[label]]
     different: list[tuple[int, int]] = []
     elsewhere: list[tuple[int, int]] = []
