@@ -27,7 +27,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, Odometry, SolverError, TheoryError, together
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.json_fields import FieldReader
-from ssh_abduction.solver import Search, Status
+from ssh_abduction.solver import Search, Status, Watch
 from ssh_abduction.solver.costs import beams, weighing
 from ssh_abduction.solver.costs.estimating import estimated, rivals_of
 from ssh_abduction.solver.costs.misfit import Misfit
@@ -403,7 +403,8 @@ def test_wider_beams_follow_while_they_find_better_maps(
         return [beam.width]
 
     clock = [0.0]
-    watch = SimpleNamespace(elapsed=lambda: clock[0], left=lambda: seconds - clock[0])
+    watch = Watch(seconds, clock=lambda: clock[0])
+    watch.start()
     candidates = SimpleNamespace(sketch=Mock(), beam=beam, maps_of=maps_of)
     task = SimpleNamespace(theory=Theory())
     parts = Mock(watch=watch, candidates=candidates, task=task)
