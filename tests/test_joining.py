@@ -19,6 +19,7 @@ from ssh_abduction.checker.checker import violations
 from ssh_abduction.checker.cost_claims import false_costs
 from ssh_abduction.data import Action, Closure, Odometry, Step, together
 from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.data.star import Gateway, Star
 from ssh_abduction.solver.costs import beams
 from ssh_abduction.solver.costs.doubts import doubt_of
@@ -27,8 +28,10 @@ from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.weighing import Weighing
 from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.kept_apart import KeptApart
+from ssh_abduction.solver.guesses.overlaying import Part
 from ssh_abduction.solver.guesses.reckoning import conditioned
 from ssh_abduction.solver.guesses.sights import Sights
+from ssh_abduction.solver.guesses.ties import relation_of, tied, ties_between
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.weighed import groups_of_drives
 from ssh_abduction.solver.steps.log import Log
@@ -302,6 +305,49 @@ def test_drives_with_one_common_view_are_joined_only_by_a_closure() -> None:
     closure = Closure(4, 5, (0.0, 0.0, 0.0), exact)
     found = solve(replace(joint, closures=(closure,)), time_limit=100).maps[0]
     assert found.dstate_at == (*range(5), 4, 5)
+
+
+def test_closures_say_how_drives_lie_on_each_other() -> None:
+    """All places look alike. By closures, the second drive comes the other way."""
+    exact = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.001))
+    closures = tuple(Closure(5 + k, 19 - k, (0.1, 0.0, math.pi), exact) for k in range(5))
+    trace = replace(along("a" * 10, "a" * 11), closures=closures)
+    *_, ssh_map = joined(settle(trace, Theory(star="none", boundary="none")))
+    places = [ssh_map.place_of(t) for t in range(21)]
+    assert len(set(places)) == 15  # six are shared
+    assert all(places[closure.first] == places[closure.last] for closure in closures)
+
+
+def test_ties_relate_maps_whichever_of_them_stands() -> None:
+    exact = ((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 1e-4))
+    between = (0.4, 0.3, 1.0)
+    trace = replace(along("abc", "cba"), closures=(Closure(1, 4, between, exact),))
+    problem = settle(trace, Theory(star="none", boundary="none"))
+    log = Log(problem.trace, problem.theory, problem.pairs)
+    sights = Sights(problem.trace, problem.theory, log, misreads=False)
+    poses = np.array([0.0, 0.0, 5.0, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0]), np.identity(9) * 0.01
+    one, other = (
+        Part.of_steps({first + t: t for t in range(3)}, range(3), poses, 0.0, log, sights)
+        for first in (0, 3)
+    )
+    back = displacement_between(between, (0.0, 0.0, 0.0))
+    for first, second, relation in ((one, other, between), (other, one, back)):
+        both = first.beside(second)
+        ties = ties_between(problem.trace, both, 3)
+        new, at, angle = relation_of(both, ties)
+        assert new == 4  # the middle dstate of the second map
+        pose = moved((5.0, 0.0, 0.0), relation)
+        np.testing.assert_allclose([*at, angle], pose)
+        # From a wrong pose that may be anywhere, conditioning leads there, too.
+        middle = [*(both.position[both.places[new]] + [0, 1]), both.heading[new]]
+        mean = both.mean.copy()
+        mean[middle] = pose
+        mean[middle[:2]] += 0.5, -0.4
+        loose = both.covariance.copy()
+        loose[middle, middle] = 1e6
+        found, covariance = tied(both, ties, mean, loose)
+        np.testing.assert_allclose(found[middle], pose, atol=1e-3)
+        assert (np.diag(covariance)[middle] < 1).all()
 
 
 @pytest.mark.parametrize("seed", [312, 313])

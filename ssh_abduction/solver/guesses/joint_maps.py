@@ -34,6 +34,7 @@ from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import valid_map
 from ssh_abduction.solver.guesses.overlaying import Overlay, Part
 from ssh_abduction.solver.guesses.sights import Sights
+from ssh_abduction.solver.guesses.ties import ties_between
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence.loops import vectors_turned
 from ssh_abduction.theory.settle import Problem
@@ -46,6 +47,8 @@ class _Anchor(NamedTuple):
     """A way to lay a map on another one.
 
     Attributes:
+        ties: The number of closures between the two maps, which say how to lay them; or 0, and the
+            next fields say it.
         good: How many dstates (or places) coincide that may be one, minus those that may not.
         old: A dstate of the first map.
         new: A dstate of the second map, which is laid on `old`.
@@ -53,11 +56,12 @@ class _Anchor(NamedTuple):
         by_places: Whether only the places of the two dstates are one, and not the dstates.
     """
 
-    good: int
-    old: int
-    new: int
-    turn: float
-    by_places: bool
+    ties: int
+    good: int = 0
+    old: int = 0
+    new: int = 0
+    turn: float = 0.0
+    by_places: bool = False
 
 
 _Anchors: TypeAlias = dict[_Pair, list[_Anchor]]
@@ -196,6 +200,8 @@ class Joining:
             *self._by_dstates(first, second, changes, near),
             *self._by_places(first, second, changes == 0, near),
         ]
+        if ties := len(ties_between(self._problem.trace, first.beside(second), len(first.places))):
+            found.append(_Anchor(ties))
         self._ways[first, second] = sorted(found, reverse=True)
         return self._ways[first, second]
 
@@ -222,7 +228,7 @@ class Joining:
             meets = _meeting(at, at[s] + vectors_turned(there - there[x], turn), near)
             meets &= np.abs(twist) < TURNED
             good = (meets & alike).sum() - (meets & ~alike).sum()
-            yield _Anchor(int(good), s, x, turn, by_places=False)
+            yield _Anchor(0, int(good), s, x, turn)
 
     def _by_places(
         self, first: Part, second: Part, same: NDArray[np.bool_], near: float
@@ -245,7 +251,7 @@ class Joining:
             moved = first.poses[0][s] + vectors_turned(second.positions - second.poses[0][x], turn)
             meets = _meeting(first.positions, moved, near)
             good = (meets & same).sum() - (meets & ~same).sum()
-            found.append(_Anchor(int(good), s, x, turn, by_places=True))
+            found.append(_Anchor(0, int(good), s, x, turn, by_places=True))
         least = 1 if same.sum() == 1 else 2
         return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
 
@@ -257,7 +263,10 @@ class Joining:
         overlay = Overlay(first, second, self._problem, self.sights)
         if (first, second) not in self._laid:
             ways = self._anchors(first, second)
-            laid = [(self._nats(part), way) for way in ways if (part := _laid(overlay, way))]
+            tied = [way for way in ways if way.ties]
+            if not any((part := _laid(overlay, way)) and self._map(part) for way in tied):
+                tied = [way for way in ways if not way.ties]
+            laid = [(self._nats(part), way) for way in tied if (part := _laid(overlay, way))]
             self._laid[first, second] = sorted(laid, key=lambda told: told[0])
         cheap = (way for nats, way in self._laid[first, second] if nats < most)
         joined = (_laid(overlay, way) for way in cheap)
@@ -296,7 +305,11 @@ class Joining:
 def _laid(overlay: Overlay, way: _Anchor) -> Part | None:
     """Lay one map on another in one way, and merge what coincides; None if it does not fit."""
     look_at_clock()
-    fits = overlay.merge(way.old, way.new, way.turn if way.by_places else None)
+    fits = (
+        overlay.merge_by_closures()
+        if way.ties
+        else overlay.merge(way.old, way.new, way.turn if way.by_places else None)
+    )
     return overlay.part() if fits else None
 
 

@@ -25,6 +25,7 @@ from ssh_abduction.solver.guesses.kept_apart import KeptApart
 from ssh_abduction.solver.guesses.pieces import poses_turned
 from ssh_abduction.solver.guesses.reckoning import BLUR, Hypothesis, conditioned
 from ssh_abduction.solver.guesses.sights import Sight, Sights
+from ssh_abduction.solver.guesses.ties import relation_of, tied, ties_between
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
 
@@ -194,11 +195,11 @@ class Overlay:
     """Merges the dstates and places of two maps, such as an old map and the map of a drive."""
 
     def __init__(self, standing: Part, drive: Part, problem: Problem, sights: Sights) -> None:
-        theory, both = problem.theory, standing.beside(drive)
+        self._theory = theory = problem.theory
+        both = standing.beside(drive)
         self._both, self._sights, self._overlap = both, sights, problem.overlap
-        self._steps, self._may_change = both.step_at, theory.changed > 0
+        self._steps = both.step_at
         self._old = len(standing.places), len(standing.sights)
-        self._has_places = theory.level == "topological"
         self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
         slack = SLACK * both.usual_travel(problem.trace)
         self._spreads = spreads_of(problem.trace).max(axis=0) + np.array([slack, slack, SLACK]) ** 2
@@ -223,8 +224,13 @@ class Overlay:
         self._costs = np.full(2 * (len(both.sights),), math.inf)
         for (p, seen), (q, others) in combinations(enumerate(both.sights), 2):
             self._costs[p, q] = sights.merged(seen, others)
+        self._ties = ties_between(problem.trace, both, len(standing.places))
         # These change while the two maps are merged.
         self._state, self._changes = self._apart, self._costs
+
+    @property
+    def _has_places(self) -> bool:
+        return self._theory.level == "topological"
 
     def merge(self, old: int, new: int, turn: float | None = None) -> bool:
         """Merge a dstate of the old map with one of the drive, and then all that coincide.
@@ -235,10 +241,29 @@ class Overlay:
         """
         self._state = self._apart
         new += self._old[0]
-        self._lay(old, new, turn)
-        places = self._both.places[old], self._both.places[new]
+        both, places = self._both, (self._both.places[old], self._both.places[new])
+        at = both.mean[both.position[places[0]] :][:2]
+        equal = float(both.mean[both.heading[old]] - both.mean[both.heading[new]])
+        self._lay(new, at, equal if turn is None else turn, is_turn_known=turn is not None)
         if not (self._tried([(old, new)]) if turn is None else self._tried([], places)):
             return False
+        self._merge_all()
+        return True
+
+    def merge_by_closures(self) -> bool:
+        """Lay the drive on the old map by the closures between them. Then merge what coincides.
+
+        An earlier merge is undone first. Returns whether anything was merged.
+        """
+        self._state = self._apart
+        self._lay(*relation_of(self._both, self._ties))
+        mean, covariance = tied(self._both, self._ties, self._state.mean, self._state.covariance)
+        self._state = replace(self._state, mean=mean, covariance=covariance)
+        return self._merge_all()
+
+    def _merge_all(self) -> bool:
+        """Merge all places that coincide. Return whether there was one."""
+        first = self._state
         merged = True
         while merged:  # what was refused may fit now
             merged, self._changes = False, self._costs.copy()
@@ -247,7 +272,7 @@ class Overlay:
                     merged = True
                 else:
                     self._changes[pair] = math.inf
-        return True
+        return self._state is not first
 
     def part(self) -> Part:
         """Return the part that all merges so far make of the two parts."""
@@ -278,26 +303,24 @@ class Overlay:
             kept,
         )
 
-    def _lay(self, old: int, new: int, turn: float | None) -> None:
-        """Turn and shift the new drive so that its dstate `new` has the pose of the dstate `old`.
+    def _lay(self, new: int, at: Array, angle: float, is_turn_known: bool = False) -> None:
+        """Turn the new drive by an angle, and shift its dstate `new` to the position `at`.
 
         All poses of the drive get a large common covariance, as the pose of its frame is unknown.
-        With a `turn`, only the positions become equal, and the turn is known up to TURNED.
+        If the turn is known, it is known up to TURNED.
         """
         both, state = self._both, self._state
         headings = both.heading[self._old[0] :]
         x = both.position[self._old[1] :]
-        at, there = (both.position[both.places[s]] for s in (old, new))
-        equal = both.mean[both.heading[old]] - both.mean[both.heading[new]]
-        angle = equal if turn is None else turn
+        there = both.position[both.places[new]]
         mean, covariance = poses_turned(both.mean, both.covariance, x, headings, there, angle)
         dx, dy = mean[x] - mean[there], mean[x + 1] - mean[there + 1]
-        mean[x], mean[x + 1] = mean[at] + dx, mean[at + 1] + dy
+        mean[x], mean[x + 1] = at[0] + dx, at[1] + dy
         by = np.zeros((len(mean), 3))
         by[x, 0], by[x + 1, 1] = 1.0, 1.0
         by[x, 2], by[x + 1, 2] = -dy, dx
         by[headings, 2] = 1.0
-        by *= ANYWHERE if turn is None else np.array([*ANYWHERE[:2], TURNED])
+        by *= np.array([*ANYWHERE[:2], TURNED]) if is_turn_known else ANYWHERE
         self._state = replace(state, mean=mean, covariance=covariance + by @ by.T)
 
     def _surest(self) -> tuple[int, int] | None:
@@ -406,7 +429,7 @@ class Overlay:
 
         This is unknown, and so True, if gateways may change between drives.
         """
-        if self._may_change:
+        if self._theory.changed:
             return True
         (s, *_), (x, *_) = self._dstates_at(p), self._dstates_at(q)
         turns = self._sights.turns(self._steps[s], self._steps[x])
