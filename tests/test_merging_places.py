@@ -64,7 +64,7 @@ def test_best_map_of_a_broad_beam_has_merged_places() -> None:
     weighing, beam = Weighing(parts), parts.candidates.beam(4)
     assert beam
     with patch.object(Candidates, "maps_of", return_value=[with_places(trace, VISITS)]):
-        assert weighing._beams._ends(beam, 4)
+        assert weighing._beams._ends(beam, 4, math.inf)
     assert weighing.best
     assert places_of(weighing.best.map) == PLACES
     assert weighing._beams.found(weighing.best.nats)

@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -266,7 +267,7 @@ def test_reproduce_writes_its_data_before_it_draws(
     def fails(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(report, "measure", lambda name, seed: type("Run", (), {"seed": seed}))
+    monkeypatch.setattr(report, "_each", lambda *_: iter([SimpleNamespace(seed=0)]))
     monkeypatch.setattr(report, "asdict", lambda run: {"seed": getattr(run, "seed", 0)})
     monkeypatch.setattr(
         report,
