@@ -45,11 +45,10 @@ def _agree(first: Sequence[object], other: Sequence[object]) -> bool:
     return len(pairs) == len(set(first)) == len(set(other))
 
 
-@pytest.mark.parametrize("order", [NAMES, NAMES[::-1]])
 def test_drives_that_are_clustered_together_get_common_views(
-    drives: list[Trace], order: Sequence[str], capsys: pytest.CaptureFixture[str]
+    drives: list[Trace], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["cluster", *order, "--together", "--k", "4", "-o", "views/of both"]) == 0
+    assert main(["cluster", *reversed(NAMES), "--together", "--k", "4", "-o", "views/of both"]) == 0
     assert "4 views of 21 images in views/of both\n" in capsys.readouterr().out
     written = [f"views/of both/{name}" for name in NAMES]
     together = _views(*written)

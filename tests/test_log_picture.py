@@ -31,7 +31,7 @@ from ssh_abduction.solver import Status
 def house() -> LogMap:
     """The map of a drive through a house of six rooms and a hall."""
     scans = every_second_beam(scans_of(record(World.named("doors"), every=0.8)))
-    return map_log(RobotLog(scans, source="house"), time_limit=20, with_ladder=False)
+    return map_log(RobotLog(scans, source="house"), time_limit=4, with_ladder=False)
 
 
 def along(*places: int) -> SSHMap:
