@@ -4,10 +4,14 @@ Each drive has a map of its own: a hypothesis with the poses of its places and d
 is a dstate of one map and a dstate of another map that may be one. It says how one map lies on the
 other. An anchor is good if many other dstates then coincide with dstates that show the same. Drives
 that cross may share places, but no dstate. So an anchor may also be two places whose stars agree if
-one map is turned. It is good if many other places then coincide with places that may be one. The
-two maps with the best anchor are joined first: `overlaying.py` merges the places and dstates that
-coincide. Then the joint map may be joined to others. Maps that no anchor connects stay pieces. Some
-of the maps may be the pieces of a map of old drives that must be kept.
+one map is turned. It is good if many other places then coincide with places that may be one.
+
+If closures (matches of local maps) connect two drives, they say how one map lies on the other, and
+anchors are used only if that map breaks an axiom.
+
+The two maps with most closures, or the best anchor, are joined first: `overlaying.py` merges the
+places and dstates that coincide. Then the joint map may be joined to others. Maps that no anchor
+connects stay pieces. Some of the maps may be the pieces of a map of old drives that must be kept.
 
 Reference:
     Carpin 2008, "Fast and accurate map merging for multi-robot systems" (votes for a turn and a
@@ -34,7 +38,6 @@ from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import valid_map
 from ssh_abduction.solver.guesses.overlaying import Overlay, Part
 from ssh_abduction.solver.guesses.sights import Sights
-from ssh_abduction.solver.guesses.ties import ties_between
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence.loops import vectors_turned
 from ssh_abduction.theory.settle import Problem
@@ -200,7 +203,12 @@ class Joining:
             *self._by_dstates(first, second, changes, near),
             *self._by_places(first, second, changes == 0, near),
         ]
-        if ties := len(ties_between(self._problem.trace, first.beside(second), len(first.places))):
+        ties = sum(
+            (c.first in first.labels and c.last in second.labels)
+            or (c.first in second.labels and c.last in first.labels)
+            for c in self._problem.trace.closures
+        )
+        if ties:
             found.append(_Anchor(ties))
         self._ways[first, second] = sorted(found, reverse=True)
         return self._ways[first, second]
@@ -263,10 +271,10 @@ class Joining:
         overlay = Overlay(first, second, self._problem, self.sights)
         if (first, second) not in self._laid:
             ways = self._anchors(first, second)
-            tied = [way for way in ways if way.ties]
-            if not any((part := _laid(overlay, way)) and self._map(part) for way in tied):
-                tied = [way for way in ways if not way.ties]
-            laid = [(self._nats(part), way) for way in tied if (part := _laid(overlay, way))]
+            usable = [way for way in ways if way.ties]
+            if not any((part := _laid(overlay, way)) and self._map(part) for way in usable):
+                usable = [way for way in ways if not way.ties]
+            laid = [(self._nats(part), way) for way in usable if (part := _laid(overlay, way))]
             self._laid[first, second] = sorted(laid, key=lambda told: told[0])
         cheap = (way for nats, way in self._laid[first, second] if nats < most)
         joined = (_laid(overlay, way) for way in cheap)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.guesses.reckoning import BLUR
@@ -67,15 +68,17 @@ def relation_of(both: Part, ties: Sequence[Tie]) -> tuple[int, Array, float]:
     (at, facing), turns, here, there = both.poses, [], [], []
     for tie in ties:
         old, new = (tie.last, tie.first) if tie.is_back else (tie.first, tie.last)
-        shift, turn = tie.displacement[:2], tie.displacement[2]
+        between = tuple(tie.displacement)
         if tie.is_back:
-            shift, turn = -_turned(shift, -turn), -turn
-        turns.append(facing[old] + turn - facing[new])
-        here.append(at[old] + _turned(shift, facing[old]))
+            between = displacement_between(between, (0.0, 0.0, 0.0))
+        x, y, heading = moved((*at[old], facing[old]), between)
+        turns.append(heading - facing[new])
+        here.append((x, y))
         there.append(new)
     angle = math.atan2(np.sin(turns).sum(), np.cos(turns).sum())
     middle = np.mean(at[there], axis=0)
-    return new, np.mean(here, axis=0) + _turned(at[new] - middle, angle), angle
+    aside = moved((0.0, 0.0, angle), (*(at[new] - middle), 0.0))[:2]
+    return new, np.mean(here, axis=0) + aside, angle
 
 
 def tied(both: Part, ties: Sequence[Tie], mean: Array, covariance: Array) -> tuple[Array, Array]:
@@ -100,9 +103,3 @@ def tied(both: Part, ties: Sequence[Tie], mean: Array, covariance: Array) -> tup
     solved = np.linalg.solve(by @ across + noise, np.column_stack([off, across.T]))
     covariance = covariance - across @ solved[:, 1:]
     return mean - across @ solved[:, 0], (covariance + covariance.T) / 2
-
-
-def _turned(point: Array, angle: float) -> Array:
-    """Turn a point counterclockwise about the origin."""
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.array([cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]])
