@@ -76,9 +76,9 @@ def save_images(path: Path, images: NDArray[np.float64]) -> None:
 
     Whole numbers from 0 to 255, such as those of a camera, are stored as bytes.
     """
-    pixels = images.astype(np.uint8)
+    are_bytes = bool(((images >= 0) & (images <= 255) & (images == np.floor(images))).all())
     packed = io.BytesIO()
-    np.savez_compressed(packed, images=pixels if np.array_equal(pixels, images) else images)
+    np.savez_compressed(packed, images=images.astype(np.uint8) if are_bytes else images)
     save_file(path, packed.getvalue(), "images", PerceptionError)
 
 

@@ -21,7 +21,7 @@ NAMES = ("monday.jsonl", "tuesday.jsonl")
 
 @pytest.fixture
 def drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Trace]:
-    """Two drives through one room, of which the second starts three dstates further."""
+    """Two drives through one room. The second starts at the fourth dstate of the first."""
     monkeypatch.chdir(tmp_path)
     world = World.named("notched-rectangle")
     monday = simulate(world, tours=2, seed=1)[:10]

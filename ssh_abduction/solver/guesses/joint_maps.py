@@ -21,7 +21,7 @@ Reference:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise, permutations
 from typing import NamedTuple, TypeAlias
@@ -271,14 +271,20 @@ class Joining:
         overlay = Overlay(first, second, self._problem, self.sights)
         if (first, second) not in self._laid:
             ways = self._anchors(first, second)
-            usable = [way for way in ways if way.ties]
-            if not any((part := _laid(overlay, way)) and self._map(part) for way in usable):
-                usable = [way for way in ways if not way.ties]
-            laid = [(self._nats(part), way) for way in usable if (part := _laid(overlay, way))]
+            tied = [way for way in ways if way.ties]
+            laid = self._fitting(overlay, tied, self._map)
+            laid = laid or self._fitting(overlay, [way for way in ways if not way.ties])
             self._laid[first, second] = sorted(laid, key=lambda told: told[0])
         cheap = (way for nats, way in self._laid[first, second] if nats < most)
         joined = (_laid(overlay, way) for way in cheap)
         return next((part for part in joined if part and self._map(part)), None)
+
+    def _fitting(
+        self, overlay: Overlay, ways: Sequence[_Anchor], suits: Callable[[Part], object] = bool
+    ) -> list[tuple[float, _Anchor]]:
+        """Lay one map on another in each way. List those that fit and suit, with their costs."""
+        laid = ((_laid(overlay, way), way) for way in ways)
+        return [(self._nats(part), way) for part, way in laid if part and suits(part)]
 
     def _nats_of(self, parts: Sequence[Part]) -> float:
         """Compute the cost of parts as separate pieces, in nats."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.drives import frames_of
 from ssh_abduction.data.groups import gathered
-from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.odometry import Displacement, Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.geometry.equations import noises, spreads_of
@@ -160,28 +160,11 @@ class HypothesisPoses:
         it. The cost includes the misfit of the closure.
         """
         noise = np.array(closure.covariance) + np.diag(self._spreads[closure.first])
-        mean, n = moved.mean, len(moved.mean) - 3
-        there = moved.labels[closure.first]
-        at, heading = moved.position[moved.places[there]], moved.heading[there]
-        cos, sin = math.cos(mean[heading]), math.sin(mean[heading])
-        back = np.array([[cos, sin], [-sin, cos]])
-        gone = back @ (mean[n : n + 2] - mean[at : at + 2])
-        # How the pose, relative to the earlier step, depends on the means.
-        by = np.zeros((3, n + 3))
-        by[:2, n : n + 2], by[:2, at : at + 2] = back, -back
-        by[:2, heading] = gone[1], -gone[0]
-        by[2, n + 2], by[2, heading] = 1.0, -1.0
-        off = np.array([*gone, mean[n + 2] - mean[heading]]) - closure.displacement
-        off[2] = math.remainder(off[2], math.tau)
-        across = moved.covariance @ by.T
-        solved = np.linalg.solve(by @ across + noise, np.column_stack([off, across.T]))
-        covariance = moved.covariance - across @ solved[:, 1:]
-        return replace(
-            moved,
-            mean=mean - across @ solved[:, 0],
-            covariance=(covariance + covariance.T) / 2,
-            nats=moved.nats + float(off @ solved[:, 0]) / 2,
-        )
+        n, there = len(moved.mean) - 3, moved.labels[closure.first]
+        first = moved.position[moved.places[there]], moved.heading[there]
+        by, off = closure_equations(moved.mean, first, (n, n + 2), closure.displacement)
+        mean, covariance, square = updated(moved.mean, moved.covariance, by, off, noise)
+        return replace(moved, mean=mean, covariance=covariance, nats=moved.nats + square / 2)
 
     def settled(self, found: Hypothesis, trace: Trace) -> tuple[float, Hypothesis]:
         """Fit all poses of a hypothesis anew, as the equations are linear only near the means.
@@ -277,6 +260,44 @@ class HypothesisPoses:
         added = range(n, n + len(new))
         covariance[added, added] += self._spreads[t, len(old) :]
         return mean[order], covariance
+
+
+def closure_equations(
+    mean: Array, first: tuple[int, int], last: tuple[int, int], displacement: Displacement
+) -> tuple[Array, Array]:
+    """Find how the last pose of a closure, relative to the first one, depends on the means.
+
+    A pose is given by the index of x, before that of y, and the index of the heading.
+
+    Returns:
+        The derivatives of the relative pose, (3, n), and by how much it is off the displacement.
+    """
+    (at, heading), (to, after) = first, last
+    cos, sin = math.cos(mean[heading]), math.sin(mean[heading])
+    back = np.array([[cos, sin], [-sin, cos]])
+    gone = back @ (mean[to : to + 2] - mean[at : at + 2])
+    by = np.zeros((3, len(mean)))
+    by[:2, to : to + 2], by[:2, at : at + 2] = back, -back
+    by[:2, heading] = gone[1], -gone[0]
+    by[2, after], by[2, heading] = 1.0, -1.0
+    off = np.array([*gone, mean[after] - mean[heading]]) - displacement
+    off[2] = math.remainder(off[2], math.tau)
+    return by, off
+
+
+def updated(
+    mean: Array, covariance: Array, by: Array, off: Array, noise: Array
+) -> tuple[Array, Array, float]:
+    """Update a Gaussian by k measurements (a Kalman filter).
+
+    `by` has their derivatives, (k, n), `off` how much too large they are by the means, (k,), and
+    `noise` their covariance, (k, k). The chi-square comes last in the result.
+    """
+    across = covariance @ by.T
+    solved = np.linalg.solve(by @ across + noise, np.column_stack([off, across.T]))
+    covariance = covariance - across @ solved[:, 1:]
+    mean = mean - across @ solved[:, 0]
+    return mean, (covariance + covariance.T) / 2, float(off @ solved[:, 0])
 
 
 def conditioned(

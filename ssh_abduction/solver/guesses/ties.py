@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
-from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.data.odometry import Displacement, displacement_between, moved
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.geometry.equations import spreads_of
-from ssh_abduction.solver.guesses.reckoning import BLUR
+from ssh_abduction.solver.guesses.reckoning import BLUR, closure_equations, updated
 
 if TYPE_CHECKING:
     from ssh_abduction.solver.guesses.overlaying import Part
@@ -32,14 +33,14 @@ class Tie(NamedTuple):
         first: The dstate of its earlier step.
         last: The dstate of its later step.
         displacement: The pose of the later step relative to the earlier one: x and y in metres,
-            and the turn in radians, (3,).
+            and the turn in radians.
         covariance: Its covariance, with the scatter of both steps about their dstates, (3, 3).
         is_back: Whether the later step, and not the earlier one, is in the first map.
     """
 
     first: int
     last: int
-    displacement: Array
+    displacement: Displacement
     covariance: Array
     is_back: bool
 
@@ -54,7 +55,7 @@ def ties_between(trace: Trace, both: Part, old: int) -> list[Tie]:
             if (s < old) != (x < old):
                 scatter = np.diag(spreads[closure.first] + spreads[closure.last])
                 covariance = np.array(closure.covariance) + scatter
-                found.append(Tie(s, x, np.array(closure.displacement), covariance, x < old))
+                found.append(Tie(s, x, closure.displacement, covariance, x < old))
     return found
 
 
@@ -68,7 +69,7 @@ def relation_of(both: Part, ties: Sequence[Tie]) -> tuple[int, Array, float]:
     (at, facing), turns, here, there = both.poses, [], [], []
     for tie in ties:
         old, new = (tie.last, tie.first) if tie.is_back else (tie.first, tie.last)
-        between = tuple(tie.displacement)
+        between = tie.displacement
         if tie.is_back:
             between = displacement_between(between, (0.0, 0.0, 0.0))
         x, y, heading = moved((*at[old], facing[old]), between)
@@ -83,23 +84,18 @@ def relation_of(both: Part, ties: Sequence[Tie]) -> tuple[int, Array, float]:
 
 def tied(both: Part, ties: Sequence[Tie], mean: Array, covariance: Array) -> tuple[Array, Array]:
     """Condition the poses of two maps on the ties between them."""
-    by, off = np.zeros((3 * len(ties), len(mean))), np.zeros(3 * len(ties))
-    noise = np.zeros(2 * (len(off),))
-    for k, (first, last, displacement, scatter, _) in enumerate(ties):
-        rows = slice(3 * k, 3 * k + 3)
-        at, to = (both.position[both.places[s]] for s in (first, last))
-        heading, after = both.heading[first], both.heading[last]
-        cos, sin = math.cos(mean[heading]), math.sin(mean[heading])
-        back = np.array([[cos, sin], [-sin, cos]])
-        gone = back @ (mean[to : to + 2] - mean[at : at + 2])
-        by[rows, [to, to + 1]] = np.vstack([back, np.zeros(2)])
-        by[rows, [at, at + 1]] = -by[rows, [to, to + 1]]
-        by[rows, heading] = gone[1], -gone[0], -1.0
-        by[3 * k + 2, after] = 1.0
-        off[rows] = [*gone, mean[after] - mean[heading]] - displacement
-        off[3 * k + 2] = math.remainder(off[3 * k + 2], math.tau)
-        noise[rows, rows] = scatter
-    across = covariance @ by.T
-    solved = np.linalg.solve(by @ across + noise, np.column_stack([off, across.T]))
-    covariance = covariance - across @ solved[:, 1:]
-    return mean - across @ solved[:, 0], (covariance + covariance.T) / 2
+    at, heading = both.position[both.places].tolist(), both.heading.tolist()
+    by, off = zip(
+        *(
+            closure_equations(
+                mean,
+                (at[tie.first], heading[tie.first]),
+                (at[tie.last], heading[tie.last]),
+                tie.displacement,
+            )
+            for tie in ties
+        ),
+        strict=True,
+    )
+    noise = block_diag(*(tie.covariance for tie in ties))
+    return updated(mean, covariance, np.concatenate(by), np.concatenate(off), noise)[:2]
