@@ -71,10 +71,11 @@ def localised(done: LogMap, asked: Trace) -> dict[str, int]:
     ssh_map, trace = done.solution.maps[0], done.imported.trace
     labels, poses, others = np.array(ssh_map.dstate_at), poses_of(trace), poses_of(asked)
     localiser = Localiser(ssh_map, done.recogniser(), trace=trace)
-    counts = dict.fromkeys(("steps", "located", "located and right"), 0)
+    counts = dict.fromkeys(("steps", "at learnt dstates", "located", "located and right"), 0)
     for belief, pose in zip(localiser.beliefs(asked), others, strict=True):
         located = belief.verdict is BeliefVerdict.LOCATED
         counts["steps"] += 1
+        counts["at learnt dstates"] += bool(is_near(pose, poses).any())
         counts["located"] += located
         counts["located and right"] += located and bool(
             is_near(pose, poses[labels == belief.likeliest]).any()

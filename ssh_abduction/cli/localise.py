@@ -16,6 +16,8 @@ from ssh_abduction.cli.options import (
     picture_file,
     read_maps,
     some_maps,
+    trace_beside,
+    trace_of_maps,
     trace_path,
 )
 from ssh_abduction.cli.parsing import Verbs
@@ -27,6 +29,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import only_known
 
 if TYPE_CHECKING:
+    from ssh_abduction.data.maps import SSHMap
     from ssh_abduction.online.localiser import Localiser
 
 HEAD = ("step", "action", "seen", "", "dstate", "probability", "nowhere", "entropy", "normaliser")
@@ -53,13 +56,15 @@ def add_parser(verbs: Verbs) -> None:
     parser.add("--map I", "the number of the map, from 1 (default: 1)", type=int)
     parser.add(
         "--trace TRACE",
-        "the trace that was mapped; its steps are used to estimate how reliable views and "
-        "links are",
+        "the trace that was mapped; its steps tell which stars were seen at each dstate, and "
+        "how reliable views and links are (default: the trace that solve -o or map wrote with "
+        "the maps)",
         type=trace_path,
     )
     parser.add(
         "--recogniser FILE.skops",
-        "recogniser that train wrote for this map, to use images instead of views",
+        "recogniser that train wrote for this map, to use images instead of views (default: "
+        "in a folder that map wrote, one for the images of its trace)",
     )
     said = {
         "misread": "at a step, the view or image does not fit the dstate "
@@ -85,8 +90,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     check_picture(options.plot)
-    localiser = _localiser(options)
-    trace = Trace.load(options.other)
+    localiser, trace = _localiser(options)
     beliefs = [belief.to_dict() for belief in localiser.beliefs(trace)]
     if options.json:
         head = {"map": options.map or 1, "dstates": len(localiser.ssh_map.dstates)}
@@ -95,7 +99,9 @@ def run(options: argparse.Namespace) -> int:
         print(json_line(head)[:-1] + ', "beliefs": [\n' + ",\n".join(lines) + "\n]}")
     else:
         print(_headline(beliefs))
-        print(table(HEAD, [_row(step, belief, trace) for step, belief in enumerate(beliefs)]))
+        views = [("image" if localiser.reads_images else step.view) for step in trace]
+        rows = [_row(t, belief, trace, views[t]) for t, belief in enumerate(beliefs)]
+        print(table(HEAD, rows))
     if options.plot:
         sys.stdout.flush()  # print first, in case drawing fails
         from ssh_abduction.evaluation.paper.figures import draw_beliefs
@@ -104,8 +110,11 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _localiser(options: argparse.Namespace) -> Localiser:
-    """Make the localiser that the options ask for. Raises AbductionError, which names the file."""
+def _localiser(options: argparse.Namespace) -> tuple[Localiser, Trace]:
+    """Make the localiser that the options ask for, and load the trace that it follows.
+
+    Raises AbductionError, which names the file.
+    """
     from ssh_abduction.online.chances import Chances
     from ssh_abduction.online.localiser import Localiser
 
@@ -118,15 +127,35 @@ def _localiser(options: argparse.Namespace) -> Localiser:
         )
     given = only_known(**{name: getattr(options, name) for name in CHANCES})
     chances = replace(Chances.none() if options.zero_one else Chances(), **given)
-    recogniser = None
+    ssh_map = maps[(options.map or 1) - 1]
+    mapped = Trace.load(options.trace) if options.trace else _mapped(options.maps)
+    other = Trace.load(options.other)
+    recogniser = _recogniser(options, ssh_map, mapped, other)
+    of_recogniser = said_of(named(options.recogniser or options.maps), LocaliserError)
+    with said_of(named(options.maps), MapError), of_recogniser:
+        return Localiser(ssh_map, recogniser, trace=mapped, chances=chances), other
+
+
+def _mapped(maps: str) -> Trace | None:
+    """Return the trace that was mapped, if it is beside the maps or in their file."""
+    beside = trace_beside(maps)
+    return Trace.load(beside) if beside else trace_of_maps(maps)
+
+
+def _recogniser(
+    options: argparse.Namespace, ssh_map: SSHMap, mapped: Trace | None, other: Trace
+) -> Any:
+    """Return the named recogniser, or train one if a log was mapped and both traces have images."""
     if options.recogniser:
         from perception.store import load
 
-        recogniser = load(options.recogniser).model
-    mapped = Trace.load(options.trace) if options.trace else None
-    of_recogniser = said_of(named(options.recogniser), LocaliserError)
-    with said_of(named(options.maps), MapError), of_recogniser:
-        return Localiser(maps[(options.map or 1) - 1], recogniser, trace=mapped, chances=chances)
+        return load(options.recogniser).model
+    is_log = options.trace is None and trace_beside(options.maps) is not None
+    if not is_log or mapped is None or other.steps[0].image is None:
+        return None
+    from ssh_abduction.robot_logs.log_maps import recogniser_of
+
+    return recogniser_of(mapped, ssh_map)
 
 
 def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:
@@ -138,13 +167,12 @@ def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join(parts)
 
 
-def _row(step: int, belief: Mapping[str, Any], trace: Trace) -> list[object]:
+def _row(step: int, belief: Mapping[str, Any], trace: Trace, seen: object) -> list[object]:
     """Make the row of a step in the table, from the belief after this step."""
-    view = trace.steps[step].view
     return [
         step,
         trace.actions[step - 1].name if step else "",
-        "image" if view is None else view,
+        NOWHERE if seen is None else seen,
         belief["verdict"],
         NOWHERE if belief["dstate"] is None else belief["dstate"],
         *(f"{belief[name]:.3f}" for name in ("probability", "nowhere")),

@@ -167,7 +167,7 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
     if options.belief is None:
         from ssh_abduction.online.localiser import Localiser
 
-        return Run(followed, lambda ssh_map: Localiser(ssh_map).beliefs(followed))
+        return Run(followed, lambda ssh_map: Localiser(ssh_map, trace=trace).beliefs(followed))
     return _with_beliefs(followed, options.belief, data)
 
 

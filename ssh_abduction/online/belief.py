@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.errors import LocaliserError
+from ssh_abduction.online.dead_reckoning import Away
 
 # The robot is located if one dstate has at least this probability.
 LOCATED = 0.9
@@ -66,6 +67,17 @@ class Observation:
     ratio: NDArray[np.float64]
     novel: float
 
+    def __and__(self, other: Observation) -> Observation:
+        """Return the observation of both, if they are independent at each of the N + 1 cases.
+
+        `other` has the ratios of all N dstates.
+        """
+        cases = len(other.ratio) + 1
+        ratio = self.ratio * other.ratio[self.where]
+        none = self.novel * other.novel * cases
+        usual = ratio.sum() / cases + none
+        return Observation(self.where, ratio / usual, none / usual) if usual else NOVEL
+
 
 NOVEL = Observation(np.empty(0, np.intp), np.empty(0), 1.0)
 
@@ -85,6 +97,8 @@ class Belief:
         akin: If the robot is nowhere, the probability that the places there are *akin* to the map:
             views follow each other there as in the map (`localiser.py`).
         seen: The last observation; None if there was none.
+        away: The parts of `nowhere` for which dead reckoning knows how the robot moved since it was
+            at a dstate. There are such parts if the map has poses and the robot has odometry.
     """
 
     probabilities: NDArray[np.float64]
@@ -93,6 +107,7 @@ class Belief:
     sure: float | None = None
     akin: float = AKIN
     seen: Observation | None = None
+    away: tuple[Away, ...] = ()
 
     def __str__(self) -> str:
         dstate = f"dstate {self.likeliest} with probability {self.probability:.3f}"

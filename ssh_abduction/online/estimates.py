@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -22,7 +23,8 @@ from scipy import sparse
 from ssh_abduction.data.action import STANDARD_ACTIONS, TURN_DEGREES
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.star import SPREAD
+from ssh_abduction.data.rotations import ways
+from ssh_abduction.data.star import SPREAD, Star
 from ssh_abduction.data.trace import Action, Trace, View
 from ssh_abduction.online.belief import Observation
 
@@ -162,6 +164,55 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
             np.array([x for x, _ in pairs], np.intp), f * ((number + 1) / f.sum()), 0.0
         )
     return ratios
+
+
+class Stars:
+    """How well a star (the gateways seen at a place) fits each of the N dstates of a map.
+
+    A star fits a step of the mapped trace if the robot may have faced the same way in both. Let
+    f(s|x) be the share of the steps at dstate x that a star s fits. Stars that fit each other are
+    not equal, so p(s|x) is only proportional to f. An unknown place looks like none of the dstates
+    with a probability of 1 / (N + 1).
+
+    Attributes:
+        misread: The probability that a star does not fit another step of its dstate.
+
+    Args:
+        trace: The trace that was mapped.
+        misread: The least value of the attribute. If it is 0, stars always fit.
+    """
+
+    def __init__(self, ssh_map: SSHMap, trace: Trace, misread: float) -> None:
+        """Collect the stars of each dstate, and compare those of one dstate."""
+        self._number = len(ssh_map.dstates)
+        self._seen = gathered(
+            (x, Star.of(step.star))
+            for x, step in zip(ssh_map.dstate_at, trace, strict=True)
+            if step.star is not None
+        )
+        fits = [_fit(one, other) for stars in self._seen.values() for one, other in pairwise(stars)]
+        self.misread = misread and max(misread, (1 + fits.count(False)) / (10 + len(fits)))
+
+    def of(self, star: Star) -> Observation:
+        """Return the observation of a star. Dstates whose star was not seen have the ratio 1."""
+        f = np.full(self._number, np.nan)
+        for x, stars in self._seen.items():
+            f[x] = np.mean([_fit(star, other) for other in stars])
+        mean = float(np.nanmean(f))
+        ratio = np.nan_to_num(f / (mean or 1.0), nan=1.0)
+        ratio = self.misread + (1 - self.misread) * ratio
+        return Observation(slice(None), ratio, 1 - float(ratio.sum()) / (self._number + 1))
+
+
+@lru_cache(maxsize=2**16)
+def _fit(one: Star, other: Star) -> bool:
+    """Whether the robot may have faced the same way when it saw two stars."""
+    return any(
+        first.slots == then.slots and ways(first, then, shift, frozenset((0,)))[0]
+        for first in one.frames
+        for then in other.frames
+        for shift in range(first.slots)
+    )
 
 
 def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:

@@ -56,7 +56,7 @@ probability of an observation with that at an unknown place.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -66,13 +66,19 @@ from numpy.typing import ArrayLike, NDArray
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.errors import LocaliserError, MapError, TraceError, brief, named
 from ssh_abduction.data.maps import SSHMap, check_labels, checked_map
+from ssh_abduction.data.odometry import Displacement, Odometry, checked_displacement
+from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace, View, checked_trace
 from ssh_abduction.online.belief import AKIN, NOVEL, TINY, Belief, Observation
 from ssh_abduction.online.chances import Chances
-from ssh_abduction.online.estimates import Move, Moves, view_ratios
+from ssh_abduction.online.dead_reckoning import Away, DeadReckoning, Motion
+from ssh_abduction.online.estimates import Links, Move, Moves, Stars, view_ratios
 
 if TYPE_CHECKING:
     from perception.likelihood import ImageLikelihood
+
+# Dead reckoning follows a robot outside the map for this many steps.
+MOST_AWAY = 20
 
 
 class Localiser:
@@ -112,11 +118,21 @@ class Localiser:
         if trace is not None:
             check_labels(ssh_map, checked_trace(trace), "map")
         self._shown = view_ratios(ssh_map, trace)
+        self._stars: Stars | None = None
+        if trace is not None and any(step.star is not None for step in trace):
+            self._stars = Stars(ssh_map, trace, self.chances.misread)
         self._moves = Moves(ssh_map, trace)
+        self._odometry = (trace.odometry if trace else None) or Odometry()
+        self._reckoning = DeadReckoning.of(ssh_map, self._odometry)
         self._seen = None if recogniser is None else self._likelihood(recogniser)
 
+    @property
+    def reads_images(self) -> bool:
+        """Whether it has a recogniser, so that it reads images instead of views."""
+        return self._seen is not None
+
     def __repr__(self) -> str:
-        reads = "views" if self._seen is None else "images"
+        reads = "images" if self.reads_images else "views"
         return f"Localiser({self._number} dstates, {reads}, {self.chances})"
 
     @property
@@ -148,6 +164,7 @@ class Localiser:
         action: Action | str,
         view: View | None = None,
         image: ArrayLike | None = None,
+        displacement: Displacement | None = None,
     ) -> Belief:
         """Compute the belief after an action and the next observation.
 
@@ -160,9 +177,12 @@ class Localiser:
             view: The view after it, for a localiser without a recogniser.
             image: The image after it, of shape (d,), for a localiser with a recogniser: laser
                 ranges in metres, or another kind of image that the recogniser was trained on.
+            displacement: How the robot moved during the action by odometry, as (dx, dy, dtheta) in
+                metres and radians. It counts if the map has poses. Its errors are those of the
+                odometry of the mapped trace, or the defaults of `Odometry`.
 
         Raises:
-            TraceError: The action or the view is malformed.
+            TraceError: The action, the view or the displacement is malformed.
             LocaliserError: The belief is of another map, or there is an image and no recogniser.
             PerceptionError: The recogniser cannot read the image.
         """
@@ -171,8 +191,14 @@ class Localiser:
                 f"belief: expected one over {self._number} dstates, got {brief(belief)}; "
                 "begin with start()"
             )
-        move = self._moves.move(Action.of(action))
-        return self._after(belief, move, self._observation(view, image))
+        motion = turned = None
+        if displacement is not None:
+            displacement = checked_displacement(displacement)
+            turned = displacement[2]
+            covariance = self._odometry.covariance(displacement)
+            motion = Motion.of(displacement, covariance, self._odometry)
+        move = self._moves.move(Action.of(action), turned)
+        return self._after(belief, move, self._observation(view, image), motion)
 
     def beliefs(self, trace: Trace) -> Iterator[Belief]:
         """Yield the belief after each step of another trace.
@@ -184,16 +210,20 @@ class Localiser:
             TraceError: No step has a view, and there is no recogniser.
             PerceptionError: The images cannot be read.
         """
-        observed = self._observed(checked_trace(trace))
+        observed = map(self._with_star, self._observed(checked_trace(trace)), self._stars_of(trace))
         belief = self._weighed(self.prior, next(observed))
         yield belief
-        for step, action, seen in zip(trace.steps[1:], trace.actions, observed, strict=True):
-            turned = None if step.displacement is None else step.displacement[2]
-            belief = (
-                self._weighed(self.prior, seen)
-                if action.starts
-                else self._after(belief, self._moves.move(action, turned), seen)
-            )
+        odometry = trace.odometry or Odometry()
+        for t, (action, seen) in enumerate(zip(trace.actions, observed, strict=True), start=1):
+            if action.starts:
+                belief = self._weighed(self.prior, seen)
+            else:
+                displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
+                motion = turned = None
+                if displacement is not None and covariance is not None:
+                    turned = displacement[2]
+                    motion = Motion.of(displacement, covariance, odometry)
+                belief = self._after(belief, self._moves.move(action, turned), seen, motion)
             yield belief
 
     def _observed(self, trace: Trace) -> Iterator[Observation | None]:
@@ -210,6 +240,22 @@ class Localiser:
                 "and give it to localise --recogniser"
             )
         yield from (self._of_view(step.view) for step in trace)
+
+    def _stars_of(self, trace: Trace) -> Iterator[Sequence[Any] | None]:
+        """Yield the star of the first step of each visit, and None for the other steps.
+
+        During turns the robot sees the same gateways again, which tells nothing new.
+        """
+        yield trace.steps[0].star
+        for action, step in zip(trace.actions, trace.steps[1:], strict=True):
+            yield None if action.kind == "turn" else step.star
+
+    def _with_star(self, seen: Observation | None, star: Any) -> Observation | None:
+        """Add a star to an observation."""
+        if star is None or self._stars is None:
+            return seen
+        found = self._stars.of(Star.of(star))
+        return found if seen is None else seen & found
 
     def _observation(self, view: View | None, image: ArrayLike | None) -> Observation | None:
         """Make an observation from a view or an image; None if there is neither."""
@@ -241,40 +287,57 @@ class Localiser:
             slice(None), spread, max(0.0, 1 - float(ratios.sum()) / (len(ratios) + 1))
         )
 
-    def _after(self, belief: Belief, move: Move, seen: Observation | None) -> Belief:
+    def _after(
+        self, belief: Belief, move: Move, seen: Observation | None, motion: Motion | None = None
+    ) -> Belief:
         """Compute the belief after an action and an observation, and whether the robot is lost."""
-        found = self._weighed(self._moved(belief, move), seen, self._alike(belief.seen, move, seen))
+        links = self._moves.links(move)
+        if links is not None and self._reckoning and motion is not None and isinstance(move, str):
+            links = replace(links, leads=self._reckoning.along(links.leads, motion))
+        expected = self._moved(belief, links, motion)
+        found = self._weighed(expected, seen, self._alike(belief.seen, links, seen))
         sure = belief.entropy if belief.sure is None and found.collapsed else belief.sure
         if sure is None or (not found.collapsed and found.found_again(sure)):
             return found
         return replace(found, sure=sure)
 
-    def _moved(self, belief: Belief, move: Move) -> Belief:
-        """Compute the belief after an action and before the observation: the sum in equation 2."""
-        chances, p = self.chances, belief.probabilities
-        links = self._moves.links(move)
+    def _moved(self, belief: Belief, links: Links | None, motion: Motion | None) -> Belief:
+        """Compute the belief after an action and before the observation: the sum in equation 2.
+
+        After a displacement d, the probabilities are multiplied by p(d) / q(d).
+        """
+        slipped, p = self.chances.slipped, belief.probabilities
+        unlinked = p if links is None else links.missing * p
+        linked = p - unlinked
+        moved = np.zeros(self._number) if links is None else (1 - slipped) * (links.leads @ p)
         # `anywhere` is the probability that the robot was in the map and that the action slipped or
-        # has no link. Then the map does not say where the robot is now.
-        if links is None:
-            moved, anywhere = np.zeros(self._number), 1 - belief.nowhere
-        else:
-            known = links.leads @ p
-            moved = (1 - chances.slipped) * known
-            anywhere = chances.slipped * float(known.sum()) + float(links.missing @ p)
-        moved += (
-            anywhere * (1 - chances.unmapped) + belief.nowhere * chances.reentered
-        ) / self._number
-        entered, stayed = anywhere * chances.unmapped, belief.nowhere * (1 - chances.reentered)
+        # has no link. Then the map does not say where the robot is now, but odometry may.
+        anywhere, outside = slipped * float(linked.sum()) + float(unlinked.sum()), belief.nowhere
+        away: list[Away] = []
+        if self._reckoning is not None and motion is not None:
+            followed = sum(part.total for part in belief.away)
+            anywhere = slipped * (float(linked.sum()) / 2 + float(unlinked.sum()) + followed)
+            outside -= followed
+            left = (1 - slipped) * unlinked + slipped / 2 * linked
+            for part in (Away(left, motion), *(x.after(motion, 1 - slipped) for x in belief.away)):
+                arrived, stays = self._reckoning.arrivals(part, self.chances.unmapped)
+                moved += arrived
+                away.append(stays)
+        unmapped, reentered = self.chances.unmapped, self.chances.reentered
+        moved += (anywhere * (1 - unmapped) + outside * reentered) / self._number
+        entered = anywhere * unmapped + sum(part.total for part in away[:1])
+        stayed = outside * (1 - reentered) + sum(part.total for part in away[1:])
         akin = (
             (AKIN * entered + belief.akin * stayed) / (entered + stayed)
             if entered + stayed
             else AKIN
         )
-        return Belief(moved, entered + stayed, akin=akin)
+        return Belief(moved, entered + stayed, akin=akin, away=tuple(away[:MOST_AWAY]))
 
-    def _alike(self, before: Observation | None, move: Move, seen: Observation | None) -> float:
+    def _alike(
+        self, before: Observation | None, links: Links | None, seen: Observation | None
+    ) -> float:
         """Compute p(o'|akin) / q(o') for two observations with an action between them."""
-        links = self._moves.links(move)
         if before is None or seen is None or links is None:
             return 1.0
         # A distribution over the dstates that look like `before` and have a link for the action.
@@ -298,15 +361,16 @@ class Localiser:
         """Compute the belief after an observation o: the product in equation 2, normalised."""
         weights = self._products(expected, seen)
         unknown = expected.akin * alike + 1 - expected.akin  # p(o|nowhere) / q(o)
-        nowhere = expected.nowhere * unknown
+        nowhere, away = expected.nowhere * unknown, expected.away
         normaliser = total = float(weights.sum()) + nowhere
         # The observation is impossible by the belief before it, so localisation restarts.
         if not total:
             weights, nowhere = self._products(self.prior, seen), self.prior.nowhere
-            total = float(weights.sum()) + nowhere
+            total, away = float(weights.sum()) + nowhere, ()
         # The observation is impossible at every dstate, so the robot is nowhere.
         if not total:
             nowhere = total = 1.0
+            away = ()
         weights /= total
         return Belief(
             _frozen(weights),
@@ -314,6 +378,7 @@ class Localiser:
             normaliser,
             akin=expected.akin * alike / unknown,
             seen=seen,
+            away=tuple(Away(part.probabilities * (unknown / total), part.motion) for part in away),
         )
 
     def _products(self, expected: Belief, seen: Observation | None) -> NDArray[np.float64]:

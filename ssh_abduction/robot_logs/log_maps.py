@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import LogError
+from perception.images import images_of
 from perception.places.distinctive import WIDTH
 from perception.places.importing import Imported, import_log
 from perception.places.joining import join_logs
@@ -31,6 +32,7 @@ from ssh_abduction.data.checks import all_instances
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.files import json_line
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
@@ -198,11 +200,18 @@ class LogMap:
     def recogniser(self) -> Any:
         """Train a recogniser on the images of the trace, labelled with the dstates of the best map.
 
-        This is the last step of the bootstrap loop (Kuipers & Beeson 2002): it recognises
-        dstates in the images of another drive.
+        This is the last step of the bootstrap loop (Kuipers & Beeson 2002).
         """
-        images = [step.image for step in self.imported.trace.steps]
-        return new_recogniser(FLOOR).fit(images, self.solution.maps[0].dstate_at)
+        return recogniser_of(self.imported.trace, self.solution.maps[0])
+
+
+def recogniser_of(trace: Trace, ssh_map: SSHMap) -> Any:
+    """Train a recogniser on the images of the trace of a log, labelled with the dstates of a map.
+
+    It recognises dstates in the images of another drive. Raises PerceptionError if a step has no
+    image.
+    """
+    return new_recogniser(FLOOR).fit(images_of(trace), ssh_map.dstate_at)
 
 
 def seconds_driven(log: RobotLog) -> float | None:
