@@ -705,6 +705,24 @@ def test_damaged_line_is_skipped_and_reported(tmp_path: Path, what: str) -> None
     assert [type(item) for item in streamed] == [Scan, Scan, Damage, Scan, Scan, Scan]
 
 
+@pytest.mark.parametrize("tag", ["ODOM", "FLASER", "TRUEPOS"])
+def test_cut_line_is_damaged_wherever_it_was_cut(tmp_path: Path, tag: str) -> None:
+    """A cut heading still is a number, and so is a cut time."""
+    lines = [
+        line
+        for i in range(30)
+        for line in (
+            f"TRUEPOS {pose((0.1 * i, 0, 1.57))} {pose((0.1 * i, 0, 1.57))} {i}.25 host {i}.25",
+            odom((0.1 * i, 0, 1.57), f"{i}.25"),
+            flaser((0.1 * i, 0, 1.57), (0.1 * i, 0, 1.57), f"{i}.25"),
+        )
+    ]
+    at = next(i for i in range(45, 90) if lines[i].startswith(tag))
+    for end in range(len(tag) + 1, lines[at].rindex(" ")):
+        cut = [*lines[:at], lines[at][:end], *lines[at + 1 :]]
+        assert [d.line for d in read_text(tmp_path / "a.log", *cut).damaged] == [at + 1], end
+
+
 def test_byte_order_mark_loses_no_scan(tmp_path: Path) -> None:
     (tmp_path / "a.log").write_text(flaser(START, START), encoding="utf-8-sig")
     log = read_log(tmp_path / "a.log")

@@ -65,6 +65,7 @@ from perception.readers.messages import (
     edge_of,
     parameters_of,
     pose_at,
+    refuse_cut,
     scan_line,
     time_at,
     vertex_of,
@@ -173,11 +174,13 @@ def _scans(
             if tag != kind.encode():
                 odometer.read_line(tag, tokens)
             elif (line := scan_line(tokens)) is not None:
+                refuse_cut(tag, line.after, odometer.found.usual_length(tag))
                 seen, pose = _measured(line, mount, reach, fov), odometer.pose_of(line)
                 waiting.append(Scan(*seen, *pose, line.time, number))
         except Damaged as damage:
             odometer.skip_line(tag)
             waiting.append(Damage(number, str(damage)))
+            tag = b""  # no pose that waiting scans could take
         if odometer.meaning != "lines" or tag == b"ODOM" or len(waiting) >= MOST_WAITING:
             yield from map(odometer.with_pose, waiting)
             waiting.clear()
@@ -217,6 +220,7 @@ class _OdometerPoses:
 
     def read_line(self, tag: bytes, tokens: list[bytes]) -> None:
         """Process a line that is no scan. Raises Damaged."""
+        refuse_cut(tag, len(tokens), self.found.usual_length(tag))
         if tag == b"ODOM":
             pose = pose_at(tokens, 1)
             self.behind = self.chain

@@ -200,6 +200,8 @@ class Findings:
         kinds: Findings for each kind of lines with scans.
         parameters: Values of PARAM lines about the laser, by name: offset, side, angle, reach, fov.
         tags: Number of lines of each kind.
+        lengths: For each kind of line with poses, how many lines have each number of words. In
+            lines with scans, only words after the poses count.
         graph: Vertices and edges of the log.
         damage: Description of the first scan that cannot be read; empty if there is none.
     """
@@ -207,8 +209,19 @@ class Findings:
     kinds: dict[str, Survey] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
     tags: Counter[str] = field(default_factory=Counter)
+    lengths: dict[bytes, Counter[int]] = field(default_factory=dict)
     graph: PoseGraph = field(default_factory=PoseGraph)
     damage: str = ""
+
+    def usual_length(self, tag: bytes) -> int:
+        """Compute the largest number of words that most lines of a kind reach."""
+        lengths = self.lengths.get(tag, Counter())
+        short = (1 - MOST_SCANS) * lengths.total()
+        for length in sorted(lengths):
+            short -= lengths[length]
+            if short < 0:
+                return length
+        return 0
 
 
 def meaning_of(
@@ -355,6 +368,8 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
             continue
         tag = tokens[0]
         try:
+            if tag in (b"ODOM", b"TRUEPOS"):
+                found.lengths.setdefault(tag, Counter())[len(tokens)] += 1
             if tag == b"ODOM":
                 pose, time = pose_at(tokens, 1), time_at(tokens, 7)
                 since = {kind: count + 1 for kind, count in since.items()}
@@ -372,6 +387,7 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
             elif (line := scan_line(tokens)) is not None:
                 survey = found.kinds.setdefault(line.kind, Survey())
                 _count(survey, line)
+                found.lengths.setdefault(tag, Counter())[line.after] += 1
                 if (
                     since.get(line.kind, 2) < 2
                 ):  # The first ODOM line after a scan only repeats the pose of the scan.

@@ -49,6 +49,7 @@ class ScanLine:
         first: First pose: the pose of the laser, or a corrected pose; None without poses.
         second: Second pose: the pose of the robot; None without poses.
         time: Seconds; None if missing.
+        after: Number of words after the poses.
     """
 
     kind: str
@@ -57,6 +58,7 @@ class ScanLine:
     first: Pose | None
     second: Pose | None
     time: float | None
+    after: int
 
 
 def words(raw: bytes | None) -> list[bytes]:
@@ -109,7 +111,16 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
         if kind == "RAWLASER1"
         else (pose_at(tokens, poses), pose_at(tokens, poses + 3))
     )
-    return ScanLine(kind, beams, shape, first, second, time_at(tokens, end))
+    return ScanLine(kind, beams, shape, first, second, time_at(tokens, end), len(tokens) - end)
+
+
+def refuse_cut(tag: bytes, count: int, usual: int) -> None:
+    """Raise Damaged if a line has fewer words than usual. Then its last number may be cut, too."""
+    if count < usual:
+        raise Damaged(
+            f"expected at least {usual - count} more words, as most lines {tag.decode('ascii')} "
+            "have, got the end of a line that was cut"
+        )
 
 
 def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
