@@ -588,6 +588,17 @@ def test_verbs_apply_star_corrections_to_the_recorded_trace(
     assert "the file belongs to another map" in capsys.readouterr().err
 
 
+def test_check_says_that_maps_are_older_than_their_corrections(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = str(folder / "building" / "maps.json")
+    assert main(["correct", maps, "--different", "monday:0,monday:1"]) == 0
+    assert main(["check", "--bound", maps]) == 0
+    assert "the maps are older than the corrections" in capsys.readouterr().out
+    assert main(["check", "--bound", maps, "--set", "boundary=none"]) == 0
+    assert "the file is of another theory" in capsys.readouterr().out
+
+
 def test_north_in_a_correction_is_north_of_the_drawing(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -122,7 +122,8 @@ def run(options: argparse.Namespace) -> int:
     trace = solved_trace(options)
     data = read_json(options.maps)
     solved = written_theory(data)
-    trace, theory = as_corrected(trace, theory_of(options, solved), options.maps)
+    asked = theory_of(options, solved)
+    trace, theory = as_corrected(trace, asked, options.maps)
     theory.check_steps(trace)
     if options.bound:
         maps = maps_of(data, str(options.maps))
@@ -132,13 +133,16 @@ def run(options: argparse.Namespace) -> int:
     resolved = settle(trace, theory).theory
     made_by = settle(trace, solved or theory).theory
     other = _axioms_of(resolved) != _axioms_of(made_by)
+    why = "the file is of another theory"
+    if _axioms_of(settle(trace, asked).theory) == _axioms_of(made_by):
+        why = "the maps are older than the corrections, so solve again"
     # The regions of a map follow from the theory that made it.
     unjudged = other and any(ssh_map.regions is not None for ssh_map in maps)
     maps = [replace(ssh_map, regions=None) for ssh_map in maps] if unjudged else maps
     violations = [check(trace, ssh_map, resolved) for ssh_map in maps]
     said: list[str] = []  # sentences about what is checked besides the axioms
     if unjudged:
-        said.append("regions are not checked: the file is of another theory")
+        said.append(f"regions are not checked: {why}")
     holds = not any(violations)
     if resolved.weigh == "cost" and isinstance(data, dict) and data.get("weighed"):
         holds &= _costs_hold(trace, data, maps, resolved, str(options.maps), said)
@@ -150,7 +154,7 @@ def run(options: argparse.Namespace) -> int:
         elif solved is None:
             doubt = "the file names no theory"
         elif other:
-            doubt = "the file is of another theory"
+            doubt = why
         holds &= _bound(trace, data, maps, doubt, made_by, broken, said)
     found = _Judgement(violations, resolved, [*map(printable, said)], holds)
     print(json_line(found.to_dict()) if options.json else "\n".join(found.lines()))

@@ -174,10 +174,12 @@ class Obeying:
         return explain(trace[stretch.start : stretch.stop], part) is not None
 
     def _seen(self, said: Said | Passage) -> str:
-        """Say what the robot saw at two steps that are said to be one dstate; else nothing."""
+        """Say what the robot saw at two steps that are said to be one dstate, if this differs."""
         if isinstance(said, Passage) or said.kind != "same":
             return ""
         drives = drives_of(self.trace)
         views = [self.trace.steps[step_of(drives, step)].view for step in said.steps]
+        if views[0] == views[1]:
+            return ""
         seen = ("no view" if view is None else view for view in views)
         return f" ({', '.join(f'{s} shows {v}' for s, v in zip(said.steps, seen, strict=True))})"
