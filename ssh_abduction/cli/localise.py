@@ -21,6 +21,7 @@ from ssh_abduction.cli.options import (
     trace_path,
 )
 from ssh_abduction.cli.parsing import Verbs
+from ssh_abduction.cli.show import named_maps
 from ssh_abduction.cli.text import steps_in_words, table
 from ssh_abduction.data.errors import LocaliserError, MapError, named, said_of
 from ssh_abduction.data.files import json_line
@@ -32,7 +33,8 @@ if TYPE_CHECKING:
     from ssh_abduction.data.maps import SSHMap
     from ssh_abduction.online.localiser import Localiser
 
-HEAD = ("step", "action", "seen", "", "dstate", "probability", "nowhere", "entropy", "normaliser")
+HEAD = ("step", "action", "seen", "", "dstate")
+NUMBERS = ("probability", "nowhere", "entropy", "normaliser")
 CHANCES = ("misread", "slipped", "unmapped", "reentered")
 NOWHERE = "–"
 
@@ -99,9 +101,19 @@ def run(options: argparse.Namespace) -> int:
         print(json_line(head)[:-1] + ', "beliefs": [\n' + ",\n".join(lines) + "\n]}")
     else:
         print(_headline(beliefs))
-        views = [("image" if localiser.reads_images else step.view) for step in trace]
-        rows = [_row(t, belief, trace, views[t]) for t, belief in enumerate(beliefs)]
-        print(table(HEAD, rows))
+        seen = ["image" if localiser.reads_images else step.view for step in trace]
+        done = ["", *(action.name for action in trace.actions)]
+        rows = [
+            [
+                step,
+                done[step],
+                NOWHERE if seen[step] is None else seen[step],
+                *_found(belief, localiser.ssh_map),
+            ]
+            for step, belief in enumerate(beliefs)
+        ]
+        place = ("place",) if localiser.ssh_map.places else ()
+        print(table((*HEAD, *place, *NUMBERS), rows))
     if options.plot:
         sys.stdout.flush()  # print first, in case drawing fails
         from ssh_abduction.evaluation.paper.figures import draw_beliefs
@@ -118,7 +130,9 @@ def _localiser(options: argparse.Namespace) -> tuple[Localiser, Trace]:
     from ssh_abduction.online.chances import Chances
     from ssh_abduction.online.localiser import Localiser
 
-    maps = some_maps(read_maps(options.maps), options.maps, "localise in")
+    data = read_maps(options.maps)
+    some_maps(data, options.maps, "localise in")
+    maps = named_maps(data, options.maps)
     check_number(options.map, maps, options.maps)
     if len(maps) > 1 and options.map is None:
         warnings.warn(
@@ -167,14 +181,15 @@ def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join(parts)
 
 
-def _row(step: int, belief: Mapping[str, Any], trace: Trace, seen: object) -> list[object]:
-    """Make the row of a step in the table, from the belief after this step."""
+def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
+    """Make the cells about a belief: the verdict, the dstate and its place, and numbers."""
+    dstate: int | None = belief["dstate"]
+    cells: list[object] = [belief["verdict"], NOWHERE if dstate is None else dstate]
+    if ssh_map.places:
+        place = None if dstate is None else ssh_map.dstates[dstate].place
+        cells.append(NOWHERE if place is None else ssh_map.numbered("place", place))
     return [
-        step,
-        trace.actions[step - 1].name if step else "",
-        NOWHERE if seen is None else seen,
-        belief["verdict"],
-        NOWHERE if belief["dstate"] is None else belief["dstate"],
+        *cells,
         *(f"{belief[name]:.3f}" for name in ("probability", "nowhere")),
         f"{belief['entropy']:.2f}",
         f"{belief['normaliser']:.3g}",

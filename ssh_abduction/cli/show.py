@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from ssh_abduction.cli.options import add_maps, check_number
 from ssh_abduction.cli.parsing import Verbs
@@ -27,11 +28,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    data, where = read_json(options.maps), str(options.maps)
-    found = maps_of(data, where)
-    steps = len(found[0].dstate_at) if found else 0
-    drives = drives_in(FieldReader(where), data, steps) if found else ()
-    maps = named_beside(found, drives, options.maps)
+    maps = named_maps(read_json(options.maps), str(options.maps))
     check_number(options.map, maps, options.maps)
     if not maps:
         print("no map")
@@ -47,3 +44,11 @@ def _with_regions(ssh_map: SSHMap) -> str:
     """Describe a map and its regions: sets of places beside paths, or behind one place."""
     regions = [f"  {described(region, ssh_map.called)}" for region in ssh_map.regions or ()]
     return "\n".join([describe(ssh_map), *regions])
+
+
+def named_maps(data: Any, file: str) -> tuple[SSHMap, ...]:
+    """Return the maps in the data of a file, with the names beside it. Raises MapError."""
+    found = maps_of(data, file)
+    steps = len(found[0].dstate_at) if found else 0
+    drives = drives_in(FieldReader(file), data, steps) if found else ()
+    return named_beside(found, drives, file)
