@@ -62,7 +62,7 @@ def test_drives_that_are_clustered_together_get_common_views(
     separate = [f"alone-{name}" for name in NAMES]
     assert not _agree(together, _views(*separate))  # a view is another one on the other day
     capsys.readouterr()
-    assert main(["solve", *separate, "--together"]) == 0
+    assert main(["solve", *separate, "--together", "--set", "weigh=count"]) == 0
     assert (
         "alone-monday.jsonl and alone-tuesday.jsonl seem to have different views of the same names"
         in capsys.readouterr().err

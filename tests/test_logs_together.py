@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.output.layout import layout
-from ssh_abduction.robot_logs import log_report
+from ssh_abduction.robot_logs import log_maps, log_report
 from ssh_abduction.robot_logs.log_maps import BARE, map_log
 from ssh_abduction.robot_logs.log_picture import ASIDE, colour_of, laid_over
 from ssh_abduction.solver import Solution, solve
@@ -52,22 +53,37 @@ def halves() -> tuple[RobotLog, RobotLog]:
 
 
 @pytest.fixture(scope="module")
-def folder(halves: tuple[RobotLog, RobotLog], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The output of `map --together` for both drives."""
+def mapping(
+    halves: tuple[RobotLog, RobotLog], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[Imported]]:
+    """The output of `map --together` for both drives, and the imports that it made."""
+    parts = []
+
+    def kept(*given: Any) -> Imported:
+        parts.append(import_log(*given))
+        return parts[-1]
+
     folder = tmp_path_factory.mktemp("logs")
     logs = []
     for log in halves:
         logs.append(str(folder / f"{log.source}.log"))
         write_carmen(Path(logs[-1]), log.scans)
     command = ["map", *logs, "--together", "-o", str(folder / "building"), "--time-limit", "5"]
-    main([*command, "--set", "ladder=false"])
-    return folder / "building"
+    with patch.object(log_maps, "import_log", kept):
+        main([*command, "--set", "ladder=false"])
+    return folder / "building", parts
 
 
 @pytest.fixture(scope="module")
-def joint(halves: tuple[RobotLog, RobotLog]) -> tuple[RobotLog, Imported, list[Imported]]:
-    parts = [import_log(log, name=log.source) for log in halves]
-    return *join_logs(halves, parts), parts
+def folder(mapping: tuple[Path, list[Imported]]) -> Path:
+    return mapping[0]
+
+
+@pytest.fixture(scope="module")
+def joint(
+    halves: tuple[RobotLog, RobotLog], mapping: tuple[Path, list[Imported]]
+) -> tuple[RobotLog, Imported, list[Imported]]:
+    return *join_logs(halves, mapping[1]), mapping[1]
 
 
 @pytest.mark.slow

@@ -77,7 +77,7 @@ def test_bound_from_repeats_is_at_most_the_least_cost(kind: str, seed: int) -> N
 
 
 def test_scatter_of_repeated_moves_raises_the_bound_of_long_drives() -> None:
-    (known,) = together.of_mazes(3, 60, [7], truth.Noise(Odometry(**truth.NOISE)), 3)
+    (known,) = together.of_mazes(3, 45, [7], truth.Noise(Odometry(**truth.NOISE)), 3)
     ssh_map, problem = true_map(known), settle(known.trace)
     cost = Misfit(problem).nats_of(ssh_map)
     first, *_, last = forcing_of(known.trace, problem.theory, ssh_map).repeated(
