@@ -12,7 +12,7 @@ import pytest
 from brute_geometry import Geometry
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from instances import maze
+from instances import Walk, maze
 from scipy.optimize import approx_fprime
 from scipy.sparse import csr_array
 from strategies import theories, traces
@@ -162,7 +162,7 @@ def test_displacements_tell_equal_corners_of_a_square_apart() -> None:
     assert solution.maps[0].labels == tuple(step % 8 for step in range(11))
 
 
-@pytest.mark.parametrize("corners", [3, 5, 6])
+@pytest.mark.parametrize("corners", [3, 6])
 def test_displacements_tell_corners_of_polygons_apart(corners: int) -> None:
     trace = circuit(corners, 2 * corners + 1, 1.0, seed=corners)
     solution = solve(trace, Theory.causal())
@@ -179,7 +179,7 @@ def test_displacements_tell_corners_of_polygons_apart(corners: int) -> None:
     ],
 )
 def test_fit_estimates_scale_and_drift(scale: float, bend: float) -> None:
-    trace = circuit(5, 16, 1.0, 1, Odometry(heading=0.001, turning=0.01, angle=0.005), scale, bend)
+    trace = circuit(5, 12, 1.0, 1, Odometry(heading=0.001, turning=0.01, angle=0.005), scale, bend)
     solution = solve(trace, Theory.causal())
     found = solution.maps[0]
     assert found.labels == tuple(step % 10 for step in range(len(trace)))
@@ -426,13 +426,21 @@ def test_p_values_of_true_maps_are_plausible_if_turns_have_hardly_any_noise() ->
     assert squares == pytest.approx(freedom, rel=0.25)
 
 
+@cache
+def walks() -> list[Walk]:
+    """Walks through 20 mazes."""
+    return [
+        maze(3, 3, steps=30, seed=seed, stars=True, follow=True, odometry=Odometry())
+        for seed in range(20)
+    ]
+
+
 @pytest.mark.parametrize("kept", ["travels", "turns", "most", "few"])
 def test_p_values_of_true_maps_are_plausible_without_turns(kept: str) -> None:
     """20 true maps without reported turns. Headings follow from places that stretches share, or
     stay unknown."""
     squares = freedom = above = 0.0
-    for seed in range(20):
-        walk = maze(3, 3, steps=30, seed=seed, stars=True, follow=True, odometry=Odometry())
+    for seed, walk in enumerate(walks()):
         rng = np.random.default_rng(seed)
         keeps = [
             {

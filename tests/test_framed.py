@@ -221,7 +221,7 @@ def test_apart_nodes_are_different_true_dstates() -> None:
     """In a world that satisfies the theory, steps that the trace alone distinguishes are truly
     different."""
     for seed in range(6):
-        walk = maze(3, 3, steps=120, seed=seed, stars=True)
+        walk = maze(3, 3, steps=200, seed=seed, stars=True)
         search = Search(walk.trace, Theory.topological())
         chart = Chart.framed(walk.trace, Log(walk.trace, search.theory))
         assert chart
@@ -577,7 +577,7 @@ def places(walk: Walk, chart: FramedChart) -> list[object]:
 
 
 def test_annealing_finds_the_true_places_of_a_maze() -> None:
-    walk = maze(4, 4, steps=800, seed=0, stars=True)
+    walk = maze(4, 4, steps=400, seed=0, stars=True)
     chart = Chart.framed(walk.trace, Log(walk.trace, Theory(star="frame")))
     guess = annealed(chart)
     assert guess.sure.all()

@@ -106,7 +106,8 @@ def test_current_folder_moves_to_the_end_of_the_module_path(
 DEAF = """
 import sys, clingo
 from ssh_abduction import __main__
-from ssh_abduction.cli import facts
+from ssh_abduction.cli import facts, guard
+guard.DEAF = 0.2
 def run(options):
     print("ready", flush=True)
     control = clingo.Control()

@@ -30,11 +30,11 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.special import gammaincc
-from threadpoolctl import threadpool_limits
 
 from ssh_abduction.data.maps import Fit, Pose, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.geometry.equations import Equations
 from ssh_abduction.solver.geometry.linear import (
     as_dense,
@@ -65,7 +65,7 @@ HELD_STILL = 1e-9
 def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
     """Find the poses of the dstates that agree best with the displacements, and the chi-square."""
     # The matrices are small: threads of BLAS would mostly wait for each other.
-    with threadpool_limits(1, user_api="blas"):
+    with one_thread("blas"):
         return Poses.of_map(trace, ssh_map).fit()
 
 

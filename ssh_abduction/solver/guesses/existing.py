@@ -13,11 +13,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.overlaying import Part
@@ -38,7 +38,7 @@ class ExistingMap:
     def __init__(self, old: Trace, ssh_map: SSHMap) -> None:
         """Fit the poses to the old drives and their map."""
         self.broken = 0.0
-        with threadpool_limits(1, user_api="blas"):
+        with one_thread("blas"):
             self._piece, self._mean, self._covariance = Poses.of_map(old, ssh_map).gaussian()
         self._places = numbered(-1 - s.id if s.place is None else s.place for s in ssh_map.dstates)
 
