@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,8 @@ import pytest
 
 from ssh_abduction import cli
 from ssh_abduction.cli import parser
+from ssh_abduction.cli.options import helps
+from ssh_abduction.theory.theory import Theory
 
 ROOT = Path(cli.__file__).parents[2]
 VERBS = {
@@ -167,3 +170,13 @@ def test_an_error_without_advice_is_found() -> None:
 )
 def test_wrong_finds_options_that_the_verb_lacks(path: str, text: str, bad: list[str]) -> None:
     assert wrong(path, text) == bad
+
+
+def test_help_reads_docstrings_without_indentation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python 3.13 removes the indentation of docstrings, and python -OO the docstrings."""
+    indented = helps()
+    assert indented["level"]
+    monkeypatch.setattr(Theory, "__doc__", inspect.cleandoc(Theory.__doc__ or ""))
+    assert helps() == indented
+    monkeypatch.setattr(Theory, "__doc__", None)
+    assert {*parser().verbs} == {*VERBS}

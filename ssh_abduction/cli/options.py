@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import os
 import re
 import sys
@@ -92,7 +93,7 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
             details = {"type": int, "metavar": "N"}
         elif isinstance(field.default, float):
             details = {"type": float, "metavar": "NUMBER"}
-        parser.add_setting(field.name, said[field.name], **details)
+        parser.add_setting(field.name, said.get(field.name, field.name), **details)
 
 
 def helps() -> dict[str, str]:
@@ -100,8 +101,9 @@ def helps() -> dict[str, str]:
 
     As in other help texts, the first letter is small.
     """
-    _, _, attributes = (Theory.__doc__ or "").partition("Attributes:")
-    entries = re.findall(r"^ {8}(\w+): (.+(?:\n {12}.+)*)", attributes, re.MULTILINE)
+    # Python 3.13 stores docstrings without indentation.
+    _, _, attributes = inspect.cleandoc(Theory.__doc__ or "").partition("Attributes:")
+    entries = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", attributes, re.MULTILINE)
     words = {name: " ".join(text.split()).rstrip(".") for name, text in entries}
     return {name: text[0].lower() + text[1:] for name, text in words.items()}
 
