@@ -79,6 +79,11 @@ def test_junctions_are_found_where_ways_meet(patch: Patch, bearings: list[float]
             assert min(radians_between(way, bearing) for way in ways) < math.radians(20)
 
 
+def test_robot_wider_than_the_map_finds_no_junctions() -> None:
+    """A mask as wide as this robot needs more memory than there is."""
+    assert not junctions(patch_of(CORRIDOR, (-1, -8, 1, 8)), 25.0)
+
+
 HALL = (-6.0, -6.0, 6.0, 6.0)
 DOOR = (-4.5, 5.0, -3.5, 8.0)  # in the upper wall of the hall, at x = -4
 OPPOSITE = (3.5, -8.0, 4.5, -5.0)

@@ -146,9 +146,10 @@ def passable(patch: Patch, room: float) -> Bools:
     Furniture does not count as an obstacle.
     """
     trail = ndimage.binary_dilation(patch.trail, EIGHT)
-    span = np.arange(-int(room / CELL), int(room / CELL) + 1)
-    disc = np.hypot(*np.meshgrid(span, span)) * CELL < room
-    fits = (patch.free & ~ndimage.binary_dilation(patch.occupied, disc)) | trail
+    fits = trail | patch.free
+    if patch.occupied.any():
+        distance = ndimage.distance_transform_edt(~patch.occupied) * CELL
+        fits = trail | (patch.free & (distance >= room))
     fits = ndimage.binary_opening(fits, EIGHT) | trail
     parts, count = ndimage.label(fits, EIGHT)
     is_reached = np.zeros(count + 1, np.bool_)
