@@ -242,10 +242,14 @@ def test_stars_tell_dstates_apart_that_look_alike() -> None:
         (0, 1, 2), tuple(DState(i, "v") for i in range(3)), ((0, "on", 1), (1, "on", 2))
     )
     localiser = Localiser(ssh_map, trace=mapped)
-    beliefs = localiser.beliefs(Trace.from_steps("vv", ["on"], stars=stars[1:]))
+    beliefs = list(localiser.beliefs(Trace.from_steps("vv", ["on"], stars=stars[1:])))
     assert [belief.dstate for belief in beliefs] == [1, 2]
     # After a turn the robot sees the same gateways, so they do not count again.
     turns = Trace.from_steps("vv", ["right"], stars=[(1, 1, 1, 0), (1, 1, 0, 1)])
     first, second = localiser.beliefs(turns)
     unseen = localiser.update(first, "right", "v")
     assert second.probabilities.tolist() == unseen.probabilities.tolist()
+    by_hand = localiser.update(localiser.start("v", star=stars[1]), "on", "v", star=stars[2])
+    assert by_hand.probabilities.tolist() == beliefs[1].probabilities.tolist()
+    with pytest.raises(TraceError, match="star"):
+        localiser.start("v", star=["ahead"])

@@ -186,9 +186,9 @@ class Stars:
         """Collect the stars of each dstate, and compare those of one dstate."""
         self._number = len(ssh_map.dstates)
         self._seen = gathered(
-            (x, Star.of(step.star))
+            (x, step.gateways)
             for x, step in zip(ssh_map.dstate_at, trace, strict=True)
-            if step.star is not None
+            if step.gateways is not None
         )
         fits = [_fit(one, other) for stars in self._seen.values() for one, other in pairwise(stars)]
         self.misread = misread and max(misread, (1 + fits.count(False)) / (10 + len(fits)))

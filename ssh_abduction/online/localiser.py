@@ -67,7 +67,6 @@ from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.errors import LocaliserError, MapError, TraceError, brief, named
 from ssh_abduction.data.maps import SSHMap, check_labels, checked_map
 from ssh_abduction.data.odometry import Displacement, Odometry, checked_displacement
-from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace, View, checked_trace
 from ssh_abduction.online.belief import AKIN, NOVEL, TINY, Belief, Observation
 from ssh_abduction.online.chances import Chances
@@ -141,22 +140,29 @@ class Localiser:
         unmapped = self.chances.unmapped
         return Belief(_frozen(np.full(self._number, (1 - unmapped) / self._number)), unmapped)
 
-    def start(self, view: View | None = None, image: ArrayLike | None = None) -> Belief:
+    def start(
+        self,
+        view: View | None = None,
+        image: ArrayLike | None = None,
+        star: Sequence[Any] | None = None,
+    ) -> Belief:
         """Compute the belief after the first observation.
 
-        Without view and image it is the prior: all dstates are equally likely.
+        Without view, image and star it is the prior: all dstates are equally likely.
 
         Args:
             view: The view, for a localiser without a recogniser.
             image: The image, of shape (d,), for a localiser with a recogniser: laser ranges in
                 metres, or another kind of image that the recogniser was trained on.
+            star: The gateways that the robot sees, as in a `Step`. They count if the localiser was
+                given the mapped trace, and this trace has stars.
 
         Raises:
-            TraceError: The view is malformed.
+            TraceError: The view or the star is malformed.
             LocaliserError: There is an image and no recogniser.
             PerceptionError: The recogniser cannot read the image.
         """
-        return self._weighed(self.prior, self._observation(view, image))
+        return self._weighed(self.prior, self._with_star(self._observation(view, image), star))
 
     def update(
         self,
@@ -165,10 +171,11 @@ class Localiser:
         view: View | None = None,
         image: ArrayLike | None = None,
         displacement: Displacement | None = None,
+        star: Sequence[Any] | None = None,
     ) -> Belief:
         """Compute the belief after an action and the next observation.
 
-        Without view and image, only the action counts.
+        Without view, image and star, only the action counts.
 
         Args:
             belief: The belief before the action.
@@ -180,9 +187,11 @@ class Localiser:
             displacement: How the robot moved during the action by odometry, as (dx, dy, dtheta) in
                 metres and radians. It counts if the map has poses. Its errors are those of the
                 odometry of the mapped trace, or the defaults of `Odometry`.
+            star: The gateways that the robot sees after it, as for `start`. After a turn they do
+                not count, as the robot saw them before.
 
         Raises:
-            TraceError: The action, the view or the displacement is malformed.
+            TraceError: The action, the view, the displacement or the star is malformed.
             LocaliserError: The belief is of another map, or there is an image and no recogniser.
             PerceptionError: The recogniser cannot read the image.
         """
@@ -197,8 +206,11 @@ class Localiser:
             turned = displacement[2]
             covariance = self._odometry.covariance(displacement)
             motion = Motion.of(displacement, covariance, self._odometry)
-        move = self._moves.move(Action.of(action), turned)
-        return self._after(belief, move, self._observation(view, image), motion)
+        action = Action.of(action)
+        seen = self._observation(view, image)
+        if action.kind != "turn":
+            seen = self._with_star(seen, star)
+        return self._after(belief, self._moves.move(action, turned), seen, motion)
 
     def beliefs(self, trace: Trace) -> Iterator[Belief]:
         """Yield the belief after each step of another trace.
@@ -252,9 +264,12 @@ class Localiser:
 
     def _with_star(self, seen: Observation | None, star: Any) -> Observation | None:
         """Add a star to an observation."""
-        if star is None or self._stars is None:
+        if star is None:
             return seen
-        found = self._stars.of(Star.of(star))
+        gateways = Step(None, star=star).gateways
+        if gateways is None or self._stars is None:
+            return seen
+        found = self._stars.of(gateways)
         return found if seen is None else seen & found
 
     def _observation(self, view: View | None, image: ArrayLike | None) -> Observation | None:
@@ -314,15 +329,15 @@ class Localiser:
         # has no link. Then the map does not say where the robot is now, but odometry may.
         anywhere, outside = slipped * float(linked.sum()) + float(unlinked.sum()), belief.nowhere
         away: list[Away] = []
-        if self._reckoning is not None and motion is not None:
+        if motion is not None and self._reckoning is not None:
             followed = sum(part.total for part in belief.away)
             anywhere = slipped * (float(linked.sum()) / 2 + float(unlinked.sum()) + followed)
             outside -= followed
-            left = (1 - slipped) * unlinked + slipped / 2 * linked
-            for part in (Away(left, motion), *(x.after(motion, 1 - slipped) for x in belief.away)):
-                arrived, stays = self._reckoning.arrivals(part, self.chances.unmapped)
-                moved += arrived
-                away.append(stays)
+            left = Away((1 - slipped) * unlinked + slipped / 2 * linked, motion)
+            older = (part.after(motion, 1 - slipped) for part in belief.away)
+            found = [self._reckoning.arrivals(p, self.chances.unmapped) for p in (left, *older)]
+            moved += sum(arrived for arrived, _ in found)
+            away = [stays for _, stays in found]
         unmapped, reentered = self.chances.unmapped, self.chances.reentered
         moved += (anywhere * (1 - unmapped) + outside * reentered) / self._number
         entered = anywhere * unmapped + sum(part.total for part in away[:1])
