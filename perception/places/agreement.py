@@ -208,11 +208,13 @@ def laser_direction(log: RobotLog) -> float | None:
     direction, or if there are several lasers.
     """
     angles = {scan.laser.mount[2] for scan in log.scans}
-    apart = _apart(log, np.radians(TURNS)) if len(angles) == 1 else None
+    now = _apart(log, np.zeros(1)) if len(angles) == 1 else None
+    most = math.inf if now is None else CLOSER_TURNED * float(now[0])
+    apart = None if now is None else _apart(log, np.radians(TURNS), most=most)
     if apart is None:
         return None
     best = int(np.argmin(apart))
-    if abs(TURNS[best]) < LEAST_CHANGE or apart[best] > CLOSER_TURNED * float(apart[TURNS == 0][0]):
+    if abs(TURNS[best]) < LEAST_CHANGE or apart[best] > most:
         return None
     return math.degrees(wrapped(angles.pop() + math.radians(TURNS[best])))
 
@@ -241,21 +243,28 @@ def _fov(scan: Scan) -> float:
     return math.degrees(abs(scan.laser.step)) * scan.laser.steps
 
 
-def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
+def _apart(
+    log: RobotLog, turns: Array, stretch: float = 1.0, most: float = math.inf
+) -> Array | None:
     """How far the points of two scans lie apart, if the odometry moves one scan to the other.
 
     The laser is rotated by each of `turns` radians, and angles between beams are stretched. The
     result is the mean distance in metres for each turn, (turns,); None if there are too few pairs.
+    A mean above `most` may be too low, but not below `most`.
     """
-    apart = []
+    pairs = []
     for first, second in _pairs(log):
-        x, y, angle = first.laser.mount
-        at, looks = complex(x, y), np.exp(1j * (angle + turns))
-        dx, dy, turn = displacement_between(first.odometry, second.odometry)
         here, there = _points(first, stretch), _points(second, stretch)
-        there = there[:: 1 + len(there) // POINTS]
-        if first.laser != second.laser or not len(here) or not len(there):
-            continue
+        if first.laser == second.laser and len(here) and len(there):
+            pairs.append((first, second, here, there[:: 1 + len(there) // POINTS]))
+    if len(pairs) < PAIRS / 4:
+        return None
+    apart = np.zeros(len(turns))
+    for first, second, here, there in pairs:
+        near = apart <= most * len(pairs)  # the others lie too far apart already
+        x, y, angle = first.laser.mount
+        at, looks = complex(x, y), np.exp(1j * (angle + turns[near]))
+        dx, dy, turn = displacement_between(first.odometry, second.odometry)
         # Transform from the laser of the second scan to the robot then, to the robot at the first
         # scan, to the laser then.
         moved = complex(dx, dy) + (at + there[:, None] * looks) * np.exp(1j * turn)
@@ -264,8 +273,8 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
         nearest, _ = tree.query(
             np.stack([seen.real, seen.imag], axis=-1), distance_upper_bound=MEET
         )
-        apart.append(np.minimum(nearest, MEET).mean(axis=0))
-    return np.asarray(np.mean(apart, axis=0)) if len(apart) >= PAIRS / 4 else None
+        apart[near] += np.minimum(nearest, MEET).mean(axis=0)
+    return apart / len(pairs)
 
 
 def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:

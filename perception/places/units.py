@@ -89,8 +89,9 @@ def _length(log: RobotLog) -> tuple[float, list[str]]:
         return float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9))
 
     # Matching cannot correct metres that are too large to be true.
-    found = min([unit for unit in UNITS if unit != "metres" or usual <= FAR_OFF], key=off)
-    if found == "metres" or off(found) > UNLIKE:
+    offs = {unit: off(unit) for unit in UNITS if unit != "metres" or usual <= FAR_OFF}
+    found = min(offs, key=offs.__getitem__)
+    if found == "metres" or offs[found] > UNLIKE:
         return 1.0, []
     count = UNITS[found]
     return count, [
