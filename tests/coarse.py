@@ -14,12 +14,12 @@ from ssh_abduction.cli.simulate import scans_of
 
 
 @cache
-def hall() -> tuple[Scan, ...]:
-    """A tour through the hallway of Taylor Hall, with a scan each metre.
+def hall(every: float = 1.0) -> tuple[Scan, ...]:
+    """A tour through the hallway of Taylor Hall, with a scan each metre, or after other distances.
 
     The first 80 scans lead into a side hallway and out of it.
     """
-    return tuple(scans_of(record(World.named("taylor-hall"), every=1.0)))
+    return tuple(scans_of(record(World.named("taylor-hall"), every=every)))
 
 
 def every_second_beam(scans: Iterable[Scan]) -> tuple[Scan, ...]:

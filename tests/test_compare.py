@@ -356,7 +356,7 @@ LISTS = """
 import sys
 from benchmarks.instances import maze
 from ssh_abduction import Theory, Trace, solve
-for trace, theory in ((Trace.load("examples/aces3-route.jsonl")[:16], None), (maze(5, 5, steps=60,
+for trace, theory in ((Trace.load("examples/aces3-route.jsonl")[:16], None), (maze(5, 5, steps=40,
 seed=3).trace, Theory.causal())):
     print([ssh_map.id for ssh_map in solve(trace, theory, max_maps=None).maps])
 """

@@ -22,10 +22,7 @@ from perception.places.live import LOOKS
 from perception.readers.logs import SURVEYED, live_log, read_log
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_carmen
-from simulator.tours import record
-from simulator.world import World
 from ssh_abduction.cli import main
-from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.trace import Trace
 
 Scans = Sequence[Scan]
@@ -34,7 +31,7 @@ Scans = Sequence[Scan]
 @pytest.fixture(scope="module")
 def scans() -> tuple[Scan, ...]:
     """A drive of a tour through a hall, a scan of 90 beams every half metre."""
-    return every_second_beam(scans_of(record(World.named("taylor-hall"), every=0.5)))[:240]
+    return every_second_beam(hall(every=0.5)[:240])
 
 
 @pytest.fixture(scope="module")

@@ -11,16 +11,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from coarse import every_second_beam
+from coarse import every_second_beam, hall
 
 from perception.errors import LogError
 from perception.places import importing, log_checks
 from perception.places.importing import import_log, tracked
 from perception.readers.scans import RobotLog, Scan
-from simulator.tours import record
-from simulator.world import World
 from ssh_abduction.cli.mapping import MapQuestion
-from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.data.trace import Trace
 
@@ -30,7 +27,7 @@ Scans = Sequence[Scan]
 @pytest.fixture(scope="module")
 def scans() -> tuple[Scan, ...]:
     """A drive of two tours through a hall, a scan of 90 beams every half metre."""
-    return every_second_beam(scans_of(record(World.named("taylor-hall"), every=0.5)))[:300]
+    return every_second_beam(hall(every=0.5)[:300])
 
 
 def notes_of(scans: Scans) -> str:

@@ -285,7 +285,7 @@ def test_refusals_hold_in_no_planar_map() -> None:
     """
     rng = random.Random(3)
     refused = accepted = 0
-    for _ in range(12):
+    for _ in range(8):
         letters = [rng.choice("TTTTRLA") for _ in range(6)]
         trace = Trace.from_steps(
             "a" * 7,

@@ -149,14 +149,14 @@ def test_limit_during_listing_of_labels_stops_the_search() -> None:
 @cache
 def maps_of_a_maze() -> frozenset[SSHMap]:
     """All minimal maps of a maze without stars, by the readable encodings."""
-    trace = maze(2, 2, steps=40, seed=1).trace
+    trace = maze(2, 2, steps=32, seed=1).trace
     return frozenset(solve(trace, max_maps=None, speedups=Speedups.without("ways")).maps)
 
 
 @pytest.mark.parametrize("off", ["", "clique", "lazy", "core_guided"])
 def test_maze_without_stars_has_the_known_maps(off: str) -> None:
-    """All minimal maps of forty steps, with all speed-ups. The bound has a certificate."""
-    trace = maze(2, 2, steps=40, seed=1).trace
+    """All minimal maps of 32 steps, with all speed-ups. The bound has a certificate."""
+    trace = maze(2, 2, steps=32, seed=1).trace
     with patch.object(choosing, "STEPWISE", -1.0):
         search = Search(trace, max_maps=None, speedups=Speedups.without(off))
         found = search.solution(tuple(search))
