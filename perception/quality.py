@@ -17,9 +17,8 @@ many labelings of the same n images, `spanning_tree` finds the tree once, and
     Hence |e| >= |ab|. If |e| > |ab|, replacing e by (a, b) would give a shorter spanning tree:
     a contradiction. So |e| = |ab|, and no edge between different labels is shorter.
 
-Distances are exact up to rounding. Matrix products are fast but less exact. They only exclude pairs
-that cannot matter, with a rigorous bound of their rounding error. The distances of the remaining
-pairs are computed from differences in float64. Only one block of pairs is in memory at a time.
+All distances are computed from differences in float64. Only one block of pairs is in memory at a
+time.
 
 References: Kuipers and Beeson, "Bootstrap Learning for Place Recognition", AAAI 2002, eq. 5 (M),
 and "Clustering" (U).
@@ -28,41 +27,27 @@ and "Clustering" (U).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.cluster.hierarchy import DisjointSet
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 from sklearn.metrics import homogeneity_score
 from sklearn.utils import check_array
 
 from perception.errors import PerceptionError, equal_length
 from ssh_abduction.data.checks import a_number
-from ssh_abduction.runtime.threads import one_thread
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
-# Largest number of images in a cell. Smaller cells let the search skip more far pairs; larger ones
-# make the matrix products faster.
-CELL = 256
-# Number of pairs of cells to compare before skipping more of the remaining pairs.
-BATCH = 64
-# Images on each side of a block when a cluster is compared with itself. A float32 block of
-# distances takes 16 MB.
-BLOCK = 2048
+# So many images are compared with all others of their cluster at once.
+BLOCK = 256
 # Quantiles of distances are estimated on at most this many images (32 MB of distances).
 SAMPLE = 2_000
 # If the median cluster has at least SEEN images, trimmed M ignores the width of clusters of at most
 # FEW images, because clusterers often put two unusual images that differ into one cluster.
 SEEN, FEW = 6, 2
-# Number of pairs of images recomputed from differences at once; 12 MB for 180 ranges per image.
-GATHERED = 8192
 
 
 @dataclass(frozen=True)
@@ -115,10 +100,7 @@ def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None =
     clusters = _numbered(labels, len(images))
     if clusters.max() == 0:
         return math.nan
-    if tree is not None:
-        between = tree.separation(clusters)
-    else:  # one round of Borůvka's algorithm, with clusters as components
-        between = math.sqrt(float(_Cells(images).shortest_leaving(clusters)[0].min()))
+    between = (tree or spanning_tree(images)).separation(clusters)
     if between == 0:
         return 0.0
     within = cluster_spread(images, clusters)
@@ -211,28 +193,27 @@ def uncertainty_coefficient(views: ArrayLike, truth: ArrayLike) -> float:
 
 
 def spanning_tree(X: ArrayLike) -> SpanningTree:
-    """Find a minimum spanning tree of images, (n, d), with Borůvka's algorithm on blocks of pairs.
+    """Find a minimum spanning tree of images, (n, d), with Prim's algorithm.
 
-    The search needs O(n) memory besides the images. It begins with each image as a component. In
-    each round, every component picks its shortest edge to another component. The picks are added
-    from short to long. A pick that would close a cycle is skipped, so that the result is a minimum
-    spanning tree even if several edges are equally long.
+    It needs O(n) memory besides a copy of the images. The tree begins with the first image. In each
+    round, it gets the image that is nearest to it.
     """
     images = check_array(equal_length(X), dtype=np.float64)
-    cells, count = _Cells(images), len(images)
-    forest, edges, lengths = DisjointSet(range(count)), np.empty((0, 2), np.intp), np.empty(0)
-    components = np.arange(count)
-    while components.max() > 0:
-        squares, picks = cells.shortest_leaving(components)
-        order = np.argsort(squares, kind="stable")
-        added = [c for c in order.tolist() if forest.merge(int(picks[c, 0]), int(picks[c, 1]))]
-        edges, lengths = (
-            np.concatenate([edges, picks[added]]),
-            np.concatenate([lengths, np.sqrt(squares[added])]),
-        )
-        # Components for the next round.
-        links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
-        components = connected_components(links, directed=False)[1].astype(np.intp)
+    size = len(images) - 1
+    edges, lengths = np.empty((size, 2), np.intp), np.empty(size)
+    # For each image that is not in the tree: its index, and its nearest image in the tree.
+    left, index = images[1:].copy(), np.arange(1, size + 1)
+    nearest, length = np.zeros(size, np.intp), np.full(size, math.inf)
+    image, at = images[:1], 0
+    for last in reversed(range(size)):
+        distances = cdist(image, left[: last + 1])[0]
+        nearer = np.flatnonzero(distances < length[: last + 1])
+        nearest[nearer], length[nearer] = at, distances[nearer]
+        new = int(length[: last + 1].argmin())
+        edges[last], lengths[last] = (nearest[new], index[new]), length[new]
+        image, at = left[[new]], int(index[new])
+        for column in (left, index, nearest, length):
+            column[new] = column[last]
     order = np.argsort(lengths, kind="stable")
     return SpanningTree(edges[order], lengths[order])
 
@@ -245,191 +226,19 @@ def cluster_spread(X: ArrayLike, labels: ArrayLike) -> float:
     """
     images = check_array(equal_length(X), dtype=np.float64)
     clusters = _numbered(labels, len(images))
-    order = np.argsort(clusters, kind="stable")
-    members = np.split(order, np.flatnonzero(np.diff(clusters[order])) + 1)
-    best = max(_two_sweeps(images[m]) for m in members)
-    for m in members:
-        best = max(best, _wider(images[m], best))
-    return best
-
-
-class _Cells:
-    """Images grouped into cells of near images, with a lower bound for each pair of cells.
-
-    It is a lower bound of the squared distance between an image of one cell and an image of the
-    other, if they belong to different components. Components only merge. So fewer pairs count in
-    later rounds, and the bound stays valid.
-    """
-
-    def __init__(self, images: Floats) -> None:
-        parts = list(_halves(images, np.arange(len(images))))
-        self.order = np.concatenate(parts)
-        self.images = images[self.order]
-        # Centred images have small norms, which keeps rounding errors small.
-        self.images -= self.images.mean(axis=0)
-        self.norms = np.einsum("ij,ij->i", self.images, self.images)
-        self.starts = np.cumsum([0, *(len(p) for p in parts)])
-        self.slices = [slice(a, b) for a, b in zip(self.starts[:-1], self.starts[1:], strict=True)]
-        self.reach = np.array([math.sqrt(self.norms[s].max()) for s in self.slices])
-        centres = np.array([self.images[s].mean(axis=0) for s in self.slices])
-        radii = np.array(
-            [
-                math.sqrt(_squares(self.images[s] - c).max())
-                for s, c in zip(self.slices, centres, strict=True)
-            ]
-        )
-        self.first, self.second = np.triu_indices(len(parts))
-        # Bound: distance of the centres minus both radii; 0 within a cell.
-        apart = np.concatenate(
-            [np.sqrt(_squares(centres[i:] - centres[i])) for i in range(len(parts))]
-        )
-        gap = apart - radii[self.first] - radii[self.second] - 1e-12 * (apart + self.reach.max())
-        gap[self.first == self.second] = 0
-        self.bounds = np.maximum(gap, 0) ** 2
-
-    def shortest_leaving(self, components: Integers) -> tuple[Floats, Integers]:
-        """The squared length, (c,), and images, (c, 2), of each component's shortest edge."""
-        search = _ShortestEdges(self.images, components[self.order])
-        pairs = np.argsort(self.bounds, kind="stable")
-        # The products are small: threads would wait for each other longer than they work.
-        with one_thread("blas"):
-            while len(pairs):
-                # Skip a pair of cells if its bound is not below the best edge of any component with
-                # images in these cells.
-                limits = np.maximum.reduceat(search.best[search.components], self.starts[:-1])
-                pairs = pairs[
-                    self.bounds[pairs]
-                    < np.maximum(limits[self.first[pairs]], limits[self.second[pairs]])
-                ]
-                for p in pairs[:BATCH].tolist():
-                    self.bounds[p] = max(
-                        self.bounds[p], self._compare(self.first[p], self.second[p], search)
-                    )
-                pairs = pairs[BATCH:]
-        return search.best, self.order[search.ends]
-
-    def _compare(self, a: int, b: int, search: _ShortestEdges) -> float:
-        """Compare all images of two cells (groups), a and b; return the new bound for them."""
-        rows, columns = self.slices[a], self.slices[b]
-        squares = self.images[rows] @ self.images[columns].T
-        squares *= -2
-        squares += self.norms[rows, None]
-        squares += self.norms[columns]
-        squares[search.components[rows, None] == search.components[columns]] = np.inf
-        slack = _rounding(self.images.shape[1], np.float64, self.reach[a] + self.reach[b])
-        squares -= slack
-        search.improve(squares, slack, rows.start, columns.start)
-        if a != b:
-            search.improve(squares.T, slack, columns.start, rows.start)
-        return float(squares.min())
-
-
-class _ShortestEdges:
-    """The shortest edge found so far from each component to another one."""
-
-    def __init__(self, images: Floats, components: Integers) -> None:
-        self.images, self.components = images, components
-        self.best = np.full(components.max() + 1, np.inf)
-        self.ends = np.zeros((len(self.best), 2), np.intp)
-
-    def improve(self, lower: Floats, slack: float, row: int, column: int) -> None:
-        """Search a block of pairs for shorter edges.
-
-        `lower` has lower bounds of the squared distances of the pairs. The first pair of the block
-        is (`row`, `column`).
-        """
-        components, least = self.components[row : row + len(lower)], lower.min(axis=1)
-        hot = np.flatnonzero(least < self.best[components])
-        if not len(hot):
-            return
-        # Offer the pair with the smallest bound of each row first. Then hardly any other pair is
-        # below the limit.
-        self._offer(row + hot, column + lower[hot].argmin(axis=1))
-        limits = self.best[components[hot]]
-        hot = hot[(least[hot] < limits) & (limits > 0)]
-        near, far = np.nonzero(lower[hot] < self.best[components[hot], None])
-        for k in range(0, len(near), GATHERED):
-            self._offer(row + hot[near[k : k + GATHERED]], column + far[k : k + GATHERED])
-
-    def _offer(self, i: Integers, j: Integers) -> None:
-        """For each component of images i, keep the shortest pair (i, j) if it beats the best."""
-        squares, components = _squares(self.images[i] - self.images[j]), self.components[i]
-        order = np.lexsort((squares, components))
-        order = order[np.flatnonzero(np.diff(components[order], prepend=-1))]
-        order = order[squares[order] < self.best[components[order]]]
-        self.best[components[order]] = squares[order]
-        self.ends[components[order]] = np.column_stack([i[order], j[order]])
-
-
-def _halves(images: Floats, members: Integers) -> Iterator[Integers]:
-    """Split images into cells of at most CELL, recursively at the median of a long axis."""
-    if len(members) <= CELL:
-        yield members
-        return
-    inside = images[members]
-    far = inside[_squares(inside - inside.mean(axis=0)).argmax()]
-    along = inside @ (inside[_squares(inside - far).argmax()] - far)
-    order = np.argpartition(along, len(members) // 2)
-    del inside
-    yield from _halves(images, members[order[: len(members) // 2]])
-    yield from _halves(images, members[order[len(members) // 2 :]])
-
-
-def _two_sweeps(images: Floats) -> float:
-    """A lower bound on the largest distance: the one from the image farthest from the centre."""
-    start = images[_squares(images - images.mean(axis=0)).argmax()]
-    return math.sqrt(_squares(images - start).max())
-
-
-def _wider(images: Floats, best: float) -> float:
-    """The largest distance between two images if it exceeds `best`; otherwise at most `best`."""
-    centred = images - images.mean(axis=0)
-    radii = np.sqrt(_squares(centred))
-    margin = 1 + 1e-12  # Radii are also rounded.
-    kept = np.flatnonzero((radii + radii.max()) * margin > best)
-    if len(kept) < 2:
-        return 0.0
-    kept = kept[np.argsort(-radii[kept], kind="stable")]
-    radii = radii[kept]
-    scale = radii[0]
-    if scale == 0:
-        return 0.0
-    # Float32 products show which pairs may exceed the best. Images are sorted by falling radius, so
-    # the inner loop can stop early.
-    small = (centred[kept] / scale).astype(np.float32)
-    norms = np.einsum("ij,ij->i", small, small)
-    for a in range(0, len(kept), BLOCK):
-        for b in range(a, len(kept), BLOCK):
-            if (radii[a] + radii[b]) * margin <= best:
+    best = 0.0
+    for cluster in range(clusters.max() + 1):
+        members = images[clusters == cluster]
+        radii = cdist(members, members.mean(axis=0)[None])[:, 0] * (1 + 1e-12)  # rounded up
+        order = np.argsort(-radii)
+        members, radii = members[order], radii[order]
+        for start in range(0, len(members), BLOCK):
+            stop = int(np.count_nonzero(radii[start] + radii > best))
+            if stop <= start:
                 break
-            upper = small[a : a + BLOCK] @ small[b : b + BLOCK].T
-            upper *= -2
-            upper += norms[a : a + BLOCK, None]
-            upper += norms[b : b + BLOCK]
-            slack = _rounding(images.shape[1], np.float32, (radii[a] + radii[b]) / scale)
-            if float(upper.max()) + slack <= (best / scale) ** 2:
-                continue
-            i, j = np.unravel_index(upper.argmax(), upper.shape)
-            best = max(
-                best, math.sqrt(_squares(centred[kept[[a + i]]] - centred[kept[[b + j]]])[0])
-            )
-            near, far = np.nonzero(upper > (best / scale) ** 2 - slack)
-            for k in range(0, len(near), GATHERED):
-                pairs = (
-                    centred[kept[a + near[k : k + GATHERED]]]
-                    - centred[kept[b + far[k : k + GATHERED]]]
-                )
-                best = max(best, math.sqrt(_squares(pairs).max()))
+            block = members[start : start + BLOCK]
+            best = max(best, float(cdist(block, members[start:stop]).max()))
     return best
-
-
-def _squares(differences: Floats) -> Floats:
-    return np.einsum("ij,ij->i", differences, differences)  # type: ignore[no-any-return]
-
-
-def _rounding(beams: int, dtype: type[np.floating[Any]], reach: float) -> float:
-    """A bound on the rounding error of |a|² + |b|² - 2ab for vectors with |a| + |b| <= reach."""
-    return float((beams + 16) * np.finfo(dtype).eps * reach**2)
 
 
 def _numbered(labels: ArrayLike, count: int | None = None) -> Integers:

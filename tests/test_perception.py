@@ -157,12 +157,11 @@ def test_cluster_quality_equals_the_ratio_over_all_pairs(
     )
 
 
-@pytest.mark.parametrize(("cell", "block"), [(2, 3), (7, 16), (quality.CELL, quality.BLOCK)])
+@pytest.mark.parametrize("block", [3, 16, quality.BLOCK])
 @pytest.mark.parametrize("scale", [1e-120, 1.0, 1e120])
-def test_quality_does_not_depend_on_cells_and_blocks(
-    monkeypatch: pytest.MonkeyPatch, cell: int, block: int, scale: float
+def test_quality_does_not_depend_on_blocks(
+    monkeypatch: pytest.MonkeyPatch, block: int, scale: float
 ) -> None:
-    monkeypatch.setattr(quality, "CELL", cell)
     monkeypatch.setattr(quality, "BLOCK", block)
     images = blobs(5, 40, beams=20, spread=0.5)[0] * scale
     tree, labels = spanning_tree(images), np.random.default_rng(1).integers(4, size=200)
