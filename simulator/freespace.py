@@ -17,8 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
+from skimage.graph import MCP_Geometric
 
 from simulator.errors import SimulatorError
 
@@ -223,7 +222,6 @@ def _shortest(
     needs at least `least`. Near start and goal, where the robot may be closer to obstacles than
     planned, it need only not touch an occupied cell.
     """
-    rows, columns = clearance.shape
     free = clearance >= least
     for row, column in (start, goal):
         beside = (
@@ -233,30 +231,6 @@ def _shortest(
         free[beside] |= clearance[beside] > 1.5 * CELL
         free[row, column] = True
     price = 1 + (NARROW - 1) * (1 - np.minimum(clearance / ROOM, 1.0)) ** 2
-    numbers = np.arange(rows * columns).reshape(rows, columns)
-    ends: list[Cells] = []
-    others: list[Cells] = []
-    costs: list[Array] = []
-    # Connect each cell with its neighbours to the right, above and on both diagonals.
-    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        here = slice(0, rows - down), slice(max(-right, 0), columns - max(right, 0))
-        there = slice(down, rows), slice(max(right, 0), columns + min(right, 0))
-        open_ = free[here] & free[there]
-        ends.append(numbers[here][open_])
-        others.append(numbers[there][open_])
-        costs.append((math.hypot(down, right) * (price[here] + price[there]) / 2)[open_])
-    graph = coo_array(
-        (np.concatenate(costs), (np.concatenate(ends), np.concatenate(others))),
-        shape=(rows * columns, rows * columns),
-    ).tocsr()
-    _, before = dijkstra(
-        graph, directed=False, indices=int(numbers[start]), return_predecessors=True
-    )
-    cell = int(numbers[goal])
-    path = [cell]
-    while cell != int(numbers[start]):
-        cell = int(before[cell])
-        if cell < 0:
-            return None
-        path.append(cell)
-    return np.column_stack(np.unravel_index(path[::-1], clearance.shape))
+    ways = MCP_Geometric(np.where(free, price, -1.0))  # -1 is closed
+    costs, _ = ways.find_costs([start], [goal])
+    return np.array(ways.traceback(goal)) if np.isfinite(costs[goal]) else None
