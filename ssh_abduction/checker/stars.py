@@ -6,7 +6,7 @@ place, numbered 0 to 3 clockwise. A turn right adds 1 to the heading.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 
 from ssh_abduction.checker.crossings import QUARTERS
 from ssh_abduction.checker.moves import Course, course_of, heading_of, opposite
@@ -22,16 +22,7 @@ def star_pattern(m: Reading) -> Found:
 
     If gateways may change between drives, this holds within each drive.
     """
-    if m.theory.changed:
-        for p, _, seen in gateways_by_drive(m):
-            yield from _alike(
-                p, [(min(_rotated(star, k) for k in range(4)), i) for star, i in seen]
-            )
-        return
-    yield from _one_star(
-        ((s, min(_rotated(star, k) for k in range(4)), i) for s, star, i in stars_of(m)),
-        "however turned",
-    )
+    yield from _one_star(m, "however turned", any_turn=True)
 
 
 def star_frame(m: Reading) -> Found:
@@ -39,24 +30,30 @@ def star_frame(m: Reading) -> Found:
 
     If gateways may change between drives, this holds within each drive.
     """
+    yield from _one_star(m, "turned by their headings", any_turn=False)
+
+
+def _one_star(m: Reading, how: str, *, any_turn: bool) -> Found:
+    """Check that the stars at each place are equal: turned by headings, or by `any_turn`."""
     if m.theory.changed:
-        for p, _, seen in gateways_by_drive(m):
-            yield from _alike(p, seen)
-        return
-    framed = (
-        (s, _rotated(star, heading), i)
-        for s, star, i in stars_of(m)
-        if (heading := heading_of(s)) is not None
-    )
-    yield from _one_star(framed, "turned by their headings")
-
-
-def _alike(place: int, seen: Sequence[tuple[Openings, int]]) -> Found:
-    """Check that all steps of one drive at a place saw the same openings."""
-    first, at = seen[0]
-    for star, i in seen[1:]:
+        seen = [
+            ((p, drive), star, i) for p, drive, sights in gateways_by_drive(m) for star, i in sights
+        ]
+    else:
+        seen = [
+            ((s.place, ""), _rotated(star, heading_of(s) or 0), i)
+            for s, star, i in stars_of(m)
+            if s.place is not None and (any_turn or heading_of(s) is not None)
+        ]
+    known: dict[tuple[int, str], tuple[Openings, int]] = {}
+    for there, framed, i in seen:
+        star = min(_rotated(framed, k) for k in range(4)) if any_turn else framed
+        first, at = known.setdefault(there, (star, i))
         if star != first:
-            yield (at, i), f"The stars seen at place {place} at steps {at} and {i} differ."
+            yield (
+                (at, i),
+                f"The stars seen at place {there[0]} at steps {at} and {i} differ, {how}.",
+            )
 
 
 def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Openings, int]]]]:
@@ -106,19 +103,6 @@ def _rotated(star: Openings, quarters: int) -> Openings:
     """Rotate a star into the frame of its place, for a robot that faces slot `quarters`."""
     ahead, right, back, left = (star[(slot - quarters) % 4] for slot in range(4))
     return ahead, right, back, left
-
-
-def _one_star(seen: Iterable[tuple[DState, Openings, int]], how: str) -> Found:
-    """Check that the stars at each place are equal. The caller rotated them to a common frame."""
-    known: dict[int, tuple[Openings, int]] = {}
-    for s, star, i in seen:
-        if s.place is not None:
-            first, at = known.setdefault(s.place, (star, i))
-            if star != first:
-                yield (
-                    (at, i),
-                    f"The stars seen at place {s.place} at steps {at} and {i} differ, {how}.",
-                )
 
 
 def one_heading(m: Reading) -> Found:
