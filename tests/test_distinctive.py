@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from perception.places.distinctive import find_visits
-from perception.places.local_map import CELL, BeamCells, LocalMaps, Patch
+from perception.places.local_map import CELL, LocalMaps, Patch
 from perception.places.recent import Recent
 from perception.places.skeleton import junctions
 from perception.places.stays import joined
@@ -285,5 +285,5 @@ def test_few_lost_beams_show_no_free_space_behind_a_wall(beams: int, is_open: bo
     ranges[45 : 45 + beams] = np.inf
     recent = Recent()
     recent.append(Scan(ranges, laser, (0.0, 0.0, 0.0)), (0.0, 0.0, 0.0))
-    patch = LocalMaps(recent, BeamCells(recent, 5.0), 5.0).around(0, (5.0, 0.0), 1.5)
+    patch = LocalMaps(recent, 5.0).around(0, (5.0, 0.0), 1.5)
     assert patch.free.any() == is_open

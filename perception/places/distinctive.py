@@ -23,7 +23,7 @@ from itertools import count
 import numpy as np
 
 from perception.places.following import Followed
-from perception.places.local_map import BeamCells, LocalMaps
+from perception.places.local_map import LocalMaps
 from perception.places.recent import Recent
 from perception.places.skeleton import Junction, junctions
 from perception.places.stays import AROUND, RIM, SAME, SHARE, SMALL, Stays
@@ -92,9 +92,8 @@ class _Detector:
         """Start before the first scan."""
         self._room = width / 2
         self._recent = Recent()
-        beams = BeamCells(self._recent, WINDOW)
-        self._maps = LocalMaps(self._recent, beams, WINDOW)
-        self._stays = Stays(self._recent, LocalMaps(self._recent, beams, WINDOW), HALF)
+        self._maps = LocalMaps(self._recent, WINDOW)
+        self._stays = Stays(self._recent, self._maps, HALF)
         self._milestones: list[int] = []  # scans; those after the first _seen have no local map yet
         self._first = self._seen = 0  # numbers of the first milestone that is kept, and of the next
         self._open: list[_Chain] = []

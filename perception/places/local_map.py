@@ -1,15 +1,14 @@
 """Makes the local perceptual map: a grid of the free space around the robot.
 
-A window of consecutive scans moves along the log. Each grid cell counts how many scans of the
-window saw through the cell, and how many hit an obstacle in it. Scans that leave the window are
-subtracted. The grid is a torus that scrolls with the robot. There is no global map, so drift
-matters only within a window (Beeson, Modayil & Kuipers 2010).
+A local map is made from a window of consecutive scans. Each grid cell counts how many scans of the
+window saw through the cell, and how many hit an obstacle in it. The grid is a torus, so that it is
+large enough anywhere. There is no global map, so drift matters only within a window (Beeson,
+Modayil & Kuipers 2010).
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -113,80 +112,20 @@ def lost(scan: Scan) -> Bools:
     return ~met & np.pad(narrow, 1)[np.searchsorted(beams, np.arange(len(met)))]
 
 
-class BeamCells:
-    """The cells that the beams of each recent scan passed and met, found once for each scan.
+class LocalMaps:
+    """Makes local maps along a trajectory.
 
     Args:
         recent: The scans with their poses.
-        reach: Metres of trajectory. Scans within this distance of a scan share its grid.
+        reach: Metres of trajectory. The window of a scan reaches this far before and after it.
     """
 
     def __init__(self, recent: Recent, reach: float) -> None:
         """Start without any scan."""
-        self._recent = recent
+        self._recent, self._reach = recent, reach
         # The torus covers all that the scans of one window can see, and a patch around any of them.
-        self.side = int(2 * (reach + SIGHT + 2) / CELL)
-        self._known: dict[int, tuple[Cells, Cells]] = {}
-
-    def of(self, i: int) -> tuple[Cells, Cells]:
-        """Find the cells that scan i looked through, and the cells in which it hit something.
-
-        Both are indices in the torus.
-        """
-        if i not in self._known:
-            for old in [old for old in self._known if old < self._recent.begin]:
-                del self._known[old]
-            self._known[i] = self._cells(i)
-        return self._known[i]
-
-    def _cells(self, i: int) -> tuple[Cells, Cells]:
-        """Compute what `of` returns for a scan."""
-        scan, pose = self._recent.scan(i), self._recent.poses(i, i + 1)[0]
-        cos, sin = math.cos(pose[2]), math.sin(pose[2])
-        x = pose[0] + cos * scan.laser.mount[0] - sin * scan.laser.mount[1]
-        y = pose[1] + sin * scan.laser.mount[0] + cos * scan.laser.mount[1]
-        angles = pose[2] + scan.laser.mount[2] + scan.laser.bearings
-        ahead, aside = np.cos(angles), np.sin(angles)
-        valid = ~(np.isnan(scan.ranges) | lost(scan))
-        ranges = np.minimum(np.where(valid, scan.ranges, 0.0), SIGHT)
-        met = valid & (scan.ranges < min(SIGHT, scan.laser.reach))
-        # Sample each beam along its free part.
-        along = np.arange(0.0, SIGHT, 0.8 * CELL)
-        beam, number = _repeated(np.searchsorted(along, ranges - CELL))
-        far = along[number]
-        cells = np.zeros(self.side**2, np.bool_)
-        cells[self._numbers(x + ahead[beam] * far, y + aside[beam] * far)] = True
-        far = ranges[met]
-        ends = np.unique(self._numbers(x + ahead[met] * far, y + aside[met] * far))
-        cells[ends] = False
-        return np.flatnonzero(cells).astype(np.int32), ends
-
-    def _numbers(self, x: Array, y: Array) -> Cells:
-        """Number the cells in the torus at positions: x and y in metres, in the frame of the track.
-
-        Equal numbers may stand for cells far apart, as the torus repeats.
-        """
-        rows, columns = (np.rint(values / CELL).astype(np.int32) % self.side for values in (x, y))
-        return np.asarray(rows * self.side + columns)
-
-
-class LocalMaps:
-    """Makes local maps along a trajectory, with a moving window of scans.
-
-    Args:
-        recent: The scans with their poses.
-        beams: The cells that the beams of these scans passed and met.
-        reach: Metres of trajectory. The window of a scan reaches this far before and after it.
-    """
-
-    def __init__(self, recent: Recent, beams: BeamCells, reach: float) -> None:
-        """Start with an empty window."""
-        self._recent, self._beams, self._reach = recent, beams, reach
-        self._side = beams.side
-        self._passed = np.zeros(self._side**2, np.int32)
-        self._met = np.zeros(self._side**2, np.int32)
-        self._window: deque[tuple[Cells, Cells]] = deque()
-        self._begin = self._end = 0
+        self._side = int(2 * (reach + SIGHT + 2) / CELL)
+        self._known: dict[int, tuple[Cells, Cells]] = {}  # the cells of each scan
 
     def around(self, scan: int, middle: Array | Sequence[float], half: float) -> Patch:
         """Make the square patch around a position near a scan.
@@ -195,11 +134,14 @@ class LocalMaps:
         """
         way = self._recent.way(scan)
         begin, end = self._recent.at(way - self._reach), self._recent.at(way + self._reach, "right")
-        self._move(begin, end)
         first = np.rint(np.asarray(middle) / CELL).astype(int) - round(half / CELL)
         rows, columns = (np.arange(n, n + 2 * round(half / CELL) + 1) % self._side for n in first)
         cells = rows[:, None] * self._side + columns
-        passed, met = self._passed[cells], self._met[cells]
+        counts = np.zeros((2, self._side**2), np.int32)
+        for i in range(begin, end):
+            for count, seen in zip(counts, self._cells_of(i), strict=True):
+                count[seen] += 1
+        passed, met = counts[:, cells]
         occupied = (met > 0) & (met >= OCCUPIED * (met + passed))
         trail = self._trail(begin, end, first, passed.shape)
         free = ((passed > 0) & ~occupied) | ndimage.binary_dilation(trail, EIGHT, 2)
@@ -223,26 +165,43 @@ class LocalMaps:
         trail[cells[:, 0], cells[:, 1]] = True
         return trail
 
-    def _move(self, begin: int, end: int) -> None:
-        """Move the window to the scans begin … end - 1, adding and subtracting counts."""
-        # Start anew unless the new window continues the old one.
-        if begin < self._begin or begin >= self._end:
-            self._passed[:], self._met[:] = 0, 0
-            self._window.clear()
-            self._begin = self._end = begin
-        for i in range(self._end, end):
-            passed, met = self._beams.of(i)
-            self._passed[passed] += 1
-            self._met[met] += 1
-            self._window.append((passed, met))
-        self._end = max(self._end, end)
-        while self._begin < begin:
-            passed, met = self._window.popleft()
-            self._passed[passed] -= 1
-            self._met[met] -= 1
-            self._begin += 1
-        while self._end > end:
-            passed, met = self._window.pop()
-            self._passed[passed] -= 1
-            self._met[met] -= 1
-            self._end -= 1
+    def _cells_of(self, i: int) -> tuple[Cells, Cells]:
+        """Find the cells that scan i looked through, and the cells in which it hit something.
+
+        Both are indices in the torus.
+        """
+        if i not in self._known:
+            for old in [old for old in self._known if old < self._recent.begin]:
+                del self._known[old]
+            self._known[i] = self._cells(i)
+        return self._known[i]
+
+    def _cells(self, i: int) -> tuple[Cells, Cells]:
+        """Compute what `_cells_of` returns for a scan."""
+        scan, pose = self._recent.scan(i), self._recent.poses(i, i + 1)[0]
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        x = pose[0] + cos * scan.laser.mount[0] - sin * scan.laser.mount[1]
+        y = pose[1] + sin * scan.laser.mount[0] + cos * scan.laser.mount[1]
+        angles = pose[2] + scan.laser.mount[2] + scan.laser.bearings
+        ahead, aside = np.cos(angles), np.sin(angles)
+        valid = ~(np.isnan(scan.ranges) | lost(scan))
+        ranges = np.minimum(np.where(valid, scan.ranges, 0.0), SIGHT)
+        met = valid & (scan.ranges < min(SIGHT, scan.laser.reach))
+        # Sample each beam along its free part.
+        along = np.arange(0.0, SIGHT, 0.8 * CELL)
+        beam, number = _repeated(np.searchsorted(along, ranges - CELL))
+        far = along[number]
+        cells = np.zeros(self._side**2, np.bool_)
+        cells[self._numbers(x + ahead[beam] * far, y + aside[beam] * far)] = True
+        far = ranges[met]
+        ends = np.unique(self._numbers(x + ahead[met] * far, y + aside[met] * far))
+        cells[ends] = False
+        return np.flatnonzero(cells).astype(np.int32), ends
+
+    def _numbers(self, x: Array, y: Array) -> Cells:
+        """Number the cells in the torus at positions: x and y in metres, in the frame of the track.
+
+        Equal numbers may stand for cells far apart, as the torus repeats.
+        """
+        rows, columns = (np.rint(values / CELL).astype(np.int32) % self._side for values in (x, y))
+        return np.asarray(rows * self._side + columns)
