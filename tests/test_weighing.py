@@ -451,6 +451,19 @@ def test_misfit_equals_that_of_the_checker(data: st.DataObject) -> None:
         assert square == pytest.approx(poses.misfit(), rel=1e-5, abs=1e-5)
 
 
+def test_misfit_of_the_checker_is_exact_if_the_robot_misses_dstates() -> None:
+    """If both ends of a loop are off their dstate, earlier turns move one beside the other."""
+    moved = [(10.0, 3.0, -0.3), (0.0, 0.0, 1.6), (0.0, -3.0, 2.8), (3.0, -3.0, 1.6)]
+    trace = Trace.from_steps(
+        "abcde",
+        ["travel"] + ["left"] * 3,
+        displacements=moved,
+        odometry=Odometry(offset=0.8, facing=0.1),
+    )
+    square = LeastSquares(trace).misfit((0, 1, 2, 3, 4), (0, 1, 1, 1, 1))
+    assert misfit(trace, (0, 1, 2, 3, 4), (0, 1, 1, 1, 1)) == pytest.approx(square, abs=1e-5)
+
+
 @pytest.mark.parametrize(
     ("factor", "offset", "least", "most"),
     [(1.0, 0.01, 1.0, 1.0), (0.6, 0.01, 1.5, 2.25), (0.6, 0.0, math.inf, math.inf)],

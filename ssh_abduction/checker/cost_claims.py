@@ -258,7 +258,8 @@ class _Errors:
             self._root[t] = np.linalg.cholesky(np.array(covariance))
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
         # If a heading after a gap is too far off, Gauss-Newton fails. So begin near the solution.
-        missing = [t for t in range(1, size) if trace.steps[t].displacement is None]
+        self._is_missing = np.array([step.displacement is None for step in trace.steps])
+        missing = [t for t in range(1, size) if self._is_missing[t]]
         for t, likely in likely_moves(self._moved, missing, dstates, places):
             self._moved[t] = likely
         self._sigma = np.array([odometry.scale, odometry.bend])
@@ -338,10 +339,19 @@ class _Errors:
         """Compute by how much a loop is off, and the derivatives."""
         gap = pose[last] - pose[first]
         row = self._row(pose, own, first, last)
-        for t, sign in ((last, -1.0), (first, 1.0)) if len(self._off) else ():
-            mine = slice(self._begin + 3 * t, self._begin + 3 * t + 3)
-            gap += sign * self._off[t] * z[mine]
-            row[range(3), range(mine.start, mine.stop)] += sign * self._off[t]
+        if len(self._off):
+            away = np.zeros(3)  # how much farther the robot is off its dstate at the last step
+            for t, sign in ((last, 1.0), (first, -1.0)):
+                mine = slice(self._begin + 3 * t, self._begin + 3 * t + 3)
+                away += sign * self._off[t] * z[mine]
+                row[range(3), range(mine.start, mine.stop)] -= sign * self._off[t]
+            gap -= away
+            # Once the loop closes, the two poses are `away` from each other. Earlier turns turn
+            # that. Turns at gaps are left out: they are too uncertain for Gauss-Newton.
+            turns = np.where(self._is_missing[: first + 1, None], 0.0, own[: first + 1, 2])
+            turned = np.outer([-away[1], away[0]], turns).reshape(2, first + 1, 5)
+            row[:2, : 3 * first + 3] += turned[:, :, :3].reshape(2, -1)
+            row[:2, -2:] += turned[:, :, 3:].sum(axis=1)
         gap[2] = math.remainder(gap[2], math.tau)
         kept = 3 if is_dstate else 2
         return gap[:kept], row[:kept]
@@ -378,7 +388,10 @@ class _Errors:
         return own
 
     def _row(self, pose: Array, own: Array, first: int, last: int) -> Array:
-        """Compute the derivatives, by all unknowns, of the pose at `last` minus that at `first`."""
+        """Compute the derivatives of the pose at `last` minus that at `first`.
+
+        They are by all unknowns. Errors up to `first`, which turn the difference, do not count.
+        """
         along = slice(first + 1, last + 1)
         rest = pose[last, :2] - pose[along, :2]
         # An error of the heading turns the rest of the way.
