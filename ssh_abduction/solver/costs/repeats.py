@@ -315,6 +315,8 @@ def shares_of(
 
 def _cliques(together: Flags) -> Flags:
     """List the maximal cliques of a graph, (n, k), without some nodes if there are too many."""
+    import networkx as nx  # slow to load, and only this bound needs it
+
     kept = np.arange(len(together))
     while True:
         look_at_clock()
@@ -322,7 +324,8 @@ def _cliques(together: Flags) -> Flags:
         graph[np.diag_indices(len(kept))] = True
         # Nodes with the same neighbours are in the same cliques.
         _, first, alike = np.unique(graph, axis=0, return_index=True, return_inverse=True)
-        found = list(islice(_maximal_cliques(graph[np.ix_(first, first)]), CLIQUES + 1))
+        one_of_each = nx.from_numpy_array(graph[np.ix_(first, first)])
+        found = list(islice(nx.find_cliques(one_of_each), CLIQUES + 1))
         if len(found) <= CLIQUES:
             break
         # Drop the nodes that have the most pairs of neighbours that are apart.
@@ -330,27 +333,6 @@ def _cliques(together: Flags) -> Flags:
         differ = near.sum(1) ** 2 - ((near @ near) * near).sum(1)
         kept = np.sort(kept[np.argsort(differ, kind="stable")[: int((1 - DROPPED) * len(kept))]])
     cliques = np.zeros((len(together), len(found)), dtype=bool)
-    members = np.array([[clique >> i & 1 for i in range(len(first))] for clique in found], bool)
+    members = np.array([np.isin(range(len(first)), clique) for clique in found])
     cliques[kept] = members[:, alike.ravel()].T
     return cliques
-
-
-def _maximal_cliques(graph: Flags) -> Iterator[int]:
-    """Yield the maximal cliques of a graph as sets of bits (Bron & Kerbosch 1973, with pivots)."""
-    near = [sum(1 << j for j in np.flatnonzero(row).tolist()) for row in graph]
-    near = [bits & ~(1 << i) for i, bits in enumerate(near)]
-    waiting = [(0, (1 << len(near)) - 1, 0)]  # a clique, nodes that may be added, nodes left out
-    while waiting:
-        clique, more, left = waiting.pop()
-        if not more | left:
-            yield clique
-            continue
-        pivot = max(_bits(more | left), key=lambda i: (more & near[i]).bit_count())
-        for i in _bits(more & ~near[pivot]):
-            waiting.append((clique | 1 << i, more & near[i], left & near[i]))
-            more, left = more & ~(1 << i), left | 1 << i
-
-
-def _bits(bits: int) -> list[int]:
-    """List the members of a set of bits."""
-    return [i for i in range(bits.bit_length()) if bits >> i & 1]
