@@ -163,8 +163,8 @@ def test_quality_does_not_depend_on_blocks(
     monkeypatch: pytest.MonkeyPatch, block: int, scale: float
 ) -> None:
     monkeypatch.setattr(quality, "BLOCK", block)
-    images = blobs(5, 40, beams=20, spread=0.5)[0] * scale
-    tree, labels = spanning_tree(images), np.random.default_rng(1).integers(4, size=200)
+    images = blobs(5, 60, beams=20, spread=0.5)[0] * scale
+    tree, labels = spanning_tree(images), np.random.default_rng(1).integers(4, size=300)
     shortest = minimum_spanning_tree(
         squareform(pdist(images / scale))
     ).sum()  # scipy reads tiny lengths as missing edges.

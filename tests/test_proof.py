@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,7 @@ def test_short_trace_is_solved_without_numpy() -> None:
     assert shown.splitlines() == ["False", "(0, 1) True"]
 
 
+@cache
 def certified() -> tuple[Trace, dict[str, Any]]:
     trace = wandering(1, rooms=12, length=300, views=3)
     certificate = solve(trace, Theory.causal(), max_maps=1).certificate
