@@ -147,7 +147,7 @@ def test_solve_names_corrections_that_steps_without_views_contradict(
     assert main(["solve", file, "-o", maps]) == 0
     assert main(["correct", str(tmp_path), "--same", "monday:1,monday:2"]) == 0
     assert main(["solve", file, "-o", maps]) == 20
-    assert "(monday:1 shows no view, monday:2 shows no view)" in capsys.readouterr().out
+    assert "same: monday:1, monday:2: it contradicts the trace\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

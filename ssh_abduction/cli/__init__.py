@@ -17,6 +17,7 @@ import argparse
 import contextlib
 import io
 import os
+import re
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -141,13 +142,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parse the options. Reject a value "--", which argparse would read as an empty list."""
+    """Parse the options. Reject a value "--", which argparse reads as an empty list or as text."""
     top = parser()
-    options: argparse.Namespace = top.parse_args(arguments)
-    for name, value in vars(options).items():
-        if isinstance(value, list) and (not value or [] in value):
-            top.error(f"{name}: expected a value, got '--'; give one, or leave the option out")
-    return options
+    for word in sys.argv[1:] if arguments is None else arguments:
+        if found := re.fullmatch(r"(-\w|--[\w-]+)=?((?<==)\w+=)?--", word):
+            flag = found[1]
+            top.error(f"{flag}: expected a value, got '--'; give one, or leave the option out")
+    return top.parse_args(arguments)
 
 
 def _main(arguments: Sequence[str] | None) -> int:
