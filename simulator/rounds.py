@@ -17,6 +17,7 @@ from itertools import pairwise
 import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
+from skimage.measure import points_in_poly
 
 from simulator.buildings import Building
 from simulator.cruise import drive_along
@@ -142,16 +143,8 @@ def _sides(building: Building, number: int) -> dict[int, Point]:
 
 
 def holds(polygon: Sequence[Point], point: Point) -> bool:
-    """Check whether a polygon contains a point.
-
-    If it does, a ray from the point crosses its outline an odd number of times.
-    """
-    x, y = point
-    crossings = sum(
-        (y1 > y) != (y2 > y) and x < x1 + (y - y1) * (x2 - x1) / (y2 - y1)
-        for (x1, y1), (x2, y2) in zip(polygon, (*polygon[1:], polygon[0]), strict=True)
-    )
-    return crossings % 2 == 1
+    """Check whether a polygon contains a point."""
+    return bool(points_in_poly([point], polygon)[0])
 
 
 def _line(start: Point, goal: Point) -> Array:

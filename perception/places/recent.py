@@ -23,7 +23,7 @@ class Recent:
 
     def __init__(self) -> None:
         """Start before the first scan."""
-        self.begin = self._base = 0  # the lists begin with scan _base
+        self.begin = 0  # the lists begin with this scan
         self._scans: list[Scan] = []
         self._poses: list[Pose] = []
         self._ways: list[float] = []
@@ -31,7 +31,7 @@ class Recent:
     @property
     def end(self) -> int:
         """The index after that of the last scan."""
-        return self._base + len(self._scans)
+        return self.begin + len(self._scans)
 
     def append(self, scan: Scan, pose: Pose) -> None:
         """Add the next scan and its pose: x, y in metres and heading in radians."""
@@ -42,23 +42,22 @@ class Recent:
 
     def drop_before(self, index: int) -> None:
         """Drop the scans before an index. The last scan stays."""
-        self.begin = max(self.begin, min(index, self.end - 1))
-        if self.begin - self._base > len(self._scans) / 2:
-            for kept in (self._scans, self._poses, self._ways):
-                del kept[: self.begin - self._base]
-            self._base = self.begin
+        dropped = max(min(index, self.end - 1) - self.begin, 0)
+        for kept in (self._scans, self._poses, self._ways):
+            del kept[:dropped]
+        self.begin += dropped
 
     def scan(self, index: int) -> Scan:
         """Return a scan."""
-        return self._scans[index - self._base]
+        return self._scans[index - self.begin]
 
     def poses(self, begin: int, end: int) -> Array:
         """Return the poses of scans begin … end - 1: (n, 3) metres and radians."""
-        return np.array(self._poses[begin - self._base : end - self._base]).reshape(-1, 3)
+        return np.array(self._poses[begin - self.begin : end - self.begin]).reshape(-1, 3)
 
     def way(self, index: int) -> float:
         """Return the metres driven up to a scan, or up to the first one that is kept; 0 if none."""
-        return self._ways[max(index, self.begin) - self._base] if self._ways else 0.0
+        return self._ways[max(index - self.begin, 0)] if self._ways else 0.0
 
     def at(self, way: float, side: Literal["left", "right"] = "left") -> int:
         """Find the first kept scan at which the robot has driven `way` metres.
@@ -67,4 +66,4 @@ class Recent:
         which it has driven farther. If there is none, the result is the index after the last scan.
         """
         find = bisect_left if side == "left" else bisect_right
-        return self._base + find(self._ways, way, lo=self.begin - self._base)
+        return self.begin + find(self._ways, way)
