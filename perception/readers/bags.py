@@ -60,10 +60,12 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
     scans = _scan_topics(bag, scan_topics)
     odometers = _chosen(bag, ODOMETRY, odom_topic, "odom")
     times, seen = _survey(bag, scans)
-    said = " and ".join(scans)
     damaged: list[Damage] = []
     frames = transforms_of(bag, set(seen), damaged)
     frame = seen.most_common(1)[0][0]
+
+    # 1. Odometry: from its topic or, if there is none, from transforms.
+    said = " and ".join(scans)
     if odometers is not None:
         odometer, odom, base = _odometer(bag, odometers, damaged, notes)
         notes.insert(len(bag.notes), f"Scans come from {said}, odometry from {odometers}.")
@@ -76,6 +78,8 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
         )
         called = f"the transforms from {odom} to {base}"
     odometer = _of_one_source(odometer, called, notes)
+
+    # 2. Where each frame of scans is on the robot.
     assumed: dict[str, str] = {}
     mounts = {frame: mount_of(frames, odom, base, frame, notes, assumed) for frame in seen}
     if len(seen) > 1:
@@ -84,18 +88,14 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
             f"({', '.join(f'{count} of {name}' for name, count in seen.most_common())}): each "
             "is mounted as its own frame says."
         )
-    # Transforms above the frame of the odometry correct its poses.
-    above = [
-        track
-        for child in ancestors(frames, odom)
-        if (track := parent_of(frames, child).track) is not None
-    ]
-    corrections = {f"the transforms above {odom}": track for track in above}
-    clocks = {
-        called: odometer.table()[:, :2],
-        **times,
-        **{name: track.table()[:, :2] for name, track in corrections.items()},
-    }
+
+    # 3. Corrected poses: from the transforms above the frame of the odometry.
+    tracks = (parent_of(frames, child).track for child in ancestors(frames, odom))
+    above = [track for track in tracks if track is not None]
+
+    # 4. Times: by the stamps of messages, or by their recording.
+    clocks = {called: odometer.table()[:, :2], **times}
+    clocks |= {f"the transforms above {odom}": track.table()[:, :2] for track in above}
     by_stamp, contradictions = clock_of(clocks)
     notes += contradictions
     if above:
