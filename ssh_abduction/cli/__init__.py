@@ -148,7 +148,8 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         if found := re.fullmatch(r"(-\w|--[\w-]+)=?((?<==)\w+=)?--", word):
             flag = found[1]
             top.error(f"{flag}: expected a value, got '--'; give one, or leave the option out")
-    return top.parse_args(arguments)
+    options: argparse.Namespace = top.parse_args(arguments)
+    return options
 
 
 def _main(arguments: Sequence[str] | None) -> int:
