@@ -6,12 +6,13 @@ import argparse
 import sys
 import warnings
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.saved_map import sentences_of
 from ssh_abduction.data.corrections import Corrections, Passage, Said
-from ssh_abduction.data.corrections_file import beside, load_corrections
+from ssh_abduction.data.corrections_file import FILE, beside, load_corrections, save_corrections
 from ssh_abduction.data.drives import drives_of, fingerprints_of, step_of, together
 from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.maps import SSHMap
@@ -70,6 +71,14 @@ def say_obeyed(said: Corrections, trace: Trace) -> None:
     aside = f"; {more} more {'is' if more == 1 else 'are'} about other drives" if more else ""
     text = f"obeying {counted(here, 'corrections')} of {named(said.source)}{aside}"
     print(printable(text), file=sys.stderr)
+
+
+def keep_corrections(said: Corrections | None, output: str | None) -> None:
+    """Write the corrections that were obeyed beside a new file of maps, if it has none yet."""
+    if said is not None and output is not None and output != "-" and beside(output) is None:
+        copy = Path(output).parent / FILE
+        save_corrections(said, copy)
+        print(printable(f"copied {named(said.source)} to {named(copy)}"), file=sys.stderr)
 
 
 @dataclass(frozen=True)

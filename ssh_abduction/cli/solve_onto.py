@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ssh_abduction.cli.obeyed_corrections import corrections_of, say_obeyed
+from ssh_abduction.cli.obeyed_corrections import corrections_of, keep_corrections, say_obeyed
 from ssh_abduction.cli.options import number_steps, theory_of
 from ssh_abduction.cli.outcome import exit_code, save_solution, warn
 from ssh_abduction.cli.text import findings, first_map, headline, told_apart
@@ -43,6 +43,7 @@ def run(options: argparse.Namespace) -> int:
         say_obeyed(said, solution.trace)
     warn(solution.warnings)
     save_solution(solution, options.output)
+    keep_corrections(said, options.output)
     if options.json:
         print(json_line(solution.to_dict()))
         return exit_code(solution)

@@ -26,19 +26,13 @@ from ssh_abduction.data.checks import (
     an_object,
     one_of,
 )
-from ssh_abduction.data.drives import (
-    SEEN,
-    Drive,
-    drives_of,
-    fingerprints_of,
-    step_name,
-    step_of,
-)
+from ssh_abduction.data.drives import Drive, drives_of, fingerprints_of, step_name, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, is_writable
 from ssh_abduction.data.map_parts import NAMED, Name, thing_named
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.regions import region_of
 from ssh_abduction.data.star import near_quarter, star_to_json, with_gateway
+from ssh_abduction.data.step import SEEN
 from ssh_abduction.data.trace import Trace, checked_trace
 
 FORMAT, VERSION = "ssh-corrections", 1

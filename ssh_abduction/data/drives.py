@@ -20,7 +20,7 @@ import math
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -38,7 +38,6 @@ from ssh_abduction.data.star import is_four
 from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace, checked_trace
 
-SEEN = "star_seen"  # the field of a step that keeps the star before a person corrected it
 # The fields of a step that its fingerprint covers. Covariances are left out, as `together` adds
 # them if drives differ in their odometry.
 _MARKED = frozenset({"view", "action", "star", "displacement", "confidence"})
@@ -135,10 +134,7 @@ def fingerprints_of(trace: Trace) -> dict[str, str]:
 
     It does not depend on the other drives of a joint trace, nor on corrections of stars.
     """
-    return {
-        drive.name: _fingerprint(trace.steps[drive.first : drive.stop])
-        for drive in drives_of(trace)
-    }
+    return {name: _fingerprint(steps) for name, steps in _recorded(trace)}
 
 
 def with_fingerprints(trace: Trace) -> tuple[Drive, ...]:
@@ -149,14 +145,11 @@ def with_fingerprints(trace: Trace) -> tuple[Drive, ...]:
 
 def _fingerprint(steps: Sequence[Step]) -> str:
     """Return a digest, of 16 hexadecimal digits, of what the robot did and saw."""
-    lines = [step.to_json() for step in steps]
-    for i, (step, line) in enumerate(zip(steps, lines, strict=True)):
-        if SEEN in step.extra:
-            line["star"] = step.extra[SEEN]
-        kept = _MARKED if i else _MARKED - {"displacement"}
-        kept = kept if i < len(steps) - 1 else kept - {"action"}
-        lines[i] = {name: value for name, value in line.items() if name in kept}
-    return hashlib.sha256("\n".join(map(json_line, lines)).encode()).hexdigest()[:16]
+    lines = [
+        json_line({name: value for name, value in step.to_json().items() if name in _MARKED})
+        for step in steps
+    ]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
 def step_named(trace: Trace, name: str) -> int:
@@ -312,12 +305,12 @@ def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
         found: list[str] = []
         copies: Counter[tuple[Step, ...]] = Counter()
         for trace in traces:
-            drives = drives_of(trace)
-            own = [d.name for d in drives] if len(drives) > 1 else [_name(trace) or ""]
-            copies[trace.steps] += 1
-            number = copies[trace.steps]
-            # If a trace is given twice, number its name.
-            found += [f"{n}-{number}" if n and n in found and number > 1 else n for n in own]
+            for name, steps in _recorded(trace):
+                copies[steps] += 1
+                # If a drive is given twice, number its name.
+                again = name in found and copies[steps] > 1
+                own = f"{name}-{copies[steps]}" if again else name
+                found.append(own if _name(trace) else "")
         found = [name or f"drive {i + 1}" for i, name in enumerate(found)]
     else:
         found = [
@@ -338,6 +331,14 @@ def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
     return found
 
 
+def _recorded(trace: Trace) -> Iterator[tuple[str, tuple[Step, ...]]]:
+    """Yield the name and the steps of each drive, as in a trace of its own without corrections."""
+    for drive in drives_of(trace):
+        first, *steps = (step.as_seen() for step in trace.steps[drive.first : drive.stop])
+        *steps, last = replace(first, displacement=None, covariance=None), *steps
+        yield drive.name, (*steps, replace(last, action=None))
+
+
 def _names_of(traces: Sequence[Trace], *numbers: int) -> str:
     """The names of the traces with these numbers, in brackets; empty if one has no name."""
     names = [_name(traces[i]) for i in numbers]
@@ -345,15 +346,14 @@ def _names_of(traces: Sequence[Trace], *numbers: int) -> str:
 
 
 def _warn_of_repeats(traces: Sequence[Trace]) -> None:
-    """Warn if two traces have the same steps: most likely one file was given twice."""
-    first: dict[tuple[Step, ...], int] = {}
-    for i, trace in enumerate(traces):
-        if (known := first.setdefault(trace.steps, i)) != i:
-            warnings.warn(
-                f"traces {known + 1} and {i + 1} have the same steps{_names_of(traces, known, i)}; "
-                "give each drive once",
-                stacklevel=3,
-            )
+    """Warn if two traces have a drive with the same steps: most likely it was given twice."""
+    first: dict[tuple[Step, ...], tuple[int, str]] = {}
+    for i, name, steps in ((i, *drive) for i, t in enumerate(traces) for drive in _recorded(t)):
+        k, other = first.setdefault(steps, (i, name))
+        named = f" ({other}, {name})" if _name(traces[k]) and _name(traces[i]) else ""
+        if k != i:
+            text = f"traces {k + 1} and {i + 1} have the same steps{named}; give each drive once"
+            warnings.warn(text, stacklevel=3)
 
 
 def _warn_of_other_names(traces: Sequence[Trace]) -> None:
@@ -457,9 +457,8 @@ def _displacements(trace: Trace) -> str | None:
 def _systematic(trace: Trace) -> dict[str, float] | None:
     """The odometry's errors of scale, drift and dstates, by name; None without displacements."""
     model = _odometry(trace)
-    if model is None:
-        return None
-    return {name: getattr(model, name) for name in ("scale", "bend", "offset", "facing")}
+    names = ("scale", "bend", "offset", "facing")
+    return None if model is None else {name: getattr(model, name) for name in names}
 
 
 def _odometry(trace: Trace) -> Odometry | None:

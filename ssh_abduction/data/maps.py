@@ -413,9 +413,15 @@ def maps_of(data: Any, where: str) -> list[SSHMap]:
 def check_labels(ssh_map: SSHMap, trace: Trace, where: str) -> None:
     """Raise MapError unless a map, named `where`, has a label for each step of a trace."""
     if len(ssh_map.dstate_at) != len(trace):
+        mend = "solve this trace"
+        if len(ssh_map.starts) > sum(action.starts for action in trace.actions):
+            mend = (
+                f"the map is of {len(ssh_map.starts) + 1} drives, so give their joint trace, which "
+                "solve --set joint_trace=FILE writes"
+            )
         raise MapError(
             f"{where}: labels: expected {len(trace)}, one for each step of the trace, got "
-            f"{len(ssh_map.dstate_at)}; solve this trace"
+            f"{len(ssh_map.dstate_at)}; {mend}"
         )
 
 

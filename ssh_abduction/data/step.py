@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ssh_abduction.data.action import Action
@@ -23,6 +23,8 @@ from ssh_abduction.data.odometry import (
 )
 from ssh_abduction.data.star import Entry, Openings, Star, is_four, parse_star, star_to_json
 from ssh_abduction.data.words import counted, that_differ
+
+SEEN = "star_seen"  # the field of a step that keeps the star before a person corrected it
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +97,13 @@ class Step:
         if isinstance(self.image, tuple):
             texts["image"] = f"<{counted(len(self.image), 'numbers')}>"
         return f"Step({', '.join(f'{name}={text}' for name, text in texts.items())})"
+
+    def as_seen(self) -> Step:
+        """Return the step with the star that the robot saw, before a person corrected it."""
+        if SEEN not in self.extra:
+            return self
+        extra = {name: value for name, value in self.extra.items() if name != SEEN}
+        return replace(self, star=parse_star(self.extra[SEEN], SEEN), extra=extra)
 
     @staticmethod
     def of(

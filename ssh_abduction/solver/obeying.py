@@ -14,7 +14,6 @@ from ssh_abduction.data.corrections import (
     direction_in_words,
 )
 from ssh_abduction.data.drives import (
-    SEEN,
     Drive,
     drives_of,
     fingerprints_of,
@@ -25,7 +24,7 @@ from ssh_abduction.data.drives import (
 )
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.star import parse_star, with_gateway
+from ssh_abduction.data.star import with_gateway
 from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.solver.solution.result import Solution
@@ -123,7 +122,7 @@ def _contradictions(
     unit = 90 if solution.theory.star == "frame" else 1
     doubted = [(p, d) for p in said.gateways for d in drives]
     if solution.theory.star != "none":
-        seen = _as_seen(trace)
+        seen = replace(trace, steps=tuple(step.as_seen() for step in trace.steps))
         doubted = [(p, d) for p, d in doubted if _may_keep_out(p, d, seen, ssh_map)]
         if not doubted:
             return
@@ -171,21 +170,6 @@ def _apart(passage: Passage, drives: Sequence[Drive], ssh_map: SSHMap) -> list[D
         name for names in joined_drives(drives, ssh_map) if about & {*names} for name in names
     }
     return [drive for drive in drives if drive.name not in joined]
-
-
-def _as_seen(trace: Trace) -> Trace:
-    """Return a trace with the stars that the robot saw, before they were corrected."""
-    steps = [
-        replace(
-            step,
-            star=parse_star(step.extra[SEEN], SEEN),
-            extra={name: value for name, value in step.extra.items() if name != SEEN},
-        )
-        if SEEN in step.extra
-        else step
-        for step in trace.steps
-    ]
-    return replace(trace, steps=tuple(steps))
 
 
 def _may_keep_out(passage: Passage, drive: Drive, seen: Trace, ssh_map: SSHMap) -> bool:
