@@ -15,7 +15,7 @@ from strategies import TOYS, theories, traces
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.cli import main
-from ssh_abduction.data import MapError, TraceError
+from ssh_abduction.data import MapError, Odometry, TraceError
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.derivation import Derivation
 from ssh_abduction.explain.mend import explain_trace
@@ -249,6 +249,24 @@ def test_explanation_states_the_cost_of_a_join_in_nats() -> None:
             "misfit: the loop of 34 m closes 6.0 m off",
         ),
     ]
+
+
+def test_explanation_says_how_far_turns_alone_are_off() -> None:
+    turned = [(0, 0, 1.5708), (0, 0, -1.4)]
+    trace = Trace.from_steps("aba", ["left", "right"], displacements=turned)
+    assert str(explain_pair(trace, 0, 2)).endswith(
+        "of misfit: by the odometry their headings are 10 degrees apart"
+    )
+
+
+def test_explanation_of_equal_counts_names_no_price() -> None:
+    moved = [(10, 0, 0), (10, 0, 0), (-5, 0, 0), (-4, 0, 0)]
+    trace = Trace.from_steps(
+        "abaca", ["travel"] * 4, displacements=moved, odometry=Odometry(along=1.0)
+    )
+    assert "joining steps 2 and 4 leaves the price of the parts as it is and costs " in str(
+        explain_pair(trace, 2, 4, Theory.causal())
+    )
 
 
 # A square whose loop closes 3 m off, and a second round.

@@ -16,6 +16,7 @@ minimal maps, and for the best map of each side.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
@@ -165,7 +166,11 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         way = self.trace.steps[self.first + 1 : self.second + 1]
         if all(step.displacement is not None for step in way):
             closing = evidence.returns_of(self.trace).closing(self.first, self.second)
-            said.append(f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off")
+            if closing.way >= 0.5:
+                said.append(f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off")
+            else:  # the robot only turned
+                off = abs(math.degrees(closing.turned))
+                said.append(f"by the odometry their headings are {off:.0f} degrees apart")
         pair = self.first, self.second
         said += [match_in_words(c, *pair) for c in self.trace.closures if (c.first, c.last) == pair]
         return ", and ".join(said) or None

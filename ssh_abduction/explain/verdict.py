@@ -179,12 +179,14 @@ class PairExplanation:
             for i, (name, number) in enumerate(more.items())
             if number and prices[i]
         ]
-        if len({number > 0 for number, _ in changed}) == 1:  # all counts rise, or all fall
+        if not changed:
+            counts = "leaves the price of the parts as it is"
+        elif len({number > 0 for number, _ in changed}) == 1:  # all counts rise, or all fall
             effect = "costs" if price > 0 else "saves"
             counts = f"{effect} {', '.join(text for _, text in changed)} ({abs(price):.1f} nats)"
         else:
             priced = (f"{text} {'more' if number > 0 else 'less'}" for number, text in changed)
-            counts = f"{_effect(price)} for its parts ({', '.join(priced) or 'the same counts'})"
+            counts = f"{_effect(price)} for its parts ({', '.join(priced)})"
         loop = f": {self.loop}" if self.loop else ""
         laying = " and of laying drives on each other" if self.theory.several_drives else ""
         effect = _effect(misfit) if abs(misfit) >= 0.05 else "0.0 nats"
