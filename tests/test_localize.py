@@ -757,3 +757,16 @@ def test_localise_errors_are_one_line(files: Path, refuses: Callable[..., None])
         ([other, maps], "other.jsonl: expected a file of maps, got a trace"),
     ]:
         refuses(["localise", *words], message)
+
+
+def test_localise_writes_json_of_a_trace_with_stars(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stars = [(1, 0, 0, 0), (1, 0, 1, 0), (0, 0, 1, 0)]
+    Trace.from_steps("abc", ["travel"] * 2, stars=stars).save(tmp_path / "t.jsonl")
+    trace, maps = str(tmp_path / "t.jsonl"), str(tmp_path / "maps.json")
+    assert main(["solve", trace, "-q", "-o", maps]) == 0
+    capsys.readouterr()
+    assert main(["localise", maps, trace, "--json"]) == 0
+    beliefs = json.loads(capsys.readouterr().out)["beliefs"]
+    assert [belief["dstate"] for belief in beliefs] == [0, 1, 2]

@@ -75,7 +75,7 @@ class Observation:
         cases = len(other.ratio) + 1
         ratio = self.ratio * other.ratio[self.where]
         none = self.novel * other.novel * cases
-        usual = ratio.sum() / cases + none
+        usual = float(ratio.sum()) / cases + none
         return Observation(self.where, ratio / usual, none / usual) if usual else NOVEL
 
 
