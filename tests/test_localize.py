@@ -396,6 +396,7 @@ def test_belief_is_frozen_and_has_verdict_and_entropy() -> None:
     told = json.loads(json.dumps(localiser.update(belief, "on", "b").to_dict()))
     assert told["dstate"] == told["probabilities"][0][0] == 2
     assert told["verdict"] == "located"
+    assert '"collapsed": true' in json.dumps(Belief(np.ones(1), 0.0, np.float64(0.01)).to_dict())
     nowhere = Belief(np.zeros(2), 1.0)
     assert (nowhere.entropy, nowhere.dstate, nowhere.verdict) == (0, None, BeliefVerdict.NOWHERE)
 

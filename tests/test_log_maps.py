@@ -221,7 +221,7 @@ def test_import_does_not_read_corrected_poses(hall: Path) -> None:
     assert not any(step.truth for step in unseen)
 
 
-def test_log_without_motion_or_walls_is_refused() -> None:
+def test_log_without_motion_or_walls_or_width_is_refused() -> None:
     laser = LaserScanner(-math.pi / 2, math.radians(1), 181, 30.0)
     corridor = np.minimum(1.0 / np.maximum(np.abs(np.sin(laser.bearings)), 1e-9), 30.0)
     still = [Scan(corridor, laser, (0.0, 0.0, 0.0))] * 3
@@ -241,6 +241,10 @@ def test_log_without_motion_or_walls_is_refused() -> None:
     ]
     with pytest.raises(LogError, match="expected a way past junctions or turning points"):
         import_log(RobotLog(tuple(onward), source="corridor.log"))
+    with pytest.raises(LogError, match="width: expected metres above 0, got nan; give the width"):
+        import_log(RobotLog(tuple(onward), source="corridor.log"), math.nan)
+    with pytest.raises(LogError, match=r"got 'a\.log'; read one with read_log"):
+        map_log("a.log")  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("without_processes")
@@ -388,7 +392,7 @@ def test_report_says_why_there_is_no_map_or_proof() -> None:
     stopped = replace(solution, status=Status.FEASIBLE, stopped="time limit")
     assert "without a proof" in str(how_it_ended(stopped, 5.0))
     nothing = replace(solution, status=Status.UNSATISFIABLE, maps=())
-    assert "No map satisfies the axioms" in str(how_it_ended(nothing, 5.0))
+    assert "or ask why: ssh-abduction explain FOLDER" in str(how_it_ended(nothing, 5.0))
 
 
 @pytest.mark.parametrize(
@@ -398,6 +402,7 @@ def test_report_says_why_there_is_no_map_or_proof() -> None:
         (["-o", "{file}/x"], "expected a folder to write, got a file"),
         (["-o", "x", "--time-limit", "-1"], "--time-limit: expected a number of seconds above 0"),
         (["-o", "x", "--maps", "-1"], "--maps: expected a number of minimal maps to list"),
+        (["-o", "x", "--same", "a:1,b:2"], "call ssh-abduction correct x --same a:1,b:2, and map"),
     ],
 )
 def test_map_refuses_wrong_options_before_reading_a_log(

@@ -47,6 +47,7 @@ from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Damage, RobotLog, Scan
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
+from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.loggers import log_of
@@ -107,8 +108,9 @@ def import_log(
     Corrected poses become the truth for evaluation; nothing else reads them. The width of the
     robot is in metres. It cannot pass narrower parts of the free space. `tell` takes each note
     on suspicious odometry as soon as it is known. Raises LogError if the robot passed no
-    distinctive place or hardly moved, or the scans do not match.
+    distinctive place or hardly moved, the scans do not match, or the width is no positive number.
     """
+    a_number("width", width, LogError, above=0, what="metres", mend="give the width of the robot")
     seconds: dict[str, float] = {}
     if not any(((scan.ranges > 0) & (scan.ranges < scan.laser.reach)).any() for scan in log.scans):
         raise LogError(

@@ -38,9 +38,10 @@ from ssh_abduction.cli.run_folders import (
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.corrections_file import beside, load_corrections, to_yaml
-from ssh_abduction.data.errors import AbductionError, MapError, named
+from ssh_abduction.data.errors import AbductionError, MapError, brief, named
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, check_limit, workers
+from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
@@ -415,6 +416,15 @@ def _say(answer: FileAnswer, folder: Path) -> None:
 
 def _theory(options: argparse.Namespace) -> tuple[Theory | None, dict[str, Any]]:
     """Find the theory that the user names, if any, or else the fields that the user set."""
+    for name in ASSERTIONS:
+        flag = f"--{name.replace('_', '-')}"
+        for pair in getattr(options, name) or []:
+            if ":" in pair:
+                raise AbductionError(
+                    f"{flag}: expected numbers of steps, as no drive is read yet, got "
+                    f"{brief(pair)}; map without it, then call ssh-abduction correct "
+                    f"{named(options.output)} {flag} {named(pair)}, and map again"
+                )
     asked = theory_of(options)
     choices = {name: getattr(asked, name) for name in choices_of(options)}
     return (asked, {}) if options.theory or asked.level == "causal" else (None, choices)

@@ -158,7 +158,7 @@ def all_instances(
     """
     return tuple(
         an_instance(f"{name}[{i}]", value, kind, error, mend=mend)
-        for i, value in enumerate(a_list(name, values, error))
+        for i, value in enumerate(a_list(name, values, error, mend=mend))
     )
 
 

@@ -141,7 +141,7 @@ class Belief:
         The observation is then more than ten times as probable at an unknown place as by that
         belief.
         """
-        return self.normaliser < COLLAPSED
+        return bool(self.normaliser < COLLAPSED)  # numpy's bool is not one of JSON
 
     @property
     def lost(self) -> bool:

@@ -243,7 +243,7 @@ def how_it_ended(solution: Solution, allowed: float) -> str | None:
     if solution.status is Status.UNSATISFIABLE:
         return (
             "No map satisfies the axioms. Let some steps be wrong (--set misread=4), or ask why: "
-            "ssh-abduction explain trace.jsonl."
+            "ssh-abduction explain FOLDER, with the folder of this map."
         )
     if solution.stopped != "time limit" or solution.status is Status.OPTIMAL:
         return None
