@@ -26,7 +26,7 @@ from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.facts.answer_maps import causal_map
 from ssh_abduction.solver.geometry.fit import Poses, fit
-from ssh_abduction.solver.geometry.linear import as_dense, inverse, least_squares, system_solved
+from ssh_abduction.solver.geometry.linear import inverse, least_squares, system_solved
 from ssh_abduction.solver.geometry.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement
@@ -209,22 +209,20 @@ def test_jacobian_of_the_fit_equals_finite_differences(data: st.DataObject) -> N
     rng = np.random.default_rng(0)
     unknown = problem._begun() + 0.01 * rng.normal(size=problem._size)
     numeric = approx_fprime(unknown, problem._residuals, 1e-7)
-    assert as_dense(problem._jacobian(unknown)) == pytest.approx(numeric, abs=2e-3)
+    assert problem._jacobian(unknown).toarray() == pytest.approx(numeric, abs=2e-3)
 
 
-def test_dense_and_sparse_systems_have_one_solution() -> None:
+def test_least_squares_find_the_smallest_solution() -> None:
     rng = np.random.default_rng(0)
     some, values, weights = rng.normal(size=(12, 5)), rng.normal(size=12), rng.uniform(1, 2, 12)
     some[:, 4] = some[:, 3]  # of several solutions, the smallest
-    dense = least_squares(some, values, weights)
-    assert dense == pytest.approx(least_squares(csr_array(some), values, weights), abs=1e-6)
-    assert dense[3] == pytest.approx(dense[4])
+    smallest = np.linalg.lstsq(some * weights[:, None], values, rcond=1e-12)[0]
+    assert least_squares(csr_array(some), values, weights) == pytest.approx(smallest, abs=1e-6)
     nothing = csr_array((0, 5))  # as if all displacements may be wrong
     assert (least_squares(nothing, np.zeros(0), np.zeros(0)) == 0).all()
     square, added = some.T @ some, np.full(5, 0.1)
     right = square @ np.arange(5.0) + 0.1 * np.arange(5.0)
-    for matrix in (square, csr_array(square)):
-        assert system_solved(matrix, added, right) == pytest.approx(np.arange(5.0))
+    assert system_solved(csr_array(square), added, right) == pytest.approx(np.arange(5.0))
 
 
 def test_inverse_of_separate_blocks_looks_at_the_clock_for_each() -> None:
@@ -236,10 +234,9 @@ def test_inverse_of_separate_blocks_looks_at_the_clock_for_each() -> None:
     rows, added = rng.permutation(90)[:40], np.full(90, 0.1)
     expected = np.linalg.inv(whole + 0.1 * np.identity(90))[np.ix_(rows, rows)]
     looks: list[None] = []
-    for square in (whole, csr_array(whole)):
-        with heeding(lambda: looks.append(None)):
-            assert inverse(square, added, rows) == pytest.approx(expected)
-    assert len(looks) == 6
+    with heeding(lambda: looks.append(None)):
+        assert inverse(csr_array(whole), added, rows) == pytest.approx(expected)
+    assert len(looks) == 3
 
 
 def test_p_values_of_true_maps_are_plausible() -> None:

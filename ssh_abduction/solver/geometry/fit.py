@@ -37,7 +37,6 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.geometry.equations import Equations
 from ssh_abduction.solver.geometry.linear import (
-    as_dense,
     inverse,
     least_squares,
     matrix,
@@ -268,11 +267,11 @@ class Poses:
         columns = np.arange(len(vectors)), self._group[self._from]
         turns = matrix((vectors, columns), (len(vectors), int(self._group.max()) + 1))
         moves = weighted(self._moves(), weights)
-        mixed = as_dense(moves.T @ turns)
+        mixed = (moves.T @ turns).toarray()
         square = moves.T @ moves
         held = 1e-9 * max(float(square.diagonal().max()), 1.0)
         best = system_solved(square, np.full(self._positions, held), mixed)
-        form: NDArray[np.complex128] = as_dense(turns.conj().T @ turns) - mixed.conj().T @ best
+        form: NDArray[np.complex128] = (turns.conj().T @ turns).toarray() - mixed.conj().T @ best
         return form
 
     def _moves(self) -> Any:
@@ -388,7 +387,7 @@ class Poses:
         settled = 0
         if exact.any():
             look_at_clock()
-            rows = as_dense(self._jacobian(unknown)[: len(exact)][exact])
+            rows = self._jacobian(unknown)[: len(exact)][exact].toarray()
             # Turns at one place say nothing about positions. So most rows and columns are zero.
             rows = rows[rows.any(axis=1)][:, rows.any(axis=0)]
             settled = int(np.linalg.matrix_rank(rows)) if rows.size else 0

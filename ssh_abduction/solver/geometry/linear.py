@@ -1,4 +1,4 @@
-"""Matrices and linear systems for the fit of poses. Small ones are dense, large ones sparse."""
+"""Sparse matrices and linear systems for the fit of poses."""
 
 from __future__ import annotations
 
@@ -16,9 +16,6 @@ from ssh_abduction.runtime.clock import look_at_clock
 
 Array: TypeAlias = NDArray[np.float64]
 
-# Matrices with at most this many columns are dense. For these, numpy with all numbers is faster
-# than scipy with the numbers that are not zero.
-DENSE = 60
 # With at most this many unknowns, compute an inverse from a dense matrix.
 DENSE_INVERSE = 3000
 # The share of the diagonal that least squares add to it, far above the rounding errors.
@@ -26,27 +23,17 @@ DAMPING = 1e-10
 
 
 def matrix(entries: tuple[Any, tuple[Any, Any]], shape: tuple[int, int]) -> Any:
-    """Make a `csr_array` (dense if it has few columns). Values at one position are added up."""
-    made = coo_array(entries, shape=shape)
-    return made.toarray() if shape[1] <= DENSE else made.tocsr()
-
-
-def as_dense(some: Any) -> Any:
-    """Return the same matrix as an array of numpy."""
-    return some if isinstance(some, np.ndarray) else some.toarray()
+    """Make a `csr_array`. Values at one position are added up."""
+    return coo_array(entries, shape=shape).tocsr()
 
 
 def weighted(some: Any, weights: Array) -> Any:
     """Multiply each row of a matrix by its weight."""
-    if isinstance(some, np.ndarray):
-        return some * weights[:, None]
     return csr_array(some.multiply(weights[:, None]))
 
 
 def system_solved(square: Any, added: Array, right: Any) -> Any:
     """Solve a linear system after adding n numbers to the diagonal of its n x n matrix."""
-    if isinstance(square, np.ndarray):
-        return np.linalg.solve(square + np.diag(added), right)
     whole = (square + diags_array(added)).tocsc()
     return splu(whole.astype(right.dtype)).solve(right)
 
@@ -54,8 +41,6 @@ def system_solved(square: Any, added: Array, right: Any) -> Any:
 def least_squares(some: Any, values: Array, weights: Array) -> Array:
     """Solve a system by weighted least squares. Of several solutions return nearly the smallest."""
     system = weighted(some, weights)
-    if isinstance(system, np.ndarray):
-        return np.linalg.lstsq(system, values, rcond=1e-12)[0].astype(float)
     normal = system.T @ system
     scale = normal.diagonal()
     # A little damping makes the matrix regular, even if there are no equations.
@@ -67,7 +52,7 @@ def least_squares(some: Any, values: Array, weights: Array) -> Array:
 def inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
     """Compute some rows, and the same columns, of the inverse of a symmetric n x n matrix.
 
-    The matrix is dense or sparse. The n numbers in `added` are added to its diagonal.
+    The n numbers in `added` are added to its diagonal.
     """
     block = connected_components(csr_array(square), directed=False)[1]
     found = np.zeros((len(rows), len(rows)))
@@ -88,7 +73,7 @@ def _block_inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
         # the Cholesky factor.
         order = np.concatenate([np.setdiff1d(np.arange(len(added)), rows), rows])
         with suppress(np.linalg.LinAlgError):
-            whole = as_dense(square) + np.diag(added)
+            whole = square.toarray() + np.diag(added)
             factor = np.linalg.cholesky(whole[np.ix_(order, order)])
             first = len(order) - len(rows)
             root = solve_triangular(factor[first:, first:], np.identity(len(rows)), lower=True)
