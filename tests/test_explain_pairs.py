@@ -255,7 +255,7 @@ def test_explanation_says_how_far_turns_alone_are_off() -> None:
     turned = [(0, 0, 1.5708), (0, 0, -1.4)]
     trace = Trace.from_steps("aba", ["left", "right"], displacements=turned)
     assert str(explain_pair(trace, 0, 2)).endswith(
-        "of misfit: by the odometry their headings are 10 degrees apart"
+        "of misfit: by the odometry their headings are 9.8 degrees apart"
     )
 
 

@@ -170,7 +170,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
                 said.append(f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off")
             else:  # the robot only turned
                 off = abs(math.degrees(closing.turned))
-                said.append(f"by the odometry their headings are {off:.0f} degrees apart")
+                said.append(f"by the odometry their headings are {off:.1f} degrees apart")
         pair = self.first, self.second
         said += [match_in_words(c, *pair) for c in self.trace.closures if (c.first, c.last) == pair]
         return ", and ".join(said) or None
