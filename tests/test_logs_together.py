@@ -16,8 +16,9 @@ import pytest
 from coarse import every_second_beam
 
 from perception.errors import LogError
+from perception.places.closures import VisitMatch
 from perception.places.importing import Imported, import_log
-from perception.places.joining import closures_between, join_logs, scenes_of
+from perception.places.joining import agreeing_matches, join_logs
 from perception.readers.scans import Pose, RobotLog
 from perception.readers.writers import write_carmen
 from simulator.tours import record
@@ -129,8 +130,27 @@ def test_closures_between_drives_match_the_truth(
     # The rooms of the house look alike, so that two relations of its halves are possible.
     assert len(joint[1].trace.closures) == sum(len(part.trace.closures) for part in joint[2])
     # Another building has no visits that agree.
-    scenes = scenes_of(parts[0]), scenes_of(joint[2][0])
-    assert closures_between(parts[0], joint[2][0], *scenes) == []
+    others = [parts[0], joint[2][0]]
+    apart = join_logs([drives[0], halves[0]], others)[1].trace
+    assert len(apart.closures) == sum(len(part.trace.closures) for part in others)
+
+
+def test_relations_of_three_drives_agree() -> None:
+    """Nothing else is needed of drives than the middles of their visits, in one frame."""
+    visits = [SimpleNamespace(middle=np.array([5.0 * (k % 3), 7.0 * (k // 3)])) for k in range(9)]
+    drives: Any = [SimpleNamespace(visits=visits)] * 3
+
+    def matched(off: float, *places: int) -> list[VisitMatch]:
+        one: Any = SimpleNamespace(turn=0.0, shift=np.array([off, 0.0]), score=1.0)
+        return [VisitMatch(k, k, one) for k in places]
+
+    sure = {(0, 1): matched(0, *range(9)), (0, 2): matched(0, *range(6))}
+    wrong, right = matched(30, 0, 3, 6), matched(0, 1, 4, 7)
+    for found, expected in [(wrong, []), (wrong + right, right), (right + wrong[1:], right)]:
+        assert agreeing_matches(drives, {**sure, (1, 2): found})[1, 2] == expected
+    # Without the third drive, nothing says which relation is right.
+    assert agreeing_matches(drives, {(1, 2): wrong}) == {(1, 2): wrong}
+    assert agreeing_matches(drives, {(1, 2): wrong + right}) == {(1, 2): []}
 
 
 def test_join_logs_keeps_a_single_log(

@@ -7,6 +7,9 @@ Closures between drives say how visits of two drives lie relative to each other.
 To find them, each pair of visits is matched in all rotations, and each reliable match says how the
 frames relate. Places look alike, so a match counts only if at least VOTES visits of the second
 drive agree on one relation, and no other relation has more than half as many.
+
+Relations of three drives form a loop. The two relations on which most visits agree say what the
+third one is. If no match of the third relation agrees with them, it is not believed.
 """
 
 from __future__ import annotations
@@ -88,8 +91,10 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
 def _closings(parts: Sequence[Imported], counts: Sequence[int]) -> Iterator[VisitMatch]:
     """Yield the closures between drives, with visits numbered over all drives."""
     scenes = [scenes_of(part) for part in parts]
-    for a, b in combinations(range(len(parts)), 2):
-        for closing in closures_between(parts[a], parts[b], scenes[a], scenes[b]):
+    pairs = [*combinations(range(len(parts)), 2)]
+    found = {(a, b): _reliable_matches(scenes[a], scenes[b]) for a, b in pairs}
+    for (a, b), agreed in agreeing_matches(parts, found).items():
+        for closing in _best_of_each_visit(agreed):
             yield replace(closing, first=closing.first + counts[a], last=closing.last + counts[b])
 
 
@@ -154,14 +159,8 @@ def scenes_of(part: Imported) -> list[Scene]:
     ]
 
 
-def closures_between(
-    first: Imported, last: Imported, ours: Sequence[Scene], theirs: Sequence[Scene]
-) -> list[VisitMatch]:
-    """Find the closures between the visits of two drives, from the scene (local map) of each visit.
-
-    They lead from visits of the earlier drive to visits of the later one. There are none if too
-    few matches agree.
-    """
+def _reliable_matches(ours: Sequence[Scene], theirs: Sequence[Scene]) -> list[VisitMatch]:
+    """Match each visit of a drive with each visit of an earlier one, in all rotations."""
     found: list[VisitMatch] = []
     for j, scene in enumerate(theirs):
         turned = Turned.of(scene, TURNS)
@@ -169,12 +168,52 @@ def closures_between(
             matched = match(other, turned)
             if matched is not None and is_reliable(matched):
                 found.append(VisitMatch(i, j, matched))
-    agreed = _largest(found, _relations(found, first, last))
+    return found
+
+
+def _best_of_each_visit(agreed: Sequence[VisitMatch]) -> list[VisitMatch]:
+    """Keep the KEPT best matches of each later visit."""
     kept: list[VisitMatch] = []
-    for j in range(len(theirs)):
+    for j in sorted({closing.last for closing in agreed}):
         here = [closing for closing in agreed if closing.last == j]
         kept += sorted(here, key=lambda closing: -closing.match.score)[:KEPT]
     return kept
+
+
+def agreeing_matches(
+    parts: Sequence[Imported], found: Mapping[tuple[int, int], Sequence[VisitMatch]]
+) -> dict[tuple[int, int], list[VisitMatch]]:
+    """Return, for each pair of drives, the matches that agree on the relation of their frames.
+
+    If two better supported relations lead from one drive of a pair over a third drive to the other
+    one, some matches must agree with them. Otherwise those that do are kept, if they are enough.
+    """
+    agreed = {
+        (a, b): _largest(some, _relations(some, parts[a], parts[b]))
+        for (a, b), some in found.items()
+    }
+    frames: dict[tuple[int, int], _FrameMatches] = {}  # of the relations that are believed
+    for a, b in sorted(agreed, key=lambda pair: -_votes(agreed[pair])):
+        here = _relations(found[a, b], parts[a], parts[b])
+        ways = [
+            (frames[c, b], frames[a, c])
+            for c in range(len(parts))
+            if (c, b) in frames and (a, c) in frames
+        ]
+        if ways:
+            over, back = max(ways, key=lambda way: min(len(way[0].turns), len(way[1].turns)))
+            fits = here.fitting(over, back)
+            fitting = [one for one, fit in zip(found[a, b], fits, strict=True) if fit]
+            if not any(one in fitting for one in agreed[a, b]):
+                agreed[a, b] = fitting if _votes(fitting) >= VOTES else []
+        if agreed[a, b]:
+            frames[a, b] = _relations(agreed[a, b], parts[a], parts[b])
+            frames[b, a] = frames[a, b].inverse()
+    return agreed
+
+
+def _votes(matches: Sequence[VisitMatch]) -> int:
+    return len({one.last for one in matches})
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +235,29 @@ class _FrameMatches:
         far = np.hypot(*(self.here - expected).T)
         twist = np.abs((self.turns - self.turns[k] + math.pi) % math.tau - math.pi)
         return np.asarray((far < NEAR + DRIFT * np.hypot(*onward.T)) & (twist < TWIST))
+
+    def inverse(self) -> _FrameMatches:
+        """Return what the matches say if the two drives change places."""
+        return _FrameMatches(-self.turns, self.there, self.here)
+
+    def fitting(self, over: _FrameMatches, back: _FrameMatches) -> list[bool]:
+        """Whether each match agrees with two relations that lead over a third drive.
+
+        `over` leads from the later frame to the frame of the third drive, and `back` from there to
+        the earlier frame. Each is taken at its match that is nearest.
+        """
+        found = []
+        for turn, here, at in zip(self.turns, self.here, self.there, strict=True):
+            point, reach, twist = at, 2 * NEAR, turn
+            for relation in (over, back):
+                onward = point - relation.there
+                k = int(np.argmin(np.hypot(*onward.T)))
+                reach += DRIFT * np.hypot(*onward[k])
+                twist -= relation.turns[k]
+                point = relation.here[k] + points_turned(relation.turns[k], onward[k : k + 1])[0]
+            twist = abs((twist + math.pi) % math.tau - math.pi)
+            found.append(bool(math.dist(point, here) < reach and twist < 2 * TWIST))
+        return found
 
 
 def _relations(found: Sequence[VisitMatch], first: Imported, last: Imported) -> _FrameMatches:
