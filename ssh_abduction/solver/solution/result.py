@@ -183,12 +183,12 @@ class Solution(MapSequence):
         """The joins of the first map that rest on minimality alone.
 
         A join is two steps at one place or one dstate (`ssh_abduction.checker.joins`). Joins that
-        follow from those listed are left out. Empty if maps were weighed, as then `probability`
-        says how sure a join is.
+        follow from those listed are left out. Empty if maps are compared by cost, as then
+        `probability` says how sure a join is, unless the search was stopped before.
         """
         if self.support.recorded is not None:
             return self.support.recorded.joins
-        if self.weighed is not None or self.trace is None or not self.maps:
+        if self.theory.weigh == "cost" or self.trace is None or not self.maps:
             return ()
         return joins_by_minimality(self.trace, self.maps[0], self.theory)
 
