@@ -97,7 +97,7 @@ def test_trace_on_standard_output_has_no_other_lines(
     [
         (b"VERTEX2 0 0 0 0\nROBOTLASER1 0\n", [], "expected lines of CARMEN, got another log"),
         (b"nothing\n", [], "expected lines of CARMEN, got another log"),
-        (b"", [], "expected lines of CARMEN, got nothing; save the log to a file"),
+        (b"", [], "expected lines of CARMEN, got nothing; check the program that sends the log"),
         (b"", ["--format", "mcap"], "got another format or a topic"),
     ],
 )
