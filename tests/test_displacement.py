@@ -179,7 +179,7 @@ def test_displacements_tell_corners_of_polygons_apart(corners: int) -> None:
     ],
 )
 def test_fit_estimates_scale_and_drift(scale: float, bend: float) -> None:
-    trace = circuit(5, 12, 1.0, 1, Odometry(heading=0.001, turning=0.01, angle=0.005), scale, bend)
+    trace = circuit(5, 16, 1.0, 1, Odometry(heading=0.001, turning=0.01, angle=0.005), scale, bend)
     solution = solve(trace, Theory.causal())
     found = solution.maps[0]
     assert found.labels == tuple(step % 10 for step in range(len(trace)))

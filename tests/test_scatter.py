@@ -170,7 +170,7 @@ def test_short_second_drive_hardly_lowers_the_scatter_bound() -> None:
 
 @pytest.mark.slow
 def test_long_trace_with_faults_gets_a_scatter_bound() -> None:
-    trace = replace(rounds(6), odometry=EXACT)
+    trace = replace(rounds(8), odometry=EXACT)
     solution = solve(trace, Theory(misread=2.0, boundary="none", star="none"), time_limit=5)
     assert len(trace) > READABLE
     assert solution.weighed is not None
