@@ -249,6 +249,14 @@ def test_draft_follows_a_robot_through_a_maze(stars: bool) -> None:
     assert {*doubts} == {True, False}
 
 
+@pytest.mark.parametrize("steps", [3, 4])
+def test_online_mapper_without_time_obeys_pairs_of_later_steps(steps: int) -> None:
+    """Before the later step of a pair is reached, a search for clashes ignores the pair."""
+    trace = Trace.from_steps("aaba", ["right", "left", "travel"], stars=[(1, 1, 1, 1)] * 4)
+    _, answers = follow(trace, Theory(same_place=((0, steps),)), limit=NO_TIME)
+    assert Status.UNSATISFIABLE not in {answer.status for answer in answers}
+
+
 @settings(max_examples=5)
 @given(st.data())
 def test_online_mapper_without_time_has_a_map_and_proves_it_later(data: st.DataObject) -> None:

@@ -149,12 +149,10 @@ def live_log(
     text = piped(stream, named(source))
     head = carmen.head_of(text, SURVEYED)
     if not carmen.looks_like(head) or carmen.VERTEX.search(head):
-        got = (
-            "another log; save the log to a file, and read the file"
-            if head
-            else "nothing; check the program that sends the log"
-        )
-        raise LogError(f"{named(source)}: expected lines of CARMEN, got {got}")
+        got, mend = "nothing", "check the program that sends the log"
+        if head:
+            got, mend = "another log", "save the log to a file, and read the file"
+        raise LogError(f"{named(source)}: expected lines of CARMEN, got {got}; {mend}")
     file = cast(IO[bytes], Piped(head, text))
     reading = carmen.read(file, named(source), "carmen", surveyed=io.BytesIO(head))
     first = list(islice(reading.items, SURVEYED))

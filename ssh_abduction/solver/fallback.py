@@ -110,9 +110,10 @@ def late_clash(
     known, task, clash = parts.known, parts.task, None
     if known.best is not None or not known.stopped or known.status is not Status.UNKNOWN:
         return None
-    said = (*task.theory.same, *task.theory.same_place)
-    ends = dict.fromkeys((*parts.candidates.contradicting, *(max(pair) for pair in said)))
-    stretches = _stretches(task.trace, list(ends))
+    # While a robot drives, the theory may already assert something about later steps.
+    said = [max(pair) for pair in (*task.theory.same, *task.theory.same_place)]
+    ends = dict.fromkeys((*parts.candidates.contradicting, *said))
+    stretches = _stretches(task.trace, [end for end in ends if end < len(task.trace)])
     part = Watch().part(CLASHING, time.thread_time)
     with suppress(LimitError, KeyboardInterrupt), heeding(part.check):
         clash = clash_in(task.trace, task.theory, stretches, maps_of)
