@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from instances import maze
 from strategies import FOREIGN, PAIRS, theories, traces
@@ -22,7 +22,7 @@ from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.theory.settle import settle
-from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.theory.speedups import Speedups, row
 
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins
 
@@ -186,6 +186,7 @@ def drawn(data: st.DataObject, most: int) -> tuple[Trace, Theory]:
 @given(st.data())
 def test_online_sketches_are_consistent(data: st.DataObject) -> None:
     trace, theory = drawn(data, 14)
+    assume(row("certain sketches").holds_for(theory))  # others are checked
     sketch = data.draw(st.sampled_from(Sketch.all_of(trace.steps[0], theory)), label="sketch")
     for i, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True)):
         assert check(trace.prefix(i + 1), sketch.map(), theory) == ()
