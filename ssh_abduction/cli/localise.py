@@ -131,8 +131,7 @@ def _localiser(options: argparse.Namespace) -> tuple[Localiser, Trace]:
     from ssh_abduction.online.localiser import Localiser
 
     data = read_maps(options.maps)
-    some_maps(data, options.maps, "localise in")
-    maps = named_maps(data, options.maps)
+    maps = named_maps(some_maps(data, options.maps, "localise in"), data, options.maps)
     check_number(options.map, maps, options.maps)
     if len(maps) > 1 and options.map is None:
         warnings.warn(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import Any
 
 from ssh_abduction.cli.options import add_maps, check_number
@@ -28,7 +29,8 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    maps = named_maps(read_json(options.maps), str(options.maps))
+    data, where = read_json(options.maps), str(options.maps)
+    maps = named_maps(maps_of(data, where), data, where)
     check_number(options.map, maps, options.maps)
     if not maps:
         print("no map")
@@ -46,9 +48,8 @@ def _with_regions(ssh_map: SSHMap) -> str:
     return "\n".join([describe(ssh_map), *regions])
 
 
-def named_maps(data: Any, file: str) -> tuple[SSHMap, ...]:
-    """Return the maps in the data of a file, with the names beside it. Raises MapError."""
-    found = maps_of(data, file)
+def named_maps(found: Sequence[SSHMap], data: Any, file: str) -> tuple[SSHMap, ...]:
+    """Return the maps found in the data of a file, with the names beside it. Raises MapError."""
     steps = len(found[0].dstate_at) if found else 0
     drives = drives_in(FieldReader(file), data, steps) if found else ()
     return named_beside(found, drives, file)

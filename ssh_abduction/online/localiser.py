@@ -67,11 +67,12 @@ from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.errors import LocaliserError, MapError, TraceError, brief, named
 from ssh_abduction.data.maps import SSHMap, check_labels, checked_map
 from ssh_abduction.data.odometry import Displacement, Odometry, checked_displacement
+from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace, View, checked_trace
 from ssh_abduction.online.belief import AKIN, NOVEL, TINY, Belief, Observation
 from ssh_abduction.online.chances import Chances
 from ssh_abduction.online.dead_reckoning import Away, DeadReckoning, Motion
-from ssh_abduction.online.estimates import Links, Move, Moves, Stars, view_ratios
+from ssh_abduction.online.estimates import Links, Moves, Stars, view_ratios
 
 if TYPE_CHECKING:
     from perception.likelihood import ImageLikelihood
@@ -162,7 +163,8 @@ class Localiser:
             LocaliserError: There is an image and no recogniser.
             PerceptionError: The recogniser cannot read the image.
         """
-        return self._weighed(self.prior, self._with_star(self._observation(view, image), star))
+        gateways = _gateways(star)
+        return self._weighed(self.prior, self._with_star(self._observation(view, image), gateways))
 
     def update(
         self,
@@ -200,17 +202,16 @@ class Localiser:
                 f"belief: expected one over {self._number} dstates, got {brief(belief)}; "
                 "begin with start()"
             )
-        motion = turned = None
+        motion = None
         if displacement is not None:
             displacement = checked_displacement(displacement)
-            turned = displacement[2]
             covariance = self._odometry.covariance(displacement)
             motion = Motion.of(displacement, covariance, self._odometry)
-        action = Action.of(action)
+        action, gateways = Action.of(action), _gateways(star)
         seen = self._observation(view, image)
         if action.kind != "turn":
-            seen = self._with_star(seen, star)
-        return self._after(belief, self._moves.move(action, turned), seen, motion)
+            seen = self._with_star(seen, gateways)
+        return self._after(belief, action, seen, motion)
 
     def beliefs(self, trace: Trace) -> Iterator[Belief]:
         """Yield the belief after each step of another trace.
@@ -231,11 +232,10 @@ class Localiser:
                 belief = self._weighed(self.prior, seen)
             else:
                 displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
-                motion = turned = None
+                motion = None
                 if displacement is not None and covariance is not None:
-                    turned = displacement[2]
                     motion = Motion.of(displacement, covariance, odometry)
-                belief = self._after(belief, self._moves.move(action, turned), seen, motion)
+                belief = self._after(belief, action, seen, motion)
             yield belief
 
     def _observed(self, trace: Trace) -> Iterator[Observation | None]:
@@ -253,23 +253,20 @@ class Localiser:
             )
         yield from (self._of_view(step.view) for step in trace)
 
-    def _stars_of(self, trace: Trace) -> Iterator[Sequence[Any] | None]:
+    def _stars_of(self, trace: Trace) -> Iterator[Star | None]:
         """Yield the star of the first step of each visit, and None for the other steps.
 
         During turns the robot sees the same gateways again, which tells nothing new.
         """
-        yield trace.steps[0].star
+        yield trace.steps[0].gateways
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):
-            yield None if action.kind == "turn" else step.star
+            yield None if action.kind == "turn" else step.gateways
 
-    def _with_star(self, seen: Observation | None, star: Any) -> Observation | None:
+    def _with_star(self, seen: Observation | None, star: Star | None) -> Observation | None:
         """Add a star to an observation."""
-        if star is None:
+        if star is None or self._stars is None:
             return seen
-        gateways = Step(None, star=star).gateways
-        if gateways is None or self._stars is None:
-            return seen
-        found = self._stars.of(gateways)
+        found = self._stars.of(star)
         return found if seen is None else seen & found
 
     def _observation(self, view: View | None, image: ArrayLike | None) -> Observation | None:
@@ -303,9 +300,10 @@ class Localiser:
         )
 
     def _after(
-        self, belief: Belief, move: Move, seen: Observation | None, motion: Motion | None = None
+        self, belief: Belief, action: Action, seen: Observation | None, motion: Motion | None
     ) -> Belief:
         """Compute the belief after an action and an observation, and whether the robot is lost."""
+        move = self._moves.move(action, None if motion is None else motion.displacement[2])
         links = self._moves.links(move)
         if links is not None and self._reckoning and motion is not None and isinstance(move, str):
             links = replace(links, leads=self._reckoning.along(links.leads, motion))
@@ -434,6 +432,11 @@ def _checked(ssh_map: object) -> SSHMap:
             f"got {brief(min(strange))}; mend the map"
         )
     return ssh_map
+
+
+def _gateways(star: Any) -> Star | None:
+    """Check a star, as in a `Step`. Raises TraceError."""
+    return Step(None, star=star).gateways
 
 
 def _frozen(values: NDArray[np.float64]) -> NDArray[np.float64]:
