@@ -24,13 +24,13 @@ from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, final_code, in_a_li
 from ssh_abduction.cli.options import check_jobs, theory_of
 from ssh_abduction.cli.outcome import (
     StopFlag,
+    Warnings,
     all_given,
     answer_ending,
     answer_opening,
     exit_code,
     on_ctrl_c,
     warn,
-    warnings_of,
     why_no_map,
 )
 from ssh_abduction.cli.text import headline
@@ -171,15 +171,16 @@ class SolveQuestion(FileQuestion):
         backbone: Backbone | None,
     ) -> FileAnswer:
         """Make the answer for a solution: its line, exit code and warnings."""
+        found = Warnings(search).of(solution)
         if self.json:
             written = [written_map(*given) for given in all_given(solution)]
-            ending = answer_ending(search, solution, explanation, len(written), backbone)
+            ending = answer_ending(solution, explanation, len(written), backbone, found)
             line = json_line({"trace": path, **answer_opening(search), "maps": written, **ending})
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
         warnings = tuple(
             warning if warning.startswith(f"{named(path)}:") else f"{named(path)}: {warning}"
-            for warning in warnings_of(search, solution)
+            for warning in found
         )
         return FileAnswer(number, line, exit_code(solution), warnings)
 

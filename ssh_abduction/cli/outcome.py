@@ -9,12 +9,11 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeAlias
-from weakref import WeakKeyDictionary
 
 from ssh_abduction.data.errors import MapError, named
 from ssh_abduction.data.map_file import read_json
@@ -79,18 +78,17 @@ def all_given(solution: Solution) -> list[Given]:
 
 
 def answer_ending(
-    search: Search,
     solution: Solution,
     explanation: Explanation | None,
     maps: int,
     backbone: Backbone | None,
+    found: Sequence[str],
 ) -> dict[str, Any]:
-    """Make the fields of a solution's JSON that come after its maps, with all warnings.
+    """Make the fields of a solution's JSON that come after its maps.
 
-    `maps` is the number of maps that were written.
+    `maps` is the number of maps that were written. `found` are all warnings.
     """
     end = written_ending(solution, maps, backbone)
-    found = warnings_of(search, solution)
     end.pop("warnings", None)
     return (
         end
@@ -99,28 +97,33 @@ def answer_ending(
     )
 
 
-def warnings_of(search: Search, solution: Solution) -> list[str]:
-    """List sentences about reasons to distrust the trace or its views."""
-    if solution.stopped == "interrupted" and len(search.trace) > SOON:
-        return []
-    return [*solution.warnings, *_second_opinion(search, solution)]
+class Warnings:
+    """Finds sentences about reasons to distrust a trace or its views."""
 
+    def __init__(self, search: Search) -> None:
+        self._search = search
+        self._second: list[str] | None = None  # None until it is found
 
-# The warnings of a search are needed twice. They are kept here, to be computed only once.
-_second_opinions: WeakKeyDictionary[Search, list[str]] = WeakKeyDictionary()
-
-
-def _second_opinion(search: Search, solution: Solution) -> list[str]:
-    """Warn if the second best number of views gives another map, if there is time to solve it."""
-    if search not in _second_opinions:
-        limit = search.limits.time_limit
-        left = None if limit is None else limit - solution.seconds.total
-        if solution.stopped not in (None, "maps limit") or (left is not None and left < LEAST_LEFT):
+    def of(self, solution: Solution) -> list[str]:
+        """List the warnings about a solution of the search."""
+        if solution.stopped == "interrupted" and len(self._search.trace) > SOON:
             return []
-        known = [*solution.maps, *([search.best] if search.best else [])]
-        found = second_map(search.trace, known, search.theory, left, search.limits.memory_limit)
-        _second_opinions[search] = [found.sentence] if found else []
-    return _second_opinions[search]
+        return [*solution.warnings, *self._second_opinion(solution)]
+
+    def _second_opinion(self, solution: Solution) -> list[str]:
+        """Warn if the runner-up's views give another map, if there is time to solve it."""
+        if self._second is None:
+            search, limits = self._search, self._search.limits
+            limit = limits.time_limit
+            left = None if limit is None else limit - solution.seconds.total
+            if solution.stopped not in (None, "maps limit") or (
+                left is not None and left < LEAST_LEFT
+            ):
+                return []
+            known = [*solution.maps, *([search.best] if search.best else [])]
+            found = second_map(search.trace, known, search.theory, left, limits.memory_limit)
+            self._second = [found.sentence] if found else []
+        return self._second
 
 
 def warn(warnings: Iterable[str]) -> None:

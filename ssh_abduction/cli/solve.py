@@ -29,6 +29,7 @@ from ssh_abduction.cli.options import (
 )
 from ssh_abduction.cli.outcome import (
     Given,
+    Warnings,
     all_given,
     answer_ending,
     answer_opening,
@@ -36,7 +37,6 @@ from ssh_abduction.cli.outcome import (
     on_ctrl_c,
     save_solution,
     warn,
-    warnings_of,
     why_no_map,
 )
 from ssh_abduction.cli.parsing import Verbs
@@ -204,11 +204,12 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
             )
             # Ctrl-C must not cut the output, as half of it would be useless.
             until_printed.enter_context(on_ctrl_c(search.interrupt))
-            printed = (_Json if options.json else _Text)(search, obeying)
+            found = Warnings(search)
+            printed = _Json(search, obeying, found) if options.json else _Text(search, obeying)
 
             def last_words(why: Stop) -> tuple[str, int, Callable[[], None]]:
                 solution = obeying.with_names(search.snapshot(why))
-                warn(warnings_of(search, solution))
+                warn(found.of(solution))
                 save = partial(save_solution, solution, options.output)
                 return printed.last_words(solution), exit_code(solution), save
 
@@ -223,7 +224,7 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
             save_solution(solution, options.output)
 
         guard.finish(exit_code(solution), printed.end(solution, explanation), save)
-        warn(warnings_of(search, solution))
+        warn(found.of(solution))
     return exit_code(solution)
 
 
@@ -278,8 +279,8 @@ class _Json:
     order in which they are found.
     """
 
-    def __init__(self, search: Search, obeying: Obeying) -> None:
-        self._search, self._obeying = search, obeying
+    def __init__(self, search: Search, obeying: Obeying, found: Warnings) -> None:
+        self._search, self._obeying, self._found = search, obeying, found
         self._held: list[Given] = []
         self._room = HELD_DSTATES
         self._maps = 0  # maps that were printed
@@ -325,7 +326,8 @@ class _Json:
         more: int = 0,
     ) -> str:
         """Make the fields after the maps; `more` maps are not printed yet."""
-        end = answer_ending(self._search, solution, explanation, self._maps + more, backbone)
+        maps, warnings = self._maps + more, self._found.of(solution)
+        end = answer_ending(solution, explanation, maps, backbone, warnings)
         if blamed := self._obeying.blamed(solution, explanation):
             end["corrections"] = blamed
         return f"\n],{json_line(end)[1:]}\n"

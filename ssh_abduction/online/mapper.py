@@ -63,7 +63,6 @@ probabilities, and restores the map when the evidence decides. `standing` says h
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -74,11 +73,11 @@ from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
 from ssh_abduction.online.keeper import MapKeeper, StepOptions
 from ssh_abduction.runtime.deprecated import renamed_parameters
-from ssh_abduction.solver import Solution, check_limit
+from ssh_abduction.solver import Solution, check_limit, preload_engine
 from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.theory.fields import choice
 from ssh_abduction.theory.settle import Problem, count_returns, settle
-from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups, row
+from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 if TYPE_CHECKING:
@@ -148,7 +147,7 @@ class OnlineMapper:
             began = time.perf_counter()
             self._keeper = Recovery(self._problem, options)
         else:
-            _preload_engine(self.theory)
+            preload_engine(self.theory)
             began = time.perf_counter()
             self._keeper = MapKeeper(self._problem, options)
         self.solution = self._keeper.answer(began)
@@ -259,14 +258,6 @@ def _known(view: View, step: int) -> View:
             "log the trace, and solve it as a whole"
         )
     return view
-
-
-def _preload_engine(theory: Theory) -> None:
-    """Import the engine before the first step, so that no step has to wait for the import."""
-    if theory.level == "causal":
-        importlib.import_module("ssh_abduction.solver.engines.causal")
-    elif row("visits").holds_for(theory):
-        importlib.import_module("ssh_abduction.solver.engines.framed")
 
 
 class TheorySettler:

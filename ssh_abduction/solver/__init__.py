@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp.rule_checks import check_rules as check_rules
     from ssh_abduction.solver.asp.workers import end_all as end_all
     from ssh_abduction.solver.asp.workers import in_process as in_process
+    from ssh_abduction.solver.choosing import preload_engine as preload_engine
     from ssh_abduction.solver.costs.estimating import maps_apart as maps_apart
     from ssh_abduction.solver.costs.misfit import Misfit as Misfit
     from ssh_abduction.solver.derived_regions import find_regions as find_regions

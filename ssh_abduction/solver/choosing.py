@@ -9,6 +9,7 @@ from ssh_abduction.solver.asp.facts import readable
 from ssh_abduction.solver.engines.base import AT_ONCE, Engine, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.theory.speedups import row
+from ssh_abduction.theory.theory import Theory
 
 # Solve traces with at most this many steps directly. This is faster than naming dstates or merging
 # steps first.
@@ -52,6 +53,14 @@ def new_engine(task: Task) -> Engine:
 
         return FramedEngine(task)
     return step_engine(task)
+
+
+def preload_engine(theory: Theory) -> None:
+    """Import the engine that long traces need, so that no step of a robot waits for the import."""
+    if theory.level == "causal":
+        import ssh_abduction.solver.engines.causal
+    elif row("visits").holds_for(theory):
+        import ssh_abduction.solver.engines.framed  # noqa: F401
 
 
 def labelling_engine(task: Task, labels: Sequence[int]) -> Engine:
