@@ -1,10 +1,13 @@
 """Find every minimal topological map that explains what a robot saw and did.
 
 Each exported name is loaded when it is first used. So the command line starts at once, and Ctrl-C
-works from its start. This module itself imports nothing when it is loaded, not even `__future__`.
-At that time, Python may still search the current folder first, and a file there could replace a
-module of Python. `__main__` moves that folder to the end of the search path.
+works from its start. When this module is loaded, it imports only `sys`, which is part of Python
+itself, and not even `__future__`. At that time, Python may still search the current folder first,
+and a file there could replace a module of Python. `__main__` moves that folder to the end of the
+search path.
 """
+
+import sys
 
 TYPE_CHECKING = False  # as in typing, which takes longer to load than this whole module
 
@@ -52,6 +55,13 @@ _MOVED = {"Path": "data.MapPath", "SSHError": "data.AbductionError"} | {
     for name in names.split()
 }
 
+# Modules whose names the documentation of version 0.1.0 imports, and the packages of these names.
+_MOVED_MODULES = {
+    "ssh_abduction.front": "ssh_abduction.solver",
+    "ssh_abduction.learner": "ssh_abduction.learning",
+    "ssh_abduction.rivals.explain": "ssh_abduction.explain",
+}
+
 
 def lazy_names(package: str) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
     """Make the `__getattr__` and `__dir__` of a package that loads each name when it is first used.
@@ -63,8 +73,6 @@ def lazy_names(package: str) -> "tuple[Callable[[str], Any], Callable[[], list[s
         The function `__getattr__`, which loads and returns the value of a name, and the function
         `__dir__`, which lists all names.
     """
-    import sys
-
     where: dict[str, tuple[str, str]] = {}  # the module of each name, and its name there
 
     def exported() -> "list[str]":
@@ -96,7 +104,6 @@ def lazy_names(package: str) -> "tuple[Callable[[str], Any], Callable[[], list[s
 def _exports_of(package: str) -> "dict[str, tuple[str, str]]":
     """Read the names that a package imports by `as`, each with its module and its name there."""
     import ast
-    import sys
 
     spec: Any = sys.modules[package].__spec__
     return {
@@ -108,6 +115,30 @@ def _exports_of(package: str) -> "dict[str, tuple[str, str]]":
     }
 
 
+class _MovedModules:
+    """Finds and loads the modules of version 0.1.0 that other packages have replaced."""
+
+    def find_spec(self, name: str, *_: object) -> "Any":
+        if name not in _MOVED_MODULES:
+            return None
+        from importlib.machinery import ModuleSpec
+
+        loader: Any = self
+        return ModuleSpec(name, loader)
+
+    def create_module(self, spec: "Any") -> None:
+        """Let Python make an empty module, which `exec_module` replaces."""
+
+    def exec_module(self, module: "Any") -> None:
+        import warnings
+        from importlib import import_module
+
+        old, now = module.__name__, _MOVED_MODULES[module.__name__]
+        warnings.warn(f"{old} is deprecated; use {now}", DeprecationWarning, stacklevel=2)
+        sys.modules[old] = import_module(now)
+
+
+sys.meta_path.append(_MovedModules())
 _load, __dir__ = lazy_names(__name__)
 
 

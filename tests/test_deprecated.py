@@ -49,6 +49,22 @@ def test_old_parameters_work_with_a_warning() -> None:
         OnlineMapper("a", Theory.causal(), limit=None)  # type: ignore[call-arg]
 
 
+def test_old_modules_give_the_new_packages_with_a_warning() -> None:
+    for old, new in ssh_abduction._MOVED_MODULES.items():
+        with pytest.warns(DeprecationWarning, match=f"{old} is deprecated; use {new}") as caught:
+            assert import_module(old) is import_module(new)
+        assert caught[0].filename.endswith("importlib/__init__.py")
+
+
+def test_old_choices_of_a_theory_work_with_a_warning() -> None:
+    expected = solve(TRACE, Theory.causal().replace(different=[(0, 2)]))
+    for theory in ({"theory": Theory.causal()}, {}):
+        args = (TRACE,) if theory else (TRACE, Theory.causal())
+        with pytest.warns(DeprecationWarning, match="different as an argument is deprec") as caught:
+            assert solve(*args, **theory, different=[(0, 2)]) == expected  # type: ignore[call-arg]
+        assert caught[0].filename == __file__
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -139,5 +155,7 @@ def test_old_names_of_search_counts_warn_and_work() -> None:
     for name in ("prefix", "grounding", "evidence"):
         with pytest.warns(DeprecationWarning, match=f"use Solution.effort.{name}"):
             assert getattr(solution, name) == getattr(solution.effort, name)
+    with pytest.warns(DeprecationWarning, match=r"use Solution\.warnings"):
+        assert solution.odometry_warning is None  # type: ignore[attr-defined]
     with pytest.raises(AttributeError, match="'Solution' object has no attribute 'maze'"):
         solution.maze  # type: ignore[attr-defined]  # noqa: B018

@@ -17,6 +17,7 @@ from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Status, Stop
 from ssh_abduction.theory.fields import ASSERTIONS
+from ssh_abduction.theory.old_choices import with_old_choices
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -26,6 +27,7 @@ SHARE = 0.45
 
 
 @renamed_parameters("limit", "memory")
+@with_old_choices
 def explain_trace(
     trace: Trace,
     theory: Theory | None = None,

@@ -37,6 +37,7 @@ from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import EQUAL, Cost, Judging, Status, Stop, facts
+from ssh_abduction.theory.old_choices import with_old_choices
 from ssh_abduction.theory.settle import displacement_of
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -58,6 +59,7 @@ ESTIMATING = 0.5
 
 
 @renamed_parameters("limit", "maps", "memory")
+@with_old_choices
 def explain_pair(
     trace: Trace,
     first: int,

@@ -35,6 +35,7 @@ from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 from ssh_abduction.solver.start import Limits
 from ssh_abduction.solver.values import Progress
+from ssh_abduction.theory.old_choices import with_old_choices
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import ALL, Speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -45,6 +46,7 @@ LEAST_SECONDS = 1e-9
 
 
 @renamed_parameters("limit", "maps", "memory")
+@with_old_choices
 def solve(
     trace: Trace | Sequence[Trace] | Iterator[Trace],
     theory: Theory | None = None,

@@ -332,12 +332,16 @@ class Solution(MapSequence):
     if not TYPE_CHECKING:  # so that type checkers reject unknown attributes
 
         def __getattr__(self, name):
-            """Return a count of `effort` by the name that it had in version 0.1.0."""
-            if name not in ("prefix", "grounding", "evidence"):
+            """Return a field of `effort` or `support` by the name that it had in version 0.1.0."""
+            if name in ("prefix", "grounding", "evidence"):
+                value, now = getattr(self.effort, name), f"effort.{name}"
+            elif name == "odometry_warning":
+                value, now = self.support.odometry_warning, "warnings"
+            else:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            text = f"Solution.{name} is deprecated; use Solution.effort.{name}"
+            text = f"Solution.{name} is deprecated; use Solution.{now}"
             warnings.warn(text, DeprecationWarning, stacklevel=2)
-            return getattr(self.effort, name)
+            return value
 
     def to_dict(self) -> dict[str, Any]:
         """Return the answer as plain data, as `solve --json` prints it (docs/reference/formats.md).
