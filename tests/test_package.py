@@ -161,3 +161,13 @@ def test_citation_and_changelog_have_the_package_version() -> None:
     assert re.search(r"^## \[[\d.]+\] \(unreleased\)$", changelog, re.MULTILINE)
     assert all(url.startswith(project["urls"]["Source"]) for url in project["urls"].values())
     assert f'repository-code: "{project["urls"]["Source"]}"' in (ROOT / "CITATION.cff").read_text()
+
+
+def test_import_linter_sees_all_imports_of_the_package() -> None:
+    """It does not see a module that is named in a string. Only notebooks need such an import."""
+    found = [
+        (path.name, name)
+        for path in (ROOT / "ssh_abduction").rglob("*.py")
+        for name in re.findall(r"import_module\(\"(ssh_abduction\.[^\"]+)", path.read_text())
+    ]
+    assert found == [("words.py", "ssh_abduction.output")]
