@@ -11,8 +11,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ssh_abduction import Theory, Trace, compare, solve
-from ssh_abduction.checker.checker import check
+from ssh_abduction import Theory, Trace, check, compare, solve
 from ssh_abduction.cli import main as main_of_the_shell
 from ssh_abduction.cli.text import compared, describe
 from ssh_abduction.output import to_svg

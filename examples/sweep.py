@@ -36,8 +36,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from ssh_abduction import Trace
 from ssh_abduction.cli import main as shell
-from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.solver import Solution
 

@@ -14,17 +14,19 @@ import warnings
 from dataclasses import dataclass
 from functools import cache
 from glob import glob
+from inspect import getsource
 from itertools import pairwise
 from pathlib import Path
 
 import figures
 import pytest
 
+from ssh_abduction import OnlineMapper, SSHMap
 from ssh_abduction.cli import main, parser
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output import streets, to_svg
 from ssh_abduction.robot_logs import log_maps
-from ssh_abduction.solver import Status, solve
+from ssh_abduction.solver import Solution, Status, solve
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
 
@@ -297,6 +299,19 @@ def test_files_named_in_pages_exist(page: Path) -> None:
     ):  # pages name modules from the folder that they are in on
         assert any(path.match(name) for path in FILES) or Path(name).name in EXAMPLES, name
     assert page != README or len(whole) > 5
+
+
+def test_attributes_of_maps_and_solutions_named_in_pages_exist() -> None:
+    types = {"solution": Solution, "ssh_map": SSHMap, "mapper": OnlineMapper, "trace": Trace}
+    pages = "\n".join(page.read_text() for page in PAGES)
+    found = re.findall(r"[`(](solution|ssh_map|mapper|trace)\.(?!jsonl)(\w+)", pages)
+    assert len(found) > 30
+    for name, attribute in found:
+        kind = types[name]
+        made = re.search(
+            rf"^    {attribute}: |self\.{attribute}\b.* = ", getsource(kind), re.MULTILINE
+        )
+        assert made or hasattr(kind, attribute), attribute
 
 
 def test_design_page_lists_the_layers_of_import_linter() -> None:
