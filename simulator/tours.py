@@ -122,8 +122,6 @@ def record(
     tours: int = 1,
     seed: int = 0,
     *,
-    laser: Laser | None = None,
-    body: Body | None = None,
     odometer: Odometer | None = None,
     every: float = EVERY,
 ) -> RecordedDrive:
@@ -133,7 +131,7 @@ def record(
     by. It is as noisy as the odometry of recorded logs. There is a scan each `every` metres, and in
     turns every ten degrees. Raises SimulatorError if the route cannot be driven.
     """
-    driver = _driver(world, tours, seed, laser, body, None)
+    driver = _driver(world, tours, seed)
     if world.lifts:
         raise SimulatorError(
             f"{world.name}: lifts: expected none in the log of a robot, as a log does not show "
@@ -190,9 +188,9 @@ def _driver(
     world: World,
     tours: int,
     seed: int,
-    laser: Laser | None,
-    body: Body | None,
-    tolerance: Tolerance | None,
+    laser: Laser | None = None,
+    body: Body | None = None,
+    tolerance: Tolerance | None = None,
 ) -> Driver:
     """Make a robot at the start of a world."""
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")

@@ -63,20 +63,18 @@ CROWDED, TRAVEL = 0.4, 0.1
 _Frame = tuple[complex, float]  # the position and the heading of the origin of a stretch
 
 
-def misfit(
-    trace: Trace, dstates: Sequence[int], places: Sequence[int], faults: Faults = ()
-) -> float:
-    """Compute the misfit (the least chi-square) if each step is at a given dstate and place.
-
-    Faults have a kind and a step. A displacement that jumped is ignored.
-    """
-    return _least(trace, dstates, places, faults)[0]
+def misfit(trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> float:
+    """Compute the misfit (the least chi-square) if each step is at a given dstate and place."""
+    return _least(trace, dstates, places, ())[0]
 
 
 def _least(
     trace: Trace, dstates: Sequence[int], places: Sequence[int], faults: Faults
 ) -> tuple[float, Array]:
-    """Compute the misfit, and the position of the dstate of each step, in metres, (n, 2)."""
+    """Compute the misfit, and the position of the dstate of each step, in metres, (n, 2).
+
+    Faults have a kind and a step. A displacement that jumped is ignored.
+    """
     wrong = [step for kind, step in faults if kind == "jumped"]
     errors = _Errors(trace.without_displacements_at(wrong), dstates, places)
     with threadpool_limits(1, user_api="blas"):  # more threads only wait for each other

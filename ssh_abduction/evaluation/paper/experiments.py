@@ -337,7 +337,7 @@ class NotchOutcome:
     rate: float
 
 
-def outcome(notch: float, scale: float, seed: int = 0) -> NotchOutcome:
+def outcome(notch: float, scale: float) -> NotchOutcome:
     """Take images in the notched rectangle with another notch, and run the method on them.
 
     The notch is in metres. `scale` is the factor for the offsets of the robot's poses from the
@@ -346,12 +346,12 @@ def outcome(notch: float, scale: float, seed: int = 0) -> NotchOutcome:
     warnings.simplefilter("ignore", ImageWarning)
     # Scan at the poses that the robot drove to, with their offsets scaled.
     world = notched(notch)
-    means, offsets, truth = _driven(notch, seed)
-    rng, laser = np.random.default_rng(seed), Laser()
+    means, offsets, truth = _driven(notch)
+    rng, laser = np.random.default_rng(0), Laser()
     scans = [laser.scan(world, means + scale * offsets, rng) for _ in range(STILL)]
     ranges = np.median(scans, axis=0)
     images = ReciprocalTransformer().fit_transform(ranges)
-    clusterer = ViewClusterer(k_max=10, n_init=4, random_state=seed).fit(images)
+    clusterer = ViewClusterer(k_max=10, n_init=4, random_state=0).fit(images)
     actions = [world.route[i % len(world.route)] for i in range(len(means) - 1)]
     solution = solve(
         Trace.from_steps(clusterer.labels_.tolist(), actions), VIEWS_ALONE, time_limit=5
@@ -364,7 +364,7 @@ def outcome(notch: float, scale: float, seed: int = 0) -> NotchOutcome:
         k=clusterer.k_,
         uncertainty=uncertainty_coefficient(clusterer.labels_, truth),
         right=is_only and one_to_one(np.array(solution.maps[0].dstate_at), truth),
-        rate=rate(ranges, np.unique(truth, return_inverse=True)[1], truth, seed),
+        rate=rate(ranges, np.unique(truth, return_inverse=True)[1], truth, 0),
     )
 
 
@@ -378,14 +378,14 @@ def notched(depth: float) -> World:
 
 @cache
 def _driven(
-    notch: float, seed: int
+    notch: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
     """Simulate all tours in the rectangle with this notch.
 
     Return three arrays with a row for each of n steps: the mean pose at its true dstate, of shape
     (n, 3); the offset of its own pose from this mean, of shape (n, 3); and the name of the dstate.
     """
-    trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, seed)
+    trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, 0)
     truth = true_dstates(trace)
     poses = np.array([step.truth["pose"] for step in trace.steps])
     means = np.empty_like(poses)
