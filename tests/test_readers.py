@@ -21,6 +21,7 @@ from perception.readers.lines import LONGEST_LINE
 from perception.readers.logs import FORMATS, live_log, read_log, stream_log
 from perception.readers.scans import Damage, LaserScanner, Pose, RobotLog, Scan
 from perception.readers.writers import write_bag, write_carmen
+from ssh_abduction.cli import import_log
 from ssh_abduction.data.errors import TraceError
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.data.trace import Trace
@@ -762,6 +763,10 @@ def broken(tmp_path: Path) -> dict[str, bytes]:
         "sqlite of nothing": b"SQLite format 3\0" + bytes(100),
         "a gzipped bag": gzip.compress(b"#ROSBAG V2.0\n"),
     }
+
+
+def test_import_takes_all_formats_of_logs() -> None:
+    assert tuple(FORMATS) == import_log.FORMATS
 
 
 @pytest.mark.parametrize("what", broken(Path()))
