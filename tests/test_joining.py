@@ -22,7 +22,7 @@ from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.data.star import Gateway, Star
 from ssh_abduction.solver.costs import beams
-from ssh_abduction.solver.costs.doubts import doubt_of
+from ssh_abduction.solver.costs.distrust import doubt_of
 from ssh_abduction.solver.costs.estimating import may_join_more, rival_of
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.weighing import Weighing

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from perception.places.closures import VisitMatch
-from perception.places.loops import agreeing
+from perception.places.consistency import agreeing
 from perception.places.matching import Match
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit

@@ -35,10 +35,10 @@ from perception.places.closures import (
     uncertainty,
     without_drift,
 )
+from perception.places.consistency import agreeing
 from perception.places.distinctive import WIDTH, WINDOW, find_visits
 from perception.places.following import follow, share_failing, turned_wrongly
 from perception.places.live import LiveLog
-from perception.places.loops import agreeing
 from perception.places.partings import with_partings
 from perception.places.tracing import DRIFT, to_trace
 from perception.places.track import Track

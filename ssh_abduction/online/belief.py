@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.errors import LocaliserError
-from ssh_abduction.online.dead_reckoning import Away
+from ssh_abduction.online.motion import Away
 
 # The robot is located if one dstate has at least this probability.
 LOCATED = 0.9

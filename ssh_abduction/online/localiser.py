@@ -71,8 +71,8 @@ from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace, View, checked_trace
 from ssh_abduction.online.belief import AKIN, NOVEL, TINY, Belief, Observation
 from ssh_abduction.online.chances import Chances
-from ssh_abduction.online.dead_reckoning import Away, DeadReckoning, Motion
 from ssh_abduction.online.estimates import Links, Moves, Stars, view_ratios
+from ssh_abduction.online.motion import Away, DeadReckoning, Motion
 
 if TYPE_CHECKING:
     from perception.likelihood import ImageLikelihood

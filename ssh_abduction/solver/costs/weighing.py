@@ -44,7 +44,7 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.costs import repeats
 from ssh_abduction.solver.costs.beams import Beams
-from ssh_abduction.solver.costs.doubts import doubt_of, misfit_of
+from ssh_abduction.solver.costs.distrust import doubt_of, misfit_of
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
     ESTIMATING,

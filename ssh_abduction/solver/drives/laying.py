@@ -17,7 +17,7 @@ from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.costs.doubts import doubt_of
+from ssh_abduction.solver.costs.distrust import doubt_of
 from ssh_abduction.solver.costs.estimating import (
     ESTIMATING,
     may_join_more,
