@@ -67,7 +67,7 @@ def _come_to(way: Array, at: int, driver: Driver) -> int:
 
 
 def _stride(driver: Driver, way: Array, aim: float) -> None:
-    """Turn towards the aim, a point on the route, and drive if the aim is roughly ahead."""
+    """Turn to the point `aim` metres ahead on the route. Drive if the robot roughly faces it."""
     x, y, heading = driver.robot.pose
     goal = way[: 2 + round(aim / CELL)][-1]
     turn = math.remainder(math.atan2(goal[1] - y, goal[0] - x) - heading, math.tau)

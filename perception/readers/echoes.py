@@ -53,8 +53,8 @@ NOISES = (1e-5, 0.001, 0.004, 0.016)
 NEARLY_ALL, SPIKE = 0.9, 10
 # A kind of beam without a measurement is worth a note if it has at least this share of all beams.
 WORTH_A_NOTE = 0.01
-# The neighbours of beams that met nothing are long: longer than this share of all beams. Those of
-# beams that failed at random have usual lengths (0.5).
+# If beams met nothing, the beams beside them are long: longer than this share of all beams. If
+# beams failed at random, the beams beside them are longer than about half of all.
 LONG = 0.8
 
 

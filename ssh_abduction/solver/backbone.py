@@ -126,7 +126,7 @@ class _Reasoning:
         self._task, self._judging, self._cost, self._sharing = task, judging, cost, sharing
 
     def settle_labels(self, engine: Engine) -> bool:
-        """Resolve all doubts, one labelling (dstates of steps) after the other; True if all are."""
+        """Resolve the doubts of each labelling (dstates of steps). Return whether none is left."""
         forbidden = set[frozenset[Equality]]()
         while isinstance(engine, LabellingEngine):
             failed, refused = 0, None

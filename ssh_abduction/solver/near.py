@@ -45,8 +45,8 @@ class NearMinimal:
     ) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
         """Yield the maps with their preferred counts, the most important one first.
 
-        `minimal` has the preferred counts of minimal maps. A map may exceed the first of these
-        counts, not counting excuses, by up to `within`.
+        `minimal` has the preferred counts of minimal maps. The first count that is not excuses may
+        be larger by up to `within`.
         """
         count = counted_first(self._task.theory)
         assert count is not None

@@ -171,7 +171,10 @@ class Visits:
 
 
 class _Cliques:
-    """A clique in each part of the graph `apart`. Nodes of different parts are always apart."""
+    """A clique in each part of the nodes. Nodes of different parts are always apart.
+
+    So the union of the cliques is a clique, too.
+    """
 
     def __init__(self, apart: Flags) -> None:
         self.apart, self._random = apart, np.random.default_rng(0)

@@ -289,14 +289,17 @@ class FaultyEngine:
 
     def _found(self, labels: Sequence[int], slips: Collection[int], shows: Sequence[int]) -> Found:
         """Make a map of the whole trace, with its cost. `shows` has the view of each dstate."""
-        shown = self._shown_somewhere(labels, shows)
+        shown = self._views_of_dstates(labels, shows)
         misread = [t for t in range(self.size) if shown[labels[t]] != self._seen[t]]
         faults = [*((t, "misread") for t in misread), *((t, "slipped") for t in slips)]
         trace, theory = self._task.trace, self._task.theory
         return Found.of(answer_maps.causal_map(labels, trace, faults, theory), theory)
 
-    def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
-        """Return the views of dstates. If all steps of one are misread, take their usual view."""
+    def _views_of_dstates(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
+        """Return the view of each dstate. If all steps there are misread, it is their usual view.
+
+        `shown` has the view of each dstate in clingo's answer.
+        """
         views = list(shown)
         for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:
             views[s] = Counter(

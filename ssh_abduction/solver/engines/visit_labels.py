@@ -114,7 +114,7 @@ class VisitLabels:
             return True
 
     def _order_of_choice(self, chart: FramedChart) -> list[int]:
-        """Set `clique`. Return its nodes, then the others, those apart from most nodes first."""
+        """Find the clique. Return its nodes, then the others: first those apart from most nodes."""
         apart = chart.apart()
         self._asker.watch.check()
         self.clique = clique(apart, chart.seen) if self._task.speedups.clique else []

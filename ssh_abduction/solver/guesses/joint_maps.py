@@ -97,8 +97,9 @@ class Joining:
         self._problem, self._log = problem, log
         self._bare = problem.theory.replace(displacement="none", weigh="count")
         self.sights = Sights(problem.trace, self._bare, log, misreads=False)
-        # The ways to lay one map on another, and those that fit with their costs in nats.
+        # The ways to lay one map on another.
         self._ways: _Anchors = {}
+        # The ways that fit, each with its cost in nats.
         self._laid: dict[_Pair, list[tuple[float, _Anchor]]] = {}
 
     def maps(self, standing: Sequence[Part] = ()) -> Iterator[SSHMap]:

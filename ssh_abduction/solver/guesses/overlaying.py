@@ -362,7 +362,7 @@ class Overlay:
         return self._state is not before
 
     def _relief(self, before: _State, places: tuple[int, int] | None) -> float:
-        """Compute what two places at one position pay that one place does not pay."""
+        """Return the price of two places at one position. It is saved if they become one place."""
         if not places or {*before.sights[places[0]]} & {*before.sights[places[1]]}:
             return 0.0
         here, there = (before.mean[k : k + 2].tolist() for k in self._both.position[[*places]])

@@ -67,8 +67,8 @@ class Sights:
     def merged(self, first: Mapping[int, Sight], second: Mapping[int, Sight]) -> float:
         """Return by how many nats changed gateways cost more if two places are one.
 
-        The result is inf if they cannot be one. Each place has what each drive saw there, as
-        `shown`.
+        The result is inf if they cannot be one. `first` and `second` have what each drive saw at
+        one of the places, as in `shown`.
         """
         one, other = {*first.values()}, {*second.values()}
         if len(one) == len(other) == 1:  # mostly
