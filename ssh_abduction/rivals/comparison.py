@@ -268,14 +268,8 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     if listing_there:
         listing.check_same_trace(listing_there)
     table = Table(listing.maps, listing.drives)
-    # the backbone has more information than the listed maps only if the list is not complete
-    # if some maps have no places, only dstates are compared: the first map decides about that
-    sharing = Sharing(sorted(listing.maps, key=lambda ssh_map: bool(ssh_map.places)))
-    listed = replace(sharing.backbone(proven=listing.complete is True), drives=listing.drives)
-    shared = listed
-    if listing.backbone and listing.complete is False:
-        shared = replace(listing.backbone, drives=listing.drives)
-    _check_backbone(shared, listed, listing)
+    shared, listed = _backbones(listing)
+    # Ask which steps the maps group differently, and how the answers depend on each other.
     asked = questions_of(
         table, listing.maps, same_places=bool(listed.places and not listed.places.sometimes)
     )
@@ -288,6 +282,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     ]
     options = [options_of([a.column for a in choice], len(table)) for choice in choices]
     of_choice, together = _depending(asked, options, table)
+    # Count what the maps have.
     fits = [ssh_map.fit.chi2 for ssh_map in listing.maps if ssh_map.fit]
     sizes = Counter((len(m.dstates), len(m.places), len(m.paths)) for m in listing.maps)
     faults = {m.faults for m in listing.maps}
@@ -309,6 +304,21 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
         others=_others(listing, listing_there) if listing_there else None,
         by_cost=listing.weighed is not None,
     )
+
+
+def _backbones(listing: Listing) -> tuple[Backbone, Backbone]:
+    """Find what all minimal maps share, as far as it is known, and what the listed maps share.
+
+    They differ only if the list is not complete. Raises MapError if they contradict each other.
+    """
+    # If some maps have no places, only dstates are compared. The first map decides about that.
+    sharing = Sharing(sorted(listing.maps, key=lambda ssh_map: bool(ssh_map.places)))
+    listed = replace(sharing.backbone(proven=listing.complete is True), drives=listing.drives)
+    if not listing.backbone or listing.complete is not False:
+        return listed, listed
+    shared = replace(listing.backbone, drives=listing.drives)
+    _check_backbone(shared, listed, listing)
+    return shared, listed
 
 
 def _depending(
@@ -367,8 +377,6 @@ def _others(here: Listing, there: Listing) -> Others:
 
 def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> None:
     """Raise MapError if the backbone contradicts the listed maps."""
-    if shared is listed:
-        return
     for sort, claimed in shared.sorts.items():
         seen = listed.sorts.get(sort)
         # Steps of one dstate share a number even if they are along no path in these maps.
