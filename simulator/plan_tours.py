@@ -63,6 +63,7 @@ def tour(
     that it faces, is "around".
 
     Args:
+        plan: The floor plan.
         steps: Number of actions.
         seed: Seed of the drive and of the noise.
         odometry: Noise of the displacements, which the trace also states; None for exact

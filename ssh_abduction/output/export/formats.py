@@ -53,6 +53,7 @@ def export_map(
     place and a heading). Otherwise positions are computed by a layout; nav2 and tmap2 files say so.
 
     Args:
+        ssh_map: The map.
         to: The format: "nav2", a route graph of Nav2 (GeoJSON); "tmap2", a topological map of
             LCAS's topological_navigation (YAML); "graphml"; "dot", for Graphviz; "svg", a picture;
             or "networkx-json", which networkx.node_link_graph reads.
