@@ -113,18 +113,18 @@ class FramedEngine:
         best = first.found
         yield best
         # Other labels with the same number of dstates may have fewer paths or places.
-        namings: list[NodeLabels] = []
-        others = self._all_with_paths(best.cost[0], besides=first.naming.labels)
-        for other in chain([first.naming], others):
+        kept: list[NodeLabels] = []
+        others = self._all_with_paths(best.cost[0], besides=first.node_labels.labels)
+        for other in chain([first.node_labels], others):
             control = other.control or self._fitting.control(other.chart, other.labels)
-            naming = replace(other, control=control)
-            for found in self._fitting.better(naming):
+            node_labels = replace(other, control=control)
+            for found in self._fitting.better(node_labels):
                 if found.cost < best.cost:
-                    best, namings = found, []
+                    best, kept = found, []
                     yield best
             if found.cost == best.cost:
-                namings.append(naming if len(namings) < KEPT else replace(naming, control=None))
-        self._best = best.cost, namings
+                kept.append(node_labels if len(kept) < KEPT else replace(node_labels, control=None))
+        self._best = best.cost, kept
 
     def _first_with_paths(self) -> Fitted | None:
         """Find a smallest map of the prefix, and its labels; None if the prefix has no map."""
@@ -145,8 +145,8 @@ class FramedEngine:
         mode = listing(cost)
         found = (
             found
-            for naming in self._namings_of_cost(cost)
-            for found in self._fitting.maps(naming, mode)
+            for node_labels in self._labels_of_cost(cost)
+            for found in self._fitting.maps(node_labels, mode)
         )
         yield from islice(found, enough or None)
 
@@ -155,9 +155,9 @@ class FramedEngine:
         if not self._framed:
             return
         mode = listing(cost)
-        yield from (self._fitting.settled(name, mode) for name in self._namings_of_cost(cost))
+        yield from (self._fitting.settled(name, mode) for name in self._labels_of_cost(cost))
 
-    def _namings_of_cost(self, cost: tuple[int, ...]) -> Iterator[NodeLabels]:
+    def _labels_of_cost(self, cost: tuple[int, ...]) -> Iterator[NodeLabels]:
         """Yield the known labels of maps of this cost; if none are known, search for all."""
         if self._best and self._best[0] == cost:
             return iter(self._best[1])
@@ -178,7 +178,7 @@ class FramedEngine:
             lambda: self._visits.all_of(dstates), why_not, self._refuse, key=tuple, known=known
         )
         for labels in every:
-            yield fitted.pop(tuple(labels)).naming
+            yield fitted.pop(tuple(labels)).node_labels
 
     def _refuse(self, labels: Sequence[int]) -> None:
         """Give clingo rules that exclude these labels (dstates of steps), as no paths fit them."""

@@ -46,10 +46,10 @@ class NodeLabels:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A map (`found`), and the dstate of each step (`naming`)."""
+    """A map (`found`), and the dstate of each step (`node_labels`)."""
 
     found: Found
-    naming: NodeLabels
+    node_labels: NodeLabels
 
 
 class FramedPaths:
@@ -66,39 +66,39 @@ class FramedPaths:
 
     def some(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
         """Find a map with these dstates, as `Fitted`; None if no paths fit them."""
-        naming = NodeLabels(chart, list(labels), self.control(chart, labels))
-        found = next(self.maps(naming, "ignore"), None)
-        return Fitted(found, naming) if found else None
+        node_labels = NodeLabels(chart, list(labels), self.control(chart, labels))
+        found = next(self.maps(node_labels, "ignore"), None)
+        return Fitted(found, node_labels) if found else None
 
-    def better(self, naming: NodeLabels) -> Iterator[Found]:
+    def better(self, node_labels: NodeLabels) -> Iterator[Found]:
         """Yield maps with these dstates, none more expensive than the one before.
 
         The last map is the best one. There is none if no paths fit. If improving the maps takes
         many conflicts, clingo raises the lower bound instead (`usc`).
         """
         if len(self.task.theory.priorities) == 1:
-            yield from self.maps(naming, "ignore")
+            yield from self.maps(node_labels, "ignore")
             return
-        proven = yield from self.maps(naming, "opt", BETTERING)
+        proven = yield from self.maps(node_labels, "opt", BETTERING)
         if not proven:
-            control = self.control(naming.chart, naming.labels, ["--opt-strategy=usc"])
-            yield from self.maps(replace(naming, control=control), "opt")
+            control = self.control(node_labels.chart, node_labels.labels, ["--opt-strategy=usc"])
+            yield from self.maps(replace(node_labels, control=control), "opt")
 
     def maps(
-        self, naming: NodeLabels, mode: str, conflicts: int = -1
+        self, node_labels: NodeLabels, mode: str, conflicts: int = -1
     ) -> Generator[Found, None, bool]:
         """Yield maps with these dstates, as `maps_of_labels` does."""
-        reader, theory = self._reader(naming), self.task.theory
+        reader, theory = self._reader(node_labels), self.task.theory
         return (yield from maps_of_labels(self._asker, reader, theory, mode, conflicts))
 
-    def settled(self, naming: NodeLabels, mode: str) -> Settled:
+    def settled(self, node_labels: NodeLabels, mode: str) -> Settled:
         """Prepare questions about the best maps with these dstates. `mode` is clingo's opt-mode."""
-        return Settled(self._asker, self._reader(naming), mode)
+        return Settled(self._asker, self._reader(node_labels), mode)
 
-    def _reader(self, naming: NodeLabels) -> path_reader.PathReader:
+    def _reader(self, node_labels: NodeLabels) -> path_reader.PathReader:
         """Make a reader of the places and paths that fit these dstates."""
-        chart, labels = naming.chart, naming.labels
-        control = naming.control or self.control(chart, labels)
+        chart, labels = node_labels.chart, node_labels.labels
+        control = node_labels.control or self.control(chart, labels)
         return path_reader.PathReader(control, self.task.trace, self.task.theory, chart, labels)
 
     def control(
