@@ -211,7 +211,7 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
             if "planar" in on and not _is_planar(labels, places, links, headings, theory):
                 continue
             for courses in _courses(places, links, on):
-                if "path_on_one_floor" in on and not _paths_stay(trace, labels, places, courses):
+                if "path_in_one_piece" in on and not _paths_stay(trace, labels, places, courses):
                     continue
                 if headings and not any(
                     _goes_straight(labels, places, courses, h, on) for h in headings

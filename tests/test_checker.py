@@ -181,7 +181,7 @@ BROKEN = {
     "one_pose": case(TOPOLOGICAL, SPUN, "0 0", "0"),
     "closure": case(TOPOLOGICAL, SHIFTED, "0 0", "0"),
     "other_floor": case(TOPOLOGICAL, written("a U b"), "0 1", "0 0"),
-    "path_on_one_floor": case(
+    "path_in_one_piece": case(
         TOPOLOGICAL, written("a T b U c T d"), "0 1 2 3", "0:0+ 1:0+ 2:0+ 3:0+", "0123"
     ),
     "one_star": case(

@@ -277,7 +277,7 @@ def test_simulator_refuses_wrong_lifts(tmp_path: Path) -> None:
         simulate(replace(tower, angles="any"))
 
 
-@pytest.mark.parametrize("without", [(), ("path_on_one_floor",)])
+@pytest.mark.parametrize("without", [(), ("path_in_one_piece",)])
 def test_route_changes_floors_by_the_lift_only(without: tuple[str, ...]) -> None:
     """If a path may lead on at the other floor, nobody can travel along it."""
     ssh_map = solve(SHAFT, Theory(without=without)).maps[0]

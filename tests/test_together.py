@@ -252,6 +252,21 @@ def test_drives_without_common_views_are_pieces(
         Solution.from_dict(data)
 
 
+def test_path_is_in_one_piece_of_the_map() -> None:
+    """Two corridors that share no place are two paths, although one path would be fewer."""
+    here, there = (
+        Trace.from_steps(views, ["travel"] * 2, displacements=[(2, 0, 0)] * 2, name=views)
+        for views in ("abc", "xyz")
+    )
+    with pytest.warns(UserWarning, match="no view in common"):
+        solutions = solve([here, there]), solve(there, onto=solve(here))
+    for solution in solutions:
+        assert sorted(path.order for path in solution[0].paths) == [(0, 1, 2), (3, 4, 5)]
+    free = Theory(without=["path_in_one_piece"])
+    with pytest.warns(UserWarning, match="no view in common"):
+        assert len(solve([here, there], free)[0].paths) == 1
+
+
 def test_solve_together_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = [str(tmp_path / f"{trace.name}.jsonl") for trace in (MONDAY, TUESDAY)]
     for trace, file in zip((MONDAY, TUESDAY), files, strict=True):

@@ -50,8 +50,8 @@ def other_floor(m: Reading) -> Found:
             )
 
 
-def path_on_one_floor(m: Reading) -> Found:
-    """Check that each path is on one floor."""
+def path_in_one_piece(m: Reading) -> Found:
+    """Check that each path is on one floor, and in one piece of the map."""
     floor = m.once(floors_of)
     for h, there in m.along.items():
         first, *others = there.values()
@@ -59,7 +59,8 @@ def path_on_one_floor(m: Reading) -> Found:
             if floor[s] != floor[first]:
                 yield (
                     m.steps_of(first, s),
-                    f"Dstates {first} and {s} are along path {h}, but on different floors.",
+                    f"Dstates {first} and {s} are along path {h}, but no places and no links "
+                    "without lifts connect them.",
                 )
                 break
 
@@ -270,5 +271,5 @@ def _may_show_the_same(one: Star, other: Star) -> bool:
 
 AXIOMS: dict[str, Check] = {
     check.__name__: check
-    for check in (one_star, asserted, closure, one_pose, other_floor, path_on_one_floor, planar)
+    for check in (one_star, asserted, closure, one_pose, other_floor, path_in_one_piece, planar)
 }

@@ -1,6 +1,6 @@
 """Floors: which parts of a map lifts and stairs connect.
 
-A *stretch* is the steps between two lifts of a drive. All steps of a stretch are on one floor. Two
+A *stretch* is the steps of a drive between two lifts. All steps of a stretch are on one floor. Two
 stretches with a dstate or a place in common are on one floor.
 
 >>> from ssh_abduction import Trace, solve

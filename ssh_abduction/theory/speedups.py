@@ -299,7 +299,7 @@ TABLE = (
             SURVIVE_A_CUT
             | {f"{axiom}, excusable" for axiom in SURVIVE_A_CUT}
             | {f"the field {kind}" for kind in EXCUSED}
-            | {"path_on_one_floor"}
+            | {"path_in_one_piece"}
         ),
     ),
     Speedup(
@@ -383,7 +383,10 @@ TABLE = (
         "all old steps.",
         lambda theory: not theory.has_faults,
         ONE_OF_EACH,
-        lambda: (SURVIVE_A_CUT | GATEWAYS | {"the field unknown_views"}) - {"one_pose", "closure"},
+        lambda: (
+            (SURVIVE_A_CUT | GATEWAYS | {"path_in_one_piece", "the field unknown_views"})
+            - {"one_pose", "closure"}
+        ),
     ),
     Speedup(
         "framing",

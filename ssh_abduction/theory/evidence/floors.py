@@ -1,6 +1,6 @@
 """Lifts as evidence: a lift leads to another floor.
 
-A *stretch* is the steps between two lifts of a drive. The stretches before and after a lift are on
+A *stretch* is the steps of a drive between two lifts. The stretches before and after a lift are on
 different floors. So no two of their steps are at one place. Two stretches are on one floor if they
 have a dstate or a place in common, or if other stretches connect them in this way.
 """

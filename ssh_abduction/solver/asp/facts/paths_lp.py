@@ -113,12 +113,12 @@ def settled_facts(
 
 
 def stretch_facts(trace: Trace, theory: Theory, labels: Iterable[int]) -> str:
-    """Return the facts that say on which stretch, between two rides in lifts, each dstate is.
+    """Return the facts that say on which stretch each dstate is: which drive, between which lifts.
 
-    There are none if the theory lets a path lead to another floor. `labels` has the dstate of each
+    There are none if a path may be in several pieces. `labels` has the dstate of each
     of the first steps, or of all.
     """
-    if "path_on_one_floor" not in theory.axioms:
+    if "path_in_one_piece" not in theory.axioms:
         return ""
     pairs = dict.fromkeys(zip(labels, stretches_of(trace), strict=False))
     return "\n".join(f"stretch({label},{stretch})." for label, stretch in pairs)

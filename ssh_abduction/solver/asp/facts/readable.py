@@ -90,7 +90,7 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
     facts += [f"act({t},{constant(action.name)})." for t, action in done.items()]
     facts += [f"unlinked({t})." for t, action in done.items() if action.slipped]
     facts += _fault_facts(problem, start, stop, done)
-    if theory.lifts:
+    if theory.lifts or theory.several_drives:
         stretches = stretches_of(trace)
         facts += [f"stretch({t},{stretches[t]})." for t in range(start, stop)]
         facts += [f"lifted({t + 1})." for t, action in done.items() if action.changes_floor]
