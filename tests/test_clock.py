@@ -19,6 +19,7 @@ from ssh_abduction.solver import Status, candidates, fallback
 from ssh_abduction.solver.geometry import ranking
 from ssh_abduction.solver.geometry.fit import fit
 from ssh_abduction.solver.guesses.tree import Sketch
+from ssh_abduction.solver.guesses.voting import Merging
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.theory.evidence import Planar
@@ -71,6 +72,8 @@ GATEWAYS = Trace.from_steps(
 )
 IN_TOLERANCE = settle(GATEWAYS).theory
 MAP = sketched(DRIVEN, USED)
+UNLIKE = Trace.from_steps("abc", ["travel"] * 2, stars=[[1, 0, 0, 0], [1, 0, 1, 0], [0, 0, 1, 0]])
+SEEN = settle(UNLIKE, Theory(misread=1.5)).theory
 
 LONG: dict[str, Callable[[], object]] = {
     "checker": lambda: check(DRIVEN, MAP, USED),
@@ -82,6 +85,7 @@ LONG: dict[str, Callable[[], object]] = {
     ).refusal(MAP),
     "crossings": lambda: Planar.of(PLANAR).refuse(RING, solve(RING, max_maps=1).maps[0]),
     "fit": lambda: fit(DRIVEN, MAP),
+    "merging": lambda: Merging(UNLIKE, SEEN, Problem.of(UNLIKE, SEEN).pairs).merge(),
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -210,6 +211,17 @@ def test_jacobian_of_the_fit_equals_finite_differences(data: st.DataObject) -> N
     unknown = problem._begun() + 0.01 * rng.normal(size=problem._size)
     numeric = approx_fprime(unknown, problem._residuals, 1e-7)
     assert problem._jacobian(unknown).toarray() == pytest.approx(numeric, abs=2e-3)
+
+
+def test_long_drive_without_returns_fits_exactly() -> None:
+    """Turns are a hundred times as exact as travels. That makes the equations stiff."""
+    chance = random.Random(0)
+    moves = [((10, 0.3, 0.05), (0, 0, chance.choice([1.6, -1.6])))[t % 2] for t in range(200)]
+    odometry = Odometry(along=0.05, across=0.005, heading=0.002, turning=0, position=0, angle=0)
+    trace = Trace.from_steps(
+        "a" * 201, ["travel", "left"] * 100, displacements=moves, odometry=odometry
+    )
+    assert Poses(trace, range(201), range(201)).misfit() < 1e-9
 
 
 def test_least_squares_find_the_smallest_solution() -> None:

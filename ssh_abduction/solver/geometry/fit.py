@@ -57,7 +57,7 @@ SWEEPS, HELD = 20, 1e-2
 # Levenberg-Marquardt: the least and the highest damping, and the most rounds. It ends if a round
 # lowers the sum of squares by less than the share STILL, or NEARLY for a hypothesis. HELD_STILL is
 # a weight that keeps poses in place if no equation determines them.
-LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-9, 1e8, 100, 1e-10, 1e-4
+LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-12, 1e8, 100, 1e-10, 1e-4
 HELD_STILL = 1e-9
 
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace, View
-from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.clock import each_looking, look_at_clock
 from ssh_abduction.solver.steps.chart import QUARTERS
 from ssh_abduction.theory.pairs import Pairs, pairs_in
 from ssh_abduction.theory.theory import Theory
@@ -106,7 +106,9 @@ class Merging:
         """Merge groups of visits while this lowers the total cost, the largest gain first."""
         while True:
             waiting = [
-                (-gain, pair) for pair in self._candidates() if (gain := self._gain(*pair)[0]) > 0
+                (-gain, pair)
+                for pair in each_looking(self._candidates())
+                if (gain := self._gain(*pair)[0]) > 0
             ]
             heapq.heapify(waiting)
             if not waiting:
