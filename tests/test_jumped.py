@@ -116,6 +116,13 @@ def test_carried_robot_finds_its_circuit_again() -> None:
     assert check(trace, solution.maps[0], solution.theory) == ()
 
 
+def test_displacements_that_may_be_wrong_exclude_no_pair() -> None:
+    """The best map joins steps that the wrong displacement takes far apart."""
+    solution = solve(circuit(7, (5,)), Theory(jumped=0.5), time_limit=20)
+    assert solution.maps[0].faults
+    assert solution.effort.evidence["displacement"]["pairs"] == 0
+
+
 @pytest.mark.slow
 def test_speedups_do_not_change_maps_with_jumps() -> None:
     trace, solution = circuit(18, (9,)), carried()

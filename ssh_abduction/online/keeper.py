@@ -207,6 +207,7 @@ class MapKeeper:
                 evidence=said_by(
                     self._problem.evidence,
                     self.trace,
+                    self.theory,
                     {name: said["refused"] for name, said in asked.effort.evidence.items()},
                 ),
             ),

@@ -71,7 +71,7 @@ class Answer:
                 parts.engine.size,
                 seconds,
                 asker.grounding if grounding is None else grounding,
-                said_by(kinds, task.trace, known.refused),
+                said_by(kinds, task.trace, task.theory, known.refused),
             ),
             stopped=known.stopped,
             partial=None if known.best else known.partial,

@@ -63,16 +63,17 @@ def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidenc
 
 
 def said_by(
-    kinds: Iterable[Evidence], trace: Trace, refused: Mapping[str, int]
+    kinds: Iterable[Evidence], trace: Trace, theory: Theory, refused: Mapping[str, int]
 ) -> dict[str, dict[str, int]]:
     """For each kind of evidence, count the pairs of steps and sets of equalities that it excluded.
 
     For each name of a kind, "pairs" is the number of pairs of steps that are different dstates,
-    and "refused" is the number of rejected sets, which is taken from `refused`.
+    and "refused" is the number of rejected sets, which is taken from `refused`. As in `pairs_of`,
+    evidence that may be wrong excludes no pair.
     """
     return {
         kind.name: {
-            "pairs": sum(map(len, kind.pairs(trace).apart.values())),
+            "pairs": sum(map(len, pairs_of(trace, theory, [kind]).apart.values())),
             "refused": refused.get(kind.name, 0),
         }
         for kind in kinds
