@@ -22,6 +22,8 @@ from ssh_abduction.checker import check
 from ssh_abduction.checker.crossings import Edges
 from ssh_abduction.data.maps import DState
 from ssh_abduction.solver import Status, choosing, prefixes
+from ssh_abduction.solver.guesses.gated import sketches_of
+from ssh_abduction.solver.guesses.mended import first_contradiction
 from ssh_abduction.theory.evidence import Equality, Planar
 from ssh_abduction.theory.planarity import can_be_drawn, is_planar
 from ssh_abduction.theory.settle import settle
@@ -324,6 +326,16 @@ def test_planar_map_cut_to_a_prefix_stays_planar() -> None:
             for steps in range(1, len(trace)):
                 labels = ssh_map.labels[:steps]
                 assert Planar.of(theory).refuse(trace, SSHMap(labels, ssh_map.dstates, ())) is None
+
+
+@pytest.mark.parametrize("stars", [None, [(0, 0, 0, 1), (0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0)]])
+def test_maps_made_without_a_search_are_planar(stars: list[object] | None) -> None:
+    """The way back through one gateway must lead to the place from which the robot came."""
+    trace = Trace.from_steps("abcd", ["travel", "around", "travel"], stars=stars)
+    theory = settle(trace, Theory(planar=True)).theory
+    for sketch in sketches_of(trace.steps[0], theory):
+        assert first_contradiction(sketch, trace) is None
+        assert check(trace, sketch.map(), theory) == ()
 
 
 @settings(max_examples=5)

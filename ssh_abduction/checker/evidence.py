@@ -13,7 +13,7 @@ from ssh_abduction.checker.moves import MapLink, heading_of
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.stars import stars_of
 from ssh_abduction.data.closure import Closure, match_in_words
-from ssh_abduction.data.groups import parts
+from ssh_abduction.data.groups import minimal_part, parts
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.star import Star
 
@@ -235,9 +235,7 @@ def planar(m: Reading) -> Found:
     if not cross(kept):
         return
     # report only travels that are needed for the crossing
-    for t in list(kept):
-        if cross(fewer := [other for other in kept if other is not t]):
-            kept = fewer
+    kept = [] if cross([]) else minimal_part(cross, kept)
     ways = ", ".join(f"{t.source.place} to {t.target.place} (step {t.step})" for t in kept)
     yield (
         [step for t in kept for step in t.steps],

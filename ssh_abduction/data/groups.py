@@ -14,6 +14,7 @@ from typing import Generic, TypeVar
 Node = TypeVar("Node", bound=Hashable)
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
+Member = TypeVar("Member")
 
 
 def gathered(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
@@ -113,3 +114,27 @@ class NodeClasses(Generic[Node]):
     def are_one(self, first: Node, second: Node) -> bool:
         """Whether two nodes are in one class."""
         return self.of(first) == self.of(second)
+
+
+def minimal_part(suffices: Callable[[list[Member]], bool], members: list[Member]) -> list[Member]:
+    """Find a minimal subset of the members for which `suffices` is true.
+
+    It has to be true for all members. If it is true for a set, it has to be true for each larger
+    set.
+
+    Reference:
+        Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained
+        problems".
+    """
+
+    def needed(kept: list[Member], is_new: bool, rest: list[Member]) -> list[Member]:
+        if is_new and suffices(kept):
+            return []
+        if len(rest) == 1:
+            return rest
+        first, second = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+        of_second = needed(kept + first, True, second)
+        of_first = needed(kept + of_second, bool(of_second), first)
+        return of_first + of_second
+
+    return needed([], False, members)

@@ -21,9 +21,8 @@ from __future__ import annotations
 from collections.abc import Collection, Hashable, Iterable, Sequence
 from typing import TypeAlias
 
-from ssh_abduction.data.groups import NodeClasses, numbered
+from ssh_abduction.data.groups import NodeClasses, minimal_part, numbered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.geometry.equations import Equations
 from ssh_abduction.solver.geometry.fit import Array, Poses
 from ssh_abduction.solver.values import Cost, nats_of

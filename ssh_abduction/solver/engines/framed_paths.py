@@ -16,11 +16,11 @@ from __future__ import annotations
 from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from ssh_abduction.data.groups import minimal_part
 from ssh_abduction.solver.asp.control import Asker, Control
 from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp
 from ssh_abduction.solver.engines.base import BETTERING, Found, Task, maps_of_labels
 from ssh_abduction.solver.engines.doubts import Settled
-from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.steps.apart import pairwise_distinct
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality

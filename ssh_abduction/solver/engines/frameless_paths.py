@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 import clingo
 
+from ssh_abduction.data.groups import minimal_part
 from ssh_abduction.solver.asp.control import Asker, Control
 from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp, sides_lp
 from ssh_abduction.solver.asp.facts.atoms import number_symbols
@@ -25,7 +26,6 @@ from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.framed_paths import PREPARING
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
 from ssh_abduction.solver.engines.named_labels import NamedLabels
-from ssh_abduction.solver.engines.refusing import minimal_part
 from ssh_abduction.solver.steps.chart import Link
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality

@@ -12,7 +12,6 @@ from typing import TypeVar
 
 Answer = TypeVar("Answer")
 Reason = TypeVar("Reason")
-Member = TypeVar("Member")
 
 
 def first_accepted(
@@ -59,26 +58,3 @@ def all_accepted(
         if reason is None:
             return
         forbid(reason)
-
-
-def minimal_part(suffices: Callable[[list[Member]], bool], members: list[Member]) -> list[Member]:
-    """Find a minimal subset of the members for which `suffices` is true.
-
-    If it is true for a set, it has to be true for each larger set.
-
-    Reference:
-        Junker 2004, "QuickXplain: preferred explanations and relaxations for over-constrained
-        problems".
-    """
-
-    def needed(kept: list[Member], is_new: bool, rest: list[Member]) -> list[Member]:
-        if is_new and suffices(kept):
-            return []
-        if len(rest) == 1:
-            return rest
-        first, second = rest[: len(rest) // 2], rest[len(rest) // 2 :]
-        of_second = needed(kept + first, True, second)
-        of_first = needed(kept + of_second, bool(of_second), first)
-        return of_first + of_second
-
-    return needed([], False, members)

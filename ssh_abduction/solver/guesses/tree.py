@@ -19,8 +19,8 @@ which dstates are one.
 
 If a travel comes back to a place, but the step there contradicts what was seen there, the travel
 leads to a new place instead. If a later step contradicts a known dstate, the sketch fails. A sketch
-without `homing` never comes back to a place, unless the axiom next_place demands it. So it may
-succeed when a sketch with `homing` fails.
+without `homing` never comes back to a place, unless the theory has the axiom next_place or planar.
+So it may succeed when a sketch with `homing` fails.
 
 A sketch may have frames, numbered directions at each place, even if the theory has none. That only
 adds axioms.
@@ -80,7 +80,7 @@ class Sketch:
         first: The first step of the trace, with its view and star.
         theory: The axioms that the map obeys.
         homing: Whether a travel may lead back to the place that the robot came from. With the axiom
-            next_place it always may.
+            next_place or planar it always may, as these often demand it.
         framed: Whether places have frames even if the theory has none. Then most turns lead to
             known dstates.
 
@@ -95,7 +95,7 @@ class Sketch:
     ) -> None:
         self.labels: list[int] = []
         self._theory = theory
-        self._homing = homing or theory.next_place
+        self._homing = homing or theory.next_place or theory.planar
         self._framed = framed or theory.star == "frame"
         self._states: list[KnownDState] = []
         self._links: dict[tuple[int, str], int] = {}
