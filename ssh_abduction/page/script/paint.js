@@ -9,7 +9,7 @@ function paintFigure(figure) {
   figure.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   figure.base.replaceChildren();
   const apart = (figure.crowding ??= crowding(figure.points)) * figure.k;
-  const r = Math.min(12, Math.max(3, 0.17 * apart)); // of a place that no other one is near
+  const r = Math.min(12, Math.max(3, 0.17 * apart)); // the radius of a place that no other place is near
   figure.radius = r;
   figure.nearest ??= nearestOf(figure.points);
   const radii = new Map(
@@ -273,12 +273,12 @@ function paintMarks(figure, see, radiusAt) {
   }
 }
 
-// A point as the data of an SVG path has it.
+// Write a point as data of an SVG path.
 function point([x, y]) {
   return `${x.toFixed(1)},${y.toFixed(1)}`;
 }
 
-// An arrow at (x, y) in the direction (c, s), as the data of an SVG path has it.
+// Write an arrow at (x, y) in the direction (c, s) as data of an SVG path.
 function arrowAt(x, y, c, s, size) {
   const p = (u, v) => point([x + c * u * size - s * v * size, y + s * u * size + c * v * size]);
   return `M${p(1, 0)} L${p(-0.7, 0.75)} L${p(-0.35, 0)} L${p(-0.7, -0.75)} Z`;
