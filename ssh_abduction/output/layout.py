@@ -33,7 +33,7 @@ from ssh_abduction.output.streets import LOOSE, Point, StreetProgram, Streets
 FARTHEST = 1e7  # metres: a robot's positions are nearer than this
 GAP = 1.5  # distance in the drawing between parts of a map that nothing connects
 SAME = 1e-6  # square metres: the ends of lifts are at one position
-STOREY = 0.25  # distance between two floors, as a share of the extent of the largest one
+FLOOR_GAP = 0.25  # distance between two floors, as a share of the extent of the largest one
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ def _moves_of(
     corners = [[*zip(*(at[s] for s in part), strict=True)] for part in parts]
     boxes = [(min(xs), min(ys), max(xs), max(ys)) for xs, ys in corners]
     extent = max((max(x1 - x0, y1 - y0) for x0, y0, x1, y1 in boxes), default=0.0)
-    gap = max(STOREY * extent, least)
+    gap = max(FLOOR_GAP * extent, least)
     below = None  # the least y of the part above, where it is drawn
     for i, (part, (x0, y0, _, y1)) in enumerate(zip(parts, boxes, strict=True)):
         aside = boxes[0][0] - x0 if beside else i * gap
