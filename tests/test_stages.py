@@ -17,7 +17,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.solver import choosing, fallback, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.guesses.tree import Sketch
+from ssh_abduction.solver.guesses.sketch import Sketch
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import settle

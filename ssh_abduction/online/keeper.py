@@ -2,7 +2,7 @@
 
 A fault is a step that a map treats as wrong.
 
-A *sketch* (`solver/guesses/tree.py`) is made without a search: a step gets a new dstate (a place
+A *sketch* (`solver/guesses/sketch.py`) is made without a search: a step gets a new dstate (a place
 and a heading) unless the axioms imply at which known dstate it is. A *draft* is a sketch that
 begins with a good map of the first steps. It is used if finding a minimal map takes too long. A
 sketch that begins at the first step is mostly larger. It is used if there is no draft.

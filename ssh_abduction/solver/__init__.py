@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.front import fault_front as fault_front
     from ssh_abduction.solver.geometry.fit import fit as fit
     from ssh_abduction.solver.geometry.ranking import Ranking as Ranking
-    from ssh_abduction.solver.guesses.gated import sketch_beyond as sketch_beyond
-    from ssh_abduction.solver.guesses.gated import sketches_of as sketches_of
-    from ssh_abduction.solver.guesses.tree import Sketch as Sketch
+    from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond as sketch_beyond
+    from ssh_abduction.solver.guesses.gateway_sketch import sketches_of as sketches_of
+    from ssh_abduction.solver.guesses.sketch import Sketch as Sketch
     from ssh_abduction.solver.judging import InternalError as InternalError
     from ssh_abduction.solver.judging import Judging as Judging
     from ssh_abduction.solver.obeying import obeyed as obeyed

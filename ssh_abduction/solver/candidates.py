@@ -23,10 +23,10 @@ from ssh_abduction.solver import choosing
 from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.asp.limits import LimitError, Watch, processor_clock
 from ssh_abduction.solver.engines.base import Found, Task
-from ssh_abduction.solver.guesses.gated import sketch_beyond, sketches_of
+from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond, sketches_of
 from ssh_abduction.solver.guesses.mended import first_contradiction, mended_sketch
 from ssh_abduction.solver.guesses.separate import has_no_frames, separate_map
-from ssh_abduction.solver.guesses.tree import Sketch
+from ssh_abduction.solver.guesses.sketch import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
@@ -82,7 +82,7 @@ class Candidates:
 
         Later calls return the same beam, which goes on where it stopped. None without the speed-up
         `greedy`, if the trace is long, or if the checker cannot check all axioms. Also None
-        if the trace has neither displacements nor stars at any angles, as `guesses/tree.py` makes
+        if the trace has neither displacements nor stars at any angles, as `guesses/sketch.py` makes
         better maps then.
         """
         theory = self._task.theory

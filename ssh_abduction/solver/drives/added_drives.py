@@ -39,7 +39,7 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.choosing import READABLE
 from ssh_abduction.solver.drives.digest import Digest
 from ssh_abduction.solver.drives.laying import can_lay, laid, unproven
-from ssh_abduction.solver.guesses.gated import sketch_beyond
+from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond
 from ssh_abduction.solver.guesses.mended import first_contradiction
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.obeying import obeyed, with_names

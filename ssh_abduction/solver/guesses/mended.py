@@ -27,8 +27,8 @@ from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.runtime.clock import each_looking
-from ssh_abduction.solver.guesses.gated import sketches_of
-from ssh_abduction.solver.guesses.tree import Sketch
+from ssh_abduction.solver.guesses.gateway_sketch import sketches_of
+from ssh_abduction.solver.guesses.sketch import Sketch
 from ssh_abduction.solver.steps.chart import QUARTERS
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.theory.theory import Theory

@@ -16,8 +16,8 @@ each direction of a path. A path may become known late: if a robot turns around 
 then travels, all these turns are on the path of the travel.
 
 All travels lead to new places unless they repeat a link. So the places and paths make a tree, as in
-`guesses/tree.py`, and the axioms of order and sides hold. The claim needs axioms that are universal
-and places without frames. The caller checks the map in any case.
+`guesses/sketch.py`, and the axioms of order and sides hold. The claim needs axioms that are
+universal and places without frames. The caller checks the map in any case.
 """
 
 from __future__ import annotations

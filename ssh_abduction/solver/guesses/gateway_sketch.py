@@ -1,7 +1,7 @@
 """Sketches (maps without a search) of traces whose stars have any number of gateways.
 
 >>> from ssh_abduction import Theory, Trace
->>> from ssh_abduction.solver.guesses.gated import sketches_of
+>>> from ssh_abduction.solver.guesses.gateway_sketch import sketches_of
 >>> from ssh_abduction.theory.settle import settle
 >>> there_and_back = ["travel", "around", "travel"]
 >>> ends = [[0], [180], [0], [180]]
@@ -35,7 +35,7 @@ from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.rotations import leads
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solver.guesses.tree import Contradiction, KnownDState, Sketch
+from ssh_abduction.solver.guesses.sketch import Contradiction, KnownDState, Sketch
 from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
 
