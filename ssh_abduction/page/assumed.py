@@ -75,20 +75,22 @@ def assumptions(
         return known
     # Then find, pair by pair, the cost of the best map that has the opposite.
     for pair, one in left:
-        if (rest := end - time.monotonic()) <= 0:
-            break
-        field = "different" if one else "same"
-        found = solve(
-            trace,
-            theory.replace(**{field: (*getattr(theory, field), pair)}),
-            time_limit=rest,
-            max_maps=1,
-        )
-        if found.status is Status.OPTIMAL:
-            tell(pair, one, Side(possible=True, cost=found.cost, proven=True))
-        elif found.status is Status.UNSATISFIABLE:
-            tell(pair, one, Side(possible=False))
+        rest = end - time.monotonic()
+        if rest > 0 and (lost := _with_opposite(trace, theory, pair, one, rest)):
+            tell(pair, one, lost)
     return known
+
+
+def _with_opposite(
+    trace: Trace, theory: Theory, pair: Pair, one: bool, seconds: float
+) -> Side | None:
+    """Find the cost of the maps in which a pair is not `one` dstate, or is; None if not in time."""
+    field = "different" if one else "same"
+    asserted = theory.replace(**{field: (*getattr(theory, field), pair)})
+    found = solve(trace, asserted, time_limit=seconds, max_maps=1)
+    if found.status is Status.OPTIMAL:
+        return Side(possible=True, cost=found.cost, proven=True)
+    return Side(possible=False) if found.status is Status.UNSATISFIABLE else None
 
 
 def _agreed(labels: list[tuple[int, ...]], steps: int) -> Iterator[tuple[Pair, bool]]:
