@@ -77,7 +77,7 @@ class Light:
     def on(self, normals: Array) -> Array:
         """Compute the relative brightness of walls from the directions that they face, in radians.
 
-        It is 1 for a wall at a right angle to the direction of the sun.
+        It is 1 for a wall that faces at a right angle to the direction of the sun.
         """
         return 1 + self.share * np.cos(normals - self.azimuth)
 

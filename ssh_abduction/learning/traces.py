@@ -96,7 +96,10 @@ class Traces:
 
     @property
     def joint(self) -> Trace:
-        """The traces as drives of one joint trace, without images. Raises TraceError."""
+        """The traces as drives of one joint trace, without images. Raises TraceError.
+
+        A single trace is returned as it is.
+        """
         if len(self.each) == 1:
             return self.each[0]
         names = [trace.name or "" for trace in self.each]

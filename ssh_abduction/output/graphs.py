@@ -180,8 +180,8 @@ def to_pandas(ssh_map: SSHMap) -> pd.DataFrame:
     """Make a table with a row for each step of the trace that was mapped.
 
     Returns:
-        A table with the columns dstate, view, place, path, direction and heading. If the map has
-        poses, also x and y (metres) and pose_heading (radians). If it has names, also place_name.
+        A table with the columns dstate, view, place, path, direction, heading and floor. If the map
+        has poses, also x and y (metres) and pose_heading (radians). If it has names, also place_name.
         The index is named step.
 
     Raises:

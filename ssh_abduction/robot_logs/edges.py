@@ -78,7 +78,10 @@ def _apart(one: Array, other: Array, loop: bool) -> float:
 
 
 def _laid(trace: Trace, ssh_map: SSHMap, t: int) -> Array:
-    """The course of the travel from step t in the frame of the map: (n, 2) metres."""
+    """The course of the travel from step t in the frame of the map: (n, 2) metres.
+
+    It is the origin alone if the map has no poses.
+    """
     if ssh_map.fit is None or not ssh_map.fit.poses:
         return np.zeros((1, 2))
     here, there = (ssh_map.fit.poses[ssh_map.dstate_at[k]] for k in (t, t + 1))
