@@ -181,8 +181,8 @@ def to_pandas(ssh_map: SSHMap) -> pd.DataFrame:
 
     Returns:
         A table with the columns dstate, view, place, path, direction, heading and floor. If the map
-        has poses, also x and y (metres) and pose_heading (radians). If it has names, also place_name.
-        The index is named step.
+        has poses, also x and y (metres) and pose_heading (radians). If it has names, also
+        place_name. The index is named step.
 
     Raises:
         MapError: `ssh_map` is not a map, or pandas is not installed.
