@@ -139,10 +139,9 @@ def near_minimal_maps(
 ) -> dict[tuple[int, ...], set[Key]]:
     """The best maps for each number of dstates, by cost. `theory.priorities` says which are best.
 
-    within  how many dstates more than minimal maps they may have
-
-    If the theory prefers few paths or places first, these are counted instead of dstates. If it
-    prefers none of these, the number is the same for all maps.
+    A map may have up to `within` dstates more than minimal maps. If the theory prefers few paths or
+    places first, these are counted instead of dstates. If it prefers none of these, the number is
+    the same for all maps.
     """
     counted = next((name for name in theory.priorities if name != "excuses"), None)
     best: dict[int, tuple[tuple[int, ...], set[Key]]] = {}  # by that number
@@ -1067,7 +1066,7 @@ def _clockwise(order: tuple[object, ...], ends: list[tuple[int, int]]) -> bool:
 def _is_drawing(edges: set[Edge], rounds: dict[int, tuple[object, ...]]) -> bool:
     """Whether each gateway has one edge, and V - E + F = 2 for each connected part.
 
-    rounds  the gateways around each place, clockwise
+    `rounds` has the gateways around each place, clockwise.
     """
     numbered = [sorted(edge, key=repr) for edge in edges]
     ends = {(i, k): edge[k % len(edge)] for i, edge in enumerate(numbered) for k in (0, 1)}

@@ -66,8 +66,9 @@ class LeastSquares:
     def misfit(self, headings: tuple[int, ...], positions: tuple[Hashable, ...]) -> float:
         """The least chi-square.
 
-        headings   the heading of each step, numbered by first use
-        positions  the position of each heading
+        Args:
+            headings: The heading of each step, numbered by first use.
+            positions: The position of each heading.
         """
         at = {position: i for i, position in enumerate(dict.fromkeys(positions))}
         where = [at[positions[heading]] for heading in headings]
@@ -171,7 +172,9 @@ class LeastSquares:
 def layings(trace: Trace, positions: Sequence[Hashable]) -> int:
     """Count how often drives are laid on others. Drives that closures join count as one.
 
-    positions  the position of each step
+    Args:
+        trace: The trace.
+        positions: The position of each step.
     """
 
     equal = [

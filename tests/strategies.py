@@ -243,7 +243,10 @@ def theories(draw: st.DrawFn, trace: Trace, fixed: Collection[str] = ()) -> Theo
 
     Without a preference every consistent map is minimal.
 
-    fixed  fields that are left as they are in a new Theory
+    Args:
+        draw: Draws from a strategy.
+        trace: The trace.
+        fixed: Fields that are left as they are in a new Theory.
     """
     choices: dict[str, Any] = {
         f.name: draw(choices_of(f.name, trace), label=f.name)

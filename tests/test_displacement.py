@@ -51,8 +51,8 @@ def circuit(
 ) -> Trace:
     """A robot that drives along some sides of a regular polygon, clockwise. All corners look alike.
 
-    noise  standard deviations of its displacements, as a share of those that the odometry claims
-    scale, bend  errors that repeat
+    `noise` has the standard deviations of its displacements, as a share of those that the odometry
+    claims. `scale` and `bend` are errors that repeat.
     """
     rng = np.random.default_rng(seed)
     moved = []
