@@ -104,7 +104,7 @@ class LeastSquares:
             return np.concatenate(rows)
 
         random = np.random.default_rng(0)
-        starts = [self._reckoned(headings, where, len(at), len(positions), size)]
+        starts = [self._reckoned(headings, where, len(at), size)]
         starts += [starts[0] + random.normal(0, 1.5, size) for _ in range(STARTS)]
         found = [
             least_squares(off, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
@@ -147,7 +147,7 @@ class LeastSquares:
         return count
 
     def _reckoned(
-        self, headings: Sequence[int], where: Sequence[int], places: int, dstates: int, size: int
+        self, headings: Sequence[int], where: Sequence[int], places: int, size: int
     ) -> np.ndarray:
         """The initial value of each unknown: dead reckoning at its first visit."""
         unknown = np.zeros(size)

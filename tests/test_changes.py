@@ -343,7 +343,7 @@ def at_bearings(name: str, stars: list[Any]) -> Trace:
     return Trace.from_steps("abcd", ["travel", "around", "travel"], stars=stars, name=name)
 
 
-def test_change_at_a_bearing_has_a_sentence_and_a_place(tmp_path: Path) -> None:
+def test_change_at_a_bearing_has_a_sentence_and_a_place() -> None:
     """Gateways of three drives: one closes on Tuesday, and opens again on Wednesday."""
     closed = [(0, 120.5), (180,), (0,), (180, 300)]
     names = "monday", "tuesday", "wednesday"

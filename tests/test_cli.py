@@ -620,9 +620,7 @@ def test_error_is_printed_as_json(
     assert json.loads(capsys.readouterr().out)["status"] == "optimal"  # no error follows it
 
 
-def test_check_prints_violations_as_json(
-    solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_prints_violations_as_json(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["check", str(solved), ACES, "--bound", "--json"]
     assert main(words) == 0
     data = json.loads(capsys.readouterr().out)

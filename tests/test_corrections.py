@@ -274,9 +274,7 @@ def test_corrections_take_names_and_stay_with_their_steps(
         assert "did you mean pantry?" in capsys.readouterr().err
 
 
-def test_two_names_of_one_place_can_both_be_changed(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_names_of_one_place_can_both_be_changed(folder: Path) -> None:
     said = Corrections(MARKS).with_name("start", "place", "monday:0")
     save_corrections(said.with_name("end", "place", "monday:3"), folder / "building")
     assert main(["name", str(folder / "building"), "end", "exit"]) == 0
@@ -790,9 +788,7 @@ def test_opposite_correction_replaces_the_old_one(first: str, then: str, left: l
     assert said.pairs[1] in changed.pairs
 
 
-def test_corrections_of_one_command_count_in_their_order(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_corrections_of_one_command_count_in_their_order(folder: Path) -> None:
     building = str(folder / "building")
     for first, then in (("same", "different"), ("different", "same")):
         steps = "monday:1,tuesday:0"

@@ -291,7 +291,7 @@ def test_export_lays_out_maps_without_poses(to: str, level: str) -> None:
         }
 
 
-def test_causal_maps_are_exported(square: SSHMap) -> None:
+def test_causal_maps_are_exported() -> None:
     ssh_map = solve(rectangle(8), Theory.causal()).maps[0]
     assert len(nav2_graph(export_map(ssh_map, "nav2"))[0]) == len(ssh_map.dstates)
     assert len(checked_tmap2(export_map(ssh_map, "tmap2"))["nodes"]) == len(ssh_map.dstates)

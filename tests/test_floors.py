@@ -265,7 +265,7 @@ def test_signs_at_lifts_tell_three_floors_apart() -> None:
     assert len(labels) == len(ssh_map.dstates) == 60
 
 
-def test_simulator_refuses_wrong_lifts(tmp_path: Path) -> None:
+def test_simulator_refuses_wrong_lifts() -> None:
     tower = World.named("tower-2")
     with pytest.raises(SimulatorError, match="lift to 1: expected a lift of this name at"):
         simulate(tower.with_choices(route="lift to 1"))

@@ -210,7 +210,7 @@ def test_onto_without_time_keeps_the_existing_map() -> None:
     assert solution[0].dstate_at[: len(around)] == standing[0].dstate_at
 
 
-def test_onto_refuses_a_solution_without_map_or_trace(tmp_path: Path) -> None:
+def test_onto_refuses_a_solution_without_map_or_trace() -> None:
     standing = solve(MONDAY)
     for bad in (replace(standing, trace=None), replace(standing, maps=())):
         with pytest.raises(SolverError, match="onto: expected a solution with a map and its trace"):

@@ -327,7 +327,7 @@ def test_hill_climbing_keeps_errors_bounded(circuits: Trace) -> None:
     assert last.mean() < 1.5 * first.mean()
 
 
-def test_errors_grow_without_hill_climbing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_grow_without_hill_climbing() -> None:
     """The test above can fail: after two sides by dead reckoning, the corner is lost."""
     rng = np.random.default_rng(0)
     ends = []
@@ -339,7 +339,7 @@ def test_errors_grow_without_hill_climbing(monkeypatch: pytest.MonkeyPatch) -> N
     assert np.std(ends, axis=0).max() > 0.05
 
 
-def test_odometry_drifts_away_from_the_truth(circuits: Trace) -> None:
+def test_odometry_drifts_away_from_the_truth() -> None:
     rng = np.random.default_rng(0)
     robot = SimulatedRobot(Body(), (0.0, 0.0, 0.0), rng)
     for _ in range(200):

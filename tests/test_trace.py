@@ -313,9 +313,7 @@ def test_folder_and_missing_file_are_refused_as_traces(tmp_path: Path) -> None:
         Trace.load(tmp_path / "nothing")
 
 
-def test_endless_line_is_not_read_into_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_endless_line_is_not_read_into_memory(tmp_path: Path) -> None:
     """A sparse file of 1 GB stands for a line of that length."""
     path = tmp_path / "t"
     with path.open("wb") as file:

@@ -281,7 +281,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
         for choice in independent([asked[i].column for i in order])
     ]
     options = [options_of([a.column for a in choice], len(table)) for choice in choices]
-    of_choice, together = _depending(asked, options, table)
+    of_choice, together = _depending(asked, options)
     # Count what the maps have.
     fits = [ssh_map.fit.chi2 for ssh_map in listing.maps if ssh_map.fit]
     sizes = Counter((len(m.dstates), len(m.places), len(m.paths)) for m in listing.maps)
@@ -322,7 +322,7 @@ def _backbones(listing: Listing) -> tuple[Backbone, Backbone]:
 
 
 def _depending(
-    asked: Sequence[AnsweredQuestion], options: Sequence[NDArray[np.intp]], table: Table
+    asked: Sequence[AnsweredQuestion], options: Sequence[NDArray[np.intp]]
 ) -> tuple[list[dict[Matter, tuple[int, ...]]], dict[Matter, tuple[int, ...]]]:
     """Find the steps whose grouping depends on each choice alone, and on several choices."""
     of_choice: list[dict[Matter, set[int]]] = [{} for _ in options]

@@ -57,7 +57,7 @@ def report(
         _faults(solution) if solution.maps else "",
         "<h2>Settings</h2>" + _settings(run),
         "<h2>Time</h2>" + _time(run),
-        "<h2>The log</h2>" + _log(log, run),
+        "<h2>The log</h2>" + _log(log),
         "<h2>Visits</h2>" + _visits(imported, solution),
     ]
     body = "\n".join(part for part in parts if part)
@@ -184,7 +184,7 @@ def _time(run: Mapping[str, Any]) -> str:
     )
 
 
-def _log(log: RobotLog, run: Mapping[str, Any]) -> str:
+def _log(log: RobotLog) -> str:
     """List what the reader of the log noticed: its format, notes, and damaged parts."""
     said = [f"{log.source}: {log.format}, {len(log)} scans.", *log.notes]
     if log.damaged:
