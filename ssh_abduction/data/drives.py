@@ -145,11 +145,8 @@ def with_fingerprints(trace: Trace) -> tuple[Drive, ...]:
 
 def _fingerprint(steps: Sequence[Step]) -> str:
     """Return a digest, of 16 hexadecimal digits, of what the robot did and saw."""
-    lines = [
-        json_line({name: value for name, value in step.to_json().items() if name in _MARKED})
-        for step in steps
-    ]
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+    marked = ({k: v for k, v in step.to_json().items() if k in _MARKED} for step in steps)
+    return hashlib.sha256("\n".join(map(json_line, marked)).encode()).hexdigest()[:16]
 
 
 def step_named(trace: Trace, name: str) -> int:
@@ -332,9 +329,11 @@ def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
 
 
 def _recorded(trace: Trace) -> Iterator[tuple[str, tuple[Step, ...]]]:
-    """Yield the name and the steps of each drive, as in a trace of its own without corrections."""
+    """Yield the name and steps of each drive, as recorded, without truth and images of views."""
+    seen = (step.as_seen() for step in trace.steps)
+    bare = [replace(s, truth=None, image=s.image if s.view is None else None) for s in seen]
     for drive in drives_of(trace):
-        first, *steps = (step.as_seen() for step in trace.steps[drive.first : drive.stop])
+        first, *steps = bare[drive.first : drive.stop]
         *steps, last = replace(first, displacement=None, covariance=None), *steps
         yield drive.name, (*steps, replace(last, action=None))
 
