@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import combinations, pairwise, product
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Literal
 from unittest.mock import Mock, patch
 
 import pytest
@@ -564,6 +565,15 @@ def test_estimated_rivals_take_each_drive_apart() -> None:
         (0, 1, 2, 3, 4, 5, 6, 1),
         (0, 1, 2, 0, 1, 2, 3, 4),
     ]
+
+
+@pytest.mark.parametrize(("kind", "of"), [("same", "dstate"), ("same_place", "place")])
+def test_estimated_rivals_obey_the_user(kind: str, of: Literal["dstate", "place"]) -> None:
+    """Without the user, drives that look alike may share no place."""
+    drive = Trace.from_steps("aaa", ["travel"] * 2, displacements=[(10.0, 0.0, 0.0)] * 2)
+    joint = together([drive, replace(drive, odometry=Odometry(along=0.1))])
+    solution = solve(joint, Theory().replace(**{kind: [(0, 3)]}))
+    assert solution.probability(0, 3, of=of) == 1.0
 
 
 def test_estimated_rivals_of_causal_maps_are_deterministic() -> None:

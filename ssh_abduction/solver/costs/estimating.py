@@ -49,17 +49,24 @@ def rivals_of(
 
     `seconds` is the time that this may take. The first `kept_steps` steps keep their dstates and
     places. `estimated` says what the rivals are. Drives that closures connect to others do not
-    overlap by chance. They stay connected.
+    overlap by chance. They stay connected. So do steps that the user says are at one dstate or
+    place.
     """
-    dstate, place, _ = problem.theory.prices
+    theory = problem.theory
+    same, same_place = (theory.same, theory.same_place) if "asserted" in theory.axioms else ((), ())
+    dstate, place, _ = theory.prices
     rival = rival_of(best, misfit.nats_of(best))
     kept_labels = rival.dstates[:kept_steps], rival.places[:kept_steps]
-    kept = nats_of(replace(Cost.of(best), dstates=0, places=0), problem.theory)
+    kept = nats_of(replace(Cost.of(best), dstates=0, places=0), theory)
     drives = drives_of(problem.trace)
     free = [drive for i, drive in enumerate(drives) if not problem.overlap.is_tied(i)]
 
     def cost_of(dstates: Sequence[int], places: Sequence[int]) -> float:
-        if (dstates[:kept_steps], places[:kept_steps]) != kept_labels:
+        if (
+            (dstates[:kept_steps], places[:kept_steps]) != kept_labels
+            or any(dstates[i] != dstates[j] for i, j in same)
+            or any(places[i] != places[j] for i, j in same_place)
+        ):
             return math.inf
         nats: float = kept + misfit.nats_of_course(dstates, places or dstates, jumped(best))
         return nats + dstate * len(set(dstates)) + place * len(set(places))
