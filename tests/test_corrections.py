@@ -330,6 +330,13 @@ def test_solve_reports_corrections_that_contradict_the_trace(
     assert "same: monday:2" not in told
     assert main([*solving(folder), "--json"]) == 20
     assert "tuesday:1" in json.loads(capsys.readouterr().out)["corrections"][0]
+    assert main(["correct", building, "--different", "monday:1,tuesday:1"]) == 0
+    assert main(["correct", building, "--same-place", "monday:1,monday:2"]) == 0
+    assert main(["correct", building, "--elsewhere", "monday:2,tuesday:1"]) == 0
+    assert main(["correct", building, "--same-place", "monday:1,tuesday:1"]) == 0
+    assert main(solving(folder)) == 20
+    said = "it contradicts the trace, or another correction that is named here"
+    assert capsys.readouterr().out.count(said) == 2
 
 
 def test_solve_names_a_contradicting_correction_without_an_explanation(

@@ -165,8 +165,8 @@ def _refuse_bound(data: Any, resolved: Theory, solved: Theory | None) -> None:
     """Raise MapError if a clique proves no bound for these theories, or the file has none."""
     if resolved.has_faults or (solved is not None and solved.has_faults):
         raise MapError(
-            "bound: expected a theory without faults (misread, slipped), as a clique of steps "
-            "proves nothing if steps may be treated as wrong; leave out --bound"
+            "bound: expected a theory without faults (misread, slipped, jumped, changed), as a "
+            "clique of steps proves nothing if steps may be treated as wrong; leave out --bound"
         )
     if resolved.unknown_views:
         raise MapError(

@@ -137,9 +137,9 @@ class Obeying:
         said = self.corrections.known_in(drives_of(self.trace))
         source = named(said.source or "corrections")
         if explanation is None:
-            wrong = filter(self._clashes, said.pairs)
             sure = [
-                f"{source}: {pair}: it contradicts the trace{self._seen(pair)}" for pair in wrong
+                f"{source}: {pair}: it contradicts the trace{self._seen(pair)}"
+                for pair in filter(self._clashes, said.pairs)
             ]
             if sure or solution.status is not Status.UNSATISFIABLE:
                 return sure
@@ -156,10 +156,11 @@ class Obeying:
         for sentence in sentences:
             fewer = kept.without(sentence)
             kept = fewer if self._has_no_map(fewer, stretch) else kept
+        wrong = [one for one in sentences if one in kept.pairs or one in kept.gateways]
+        others = ", or another correction that is named here" if len(wrong) > 1 else ""
         return [
-            f"{source}: {sentence}: it contradicts the trace{self._seen(sentence)}"
-            for sentence in sentences
-            if sentence in kept.pairs or sentence in kept.gateways
+            f"{source}: {sentence}: it contradicts the trace{self._seen(sentence)}{others}"
+            for sentence in wrong
         ]
 
     def _clashes(self, said: Said) -> bool:
