@@ -499,6 +499,15 @@ def test_excess_of_the_misfit_lowers_confidence() -> None:
         Weighed.from_dict(read, {**less.to_dict(), "excess": 0.5}, 3)
 
 
+def test_rival_may_cost_far_less_than_the_best_map() -> None:
+    """A search that was stopped may know an estimated rival that costs a thousand nats less."""
+    rivals = Rival(5000.0, (0, 1, 0), (0, 1, 0)), Rival(4000.0, (0, 1, 2), (0, 1, 2), True)
+    weighed = Weighed(10.0, 0.0, rivals)
+    assert weighed.weights == pytest.approx([0.0, 1.0])
+    assert weighed.confidence == pytest.approx(0.0)
+    assert "steps 0 and 2" in weighed.sentence
+
+
 def test_sentence_names_the_most_probable_missed_join() -> None:
     """The best map keeps steps 1 and 3 apart, and a rival joins them."""
     best = Rival(10.0, (0, 1, 0, 2), (0, 1, 0, 2))

@@ -115,7 +115,7 @@ class Weighed:
             else self.nats - rival.nats - FITTED * (rival.estimated and not rival.places)
             for rival, way in zip(self.rivals, ways, strict=True)
         ]
-        likely = [math.exp(nats / self.excess) for nats in less]
+        likely = [math.exp(min(nats / self.excess, MOST)) for nats in less]
         return tuple(weight / sum(likely) for weight in likely)
 
     @property
