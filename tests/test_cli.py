@@ -147,6 +147,8 @@ def test_solve_without_time_prints_a_sketch_or_unknown(
     assert capsys.readouterr().out.startswith("unknown (time limit): no map of all 22 steps yet")
     assert main([*no_time, "--json"]) == 30
     assert json.loads(capsys.readouterr().out)["status"] == "unknown"
+    assert main([*no_time, "--set", "without=functional_view"]) == 30
+    assert "; no bound is proven; " in capsys.readouterr().out
 
 
 def test_solve_prints_a_map_without_proof(

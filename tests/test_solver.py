@@ -401,7 +401,11 @@ def test_solve_refuses_wrong_limits(choices: dict[str, Any], name: str) -> None:
         ({"prefer": ("dstates", "dstates")}, "prefer: expected each name once"),
         ({"prefer": ("excuses",)}, "prefer: expected boundary=defeasible with excuses, got strict"),
         ({"without": ("gravity",)}, "without: expected functional_view, deterministic, "),
-        ({"level": "causal"}, "boundary: expected none with level=causal"),
+        (
+            {"level": "causal"},
+            "boundary: expected none with level=causal, got strict; leave boundary out, and take "
+            "Theory.causal() (--theory causal)",
+        ),
         ({"next_place": 1}, "next_place: expected true or false"),
         ({"colour": "red"}, "theory: expected fields out of"),
         ({"prefer": 5}, "prefer: expected a list of names, got 5"),

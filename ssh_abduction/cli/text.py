@@ -64,8 +64,8 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     )
     if solution.cost is None:
         return (
-            f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any map has "
-            f"{bound or 'no proven bound'}; {seconds}"
+            f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; "
+            f"{_proven(bound)}; {seconds}"
         )
     counts = ", ".join(
         counted(v, k) if k != "faults" else f"faults that cost {v:g} dstates"
@@ -79,10 +79,13 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         claim = "not proven minimal" if weighed is None else "not proven to cost least"
         if weighed is not None:
             bound = f"{weighed.bound:.1f} nats or more"
-        return (
-            f"feasible{why}: {counts}, {claim}; any map has {bound or 'no proven bound'}; {seconds}"
-        )
+        return f"feasible{why}: {counts}, {claim}; {_proven(bound)}; {seconds}"
     return f"optimal: {counts}; {_number_of_maps(solution, count)}; {seconds}"
+
+
+def _proven(bound: str) -> str:
+    """Say what is proven about all maps; `bound` is empty if nothing is."""
+    return f"any map has {bound}" if bound else "no bound is proven"
 
 
 def _number_of_maps(solution: Solution, count: int) -> str:

@@ -141,12 +141,12 @@ def _check_causal(theory: Theory) -> None:
         if getattr(theory, name) not in values:
             raise TheoryError(
                 f"{name}: expected {' or '.join(values)} with level=causal, got "
-                f"{getattr(theory, name)}; take {CAUSAL}"
+                f"{getattr(theory, name)}; leave {name} out, and take {CAUSAL}"
             )
     if set(theory.prefer) - {"dstates", *AUTO}:
         raise TheoryError(
             f"prefer: expected dstates with level=causal, got {', '.join(theory.prefer)}; "
-            f"take {CAUSAL}"
+            f"leave prefer out, and take {CAUSAL}"
         )
     if theory.same_place:
         raise TheoryError(
