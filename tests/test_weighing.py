@@ -25,7 +25,7 @@ from ssh_abduction.checker import cost_claims
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.cost_claims import false_costs, misfit
 from ssh_abduction.cli import main
-from ssh_abduction.data import MapError, Odometry, SolverError, TheoryError, together
+from ssh_abduction.data import Closure, MapError, Odometry, SolverError, TheoryError, together
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.solver import Search, Status, Watch
@@ -642,6 +642,22 @@ def test_join_across_missing_displacements_needs_another_join(
     assert weighed.proven
     assert (weighed.confidence > 0.95) is confirmed
     assert ("across a missing displacement" in weighed.sentence) is not confirmed
+
+
+@pytest.mark.parametrize(("views", "is_known"), [("abcd", True), ("aaab", False)])
+def test_views_that_are_alike_do_not_replace_a_missing_displacement(
+    views: str, is_known: bool
+) -> None:
+    """A square room is driven around twice. Closures or other views say where the robot is."""
+    laps = [(10.0, 0.0, math.pi / 2)] * 8
+    trace = Trace.from_steps(
+        (views * 3)[:9], ["bend"] * 8, displacements=[*laps[:3], None, *laps[4:]]
+    )
+    closure = Closure(3, 7, (0.0, 0.0, 0.0), ((0.01, 0, 0), (0, 0.01, 0), (0, 0, 0.01)))
+    for tried, known in [(trace, is_known), (replace(trace, closures=(closure,)), True)]:
+        weighed = solve(tried, Theory.causal().replace(star="none")).weighed
+        assert weighed is not None
+        assert ("too much alike to tell where the robot was" in weighed.sentence) is not known
 
 
 @pytest.mark.parametrize("most", [1, 2, None])

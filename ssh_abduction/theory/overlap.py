@@ -51,7 +51,8 @@ class Overlap:
         """
         starts = starts_of(trace)
         self.crowded_price = theory.price_of_laying
-        self.price = self.crowded_price * (_ambiguity(trace) if theory.star == "none" else 1.0)
+        drives = (trace.views[drive.first : drive.stop] for drive in drives_of(trace))
+        self.price = self.crowded_price * (_ambiguity(drives) if theory.star == "none" else 1.0)
         self._drive = [bisect_right(starts, t) for t in range(len(trace))]
         closures = ((self._drive[c.first], self._drive[c.last]) for c in trace.closures)
         self._tied = _joined(range(len(starts) + 1), closures)  # a group for each drive
@@ -169,13 +170,25 @@ class Overlap:
         return 0.0 if groups[0] & groups[1] else self.price
 
 
-def _ambiguity(trace: Trace) -> float:
+def _ambiguity(drives: Iterable[Sequence[Hashable]]) -> float:
     """Return how many times as much laying drives on each other costs, by their views."""
-    drives = [Counter(trace.views[drive.first : drive.stop]) for drive in drives_of(trace)]
-    every = sum(drives, Counter())
-    pairs = (every.total() ** 2 - sum(drive.total() ** 2 for drive in drives)) / 2
-    alike = sum(n * n - sum(drive[view] ** 2 for drive in drives) for view, n in every.items()) / 2
+    pairs, alike = pairs_of_parts(drives)
     return max(TOLD / math.log((pairs + UNLIKE) / max(alike, 1)), 1.0)
+
+
+def pairs_of_parts(parts: Iterable[Iterable[Hashable]]) -> tuple[int, int]:
+    """Count the pairs of steps of different parts of a trace, and those that look alike.
+
+    Each part is given by the views of its steps.
+
+    >>> pairs_of_parts(["aab", "ac"])
+    (6, 2)
+    """
+    counts = [Counter(views) for views in parts]
+    every = sum(counts, Counter[Hashable]())
+    pairs = every.total() ** 2 - sum(part.total() ** 2 for part in counts)
+    alike = sum(n * n - sum(part[view] ** 2 for part in counts) for view, n in every.items())
+    return pairs // 2, alike // 2
 
 
 def groups_of(at: Iterable[Hashable], drive: Iterable[int], tied: Sequence[int]) -> int:
