@@ -17,9 +17,12 @@ from perception.places import importing
 from perception.places.following import turned_wrongly
 from perception.places.importing import import_log, tracked
 from perception.places.jumps import Unknown, describe_cuts, unknown_steps
+from perception.places.tracing import with_drives
 from perception.places.track import Track
 from perception.readers.scans import Pose, RobotLog, Scan
 from ssh_abduction.checker.checker import check
+from ssh_abduction.data import Action, Step, Trace, drives_of
+from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.solver import solve
 
@@ -88,6 +91,20 @@ def test_trace_has_no_displacement_across_a_cut(
     solution = solve(done.trace)
     assert solution.maps
     assert not check(done.trace, solution.maps[0], solution.theory)
+
+
+def test_drive_starts_at_each_part_that_closures_connect() -> None:
+    """The part of visit 2 is not connected, and visits 3 and 4 are in one part."""
+    steps = [
+        Step(view="a", action=Action.of("travel"), extra={"visit": visit}) for visit in range(5)
+    ]
+    trace = Trace((*steps[:-1], replace(steps[-1], action=None)), name="drive")
+    found = with_drives(trace, [0, 1, 2, 3, 3], known=[1, 3])
+    assert starts_of(found) == (1, 3)
+    assert [drive.name for drive in drives_of(found)] == ["drive", "drive part 2", "drive part 3"]
+    unnamed = with_drives(replace(trace, name=None), [0, 0, 0, 1, 1], known=[1])
+    assert [drive.name for drive in drives_of(unnamed)] == ["drive 1", "drive 2"]
+    assert with_drives(trace, [0, 0, 1, 1, 1], known=[]) == trace
 
 
 def test_stuck_odometer_is_replaced_by_scan_matching(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +19,8 @@ from coarse import every_second_beam
 from perception.errors import LogError
 from perception.places.closures import VisitMatch
 from perception.places.importing import Imported, import_log
-from perception.places.joining import agreeing_matches, join_logs
+from perception.places.joining import join_logs
+from perception.places.unrelated import agreeing_matches
 from perception.readers.scans import Pose, RobotLog
 from perception.readers.writers import write_carmen
 from simulator.tours import record
@@ -26,7 +28,7 @@ from simulator.world import World
 from ssh_abduction.cli import main
 from ssh_abduction.cli.run_folders import digest, distinct
 from ssh_abduction.cli.simulate import scans_of
-from ssh_abduction.data import SSHMap, Trace, drives_of, together
+from ssh_abduction.data import Closure, SSHMap, Trace, drives_of, together
 from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.evaluation import evaluate_visits
@@ -109,36 +111,67 @@ def test_joint_logs_number_scans_and_visits_over_all_drives(
     assert not join_logs(halves, [doubted, parts[1]])[1].track.is_reliable
 
 
-@pytest.mark.slow
-def test_closures_between_drives_match_the_truth(
-    joint: tuple[RobotLog, Imported, list[Imported]], halves: tuple[RobotLog, RobotLog]
-) -> None:
-    # Furniture makes the places of this world differ. Each drive is a tour.
+@pytest.fixture(scope="module")
+def tours() -> list[RobotLog]:
+    """Two tours through a world whose furniture makes places differ, a log for each."""
     scans = every_second_beam(scans_of(record(World.named("cluttered"), 2, every=1.0)))
     middle = len(scans) // 2
-    drives = [RobotLog(scans[:middle], source="a"), RobotLog(scans[middle:], source="b")]
-    parts = [import_log(drive, name=drive.source) for drive in drives]
-    trace = join_logs(drives, parts)[1].trace
+    return [RobotLog(scans[:middle], source="a"), RobotLog(scans[middle:], source="b")]
+
+
+def are_right(closures: Sequence[Closure], trace: Trace) -> bool:
+    """Whether closures agree with the true poses."""
+    off = [
+        displacement_between(
+            displacement_between(*(trace[t].truth["pose"] for t in (one.first, one.last))),
+            one.displacement,
+        )
+        for one in closures
+    ]
+    return all(math.hypot(x, y) < 0.5 and abs(turn) < math.radians(5) for x, y, turn in off)
+
+
+@pytest.mark.slow
+def test_drive_starts_where_the_odometer_does(tours: list[RobotLog]) -> None:
+    """Closures connect the parts of a log, as those of two drives."""
+    first, last = (log.scans for log in tours)
+    anew = [
+        replace(scan, odometry=displacement_between(last[0].odometry, scan.odometry))
+        for scan in last
+    ]
+    found = import_log(RobotLog((*first, *anew), source="both"), name="both")
+    (start,) = starts_of(found.trace)
+    across = [c for c in found.trace.closures if c.first < start <= c.last]
+    assert found.starts == (len(first),)
+    assert [drive.name for drive in drives_of(found.trace)] == ["both", "both part 2"]
+    assert len(across) >= 3
+    assert are_right(across, found.trace)
+
+
+@pytest.mark.slow
+def test_closures_between_drives_match_the_truth(
+    joint: tuple[RobotLog, Imported, list[Imported]],
+    halves: tuple[RobotLog, RobotLog],
+    tours: list[RobotLog],
+) -> None:
+    parts = [import_log(drive, name=drive.source) for drive in tours]
+    trace = join_logs(tours, parts)[1].trace
     (start,) = starts_of(trace)
     found = [c for c in trace.closures if c.first < start <= c.last]
     assert len(found) >= 3
-    for closure in found:
-        true = [trace[t].truth["pose"] for t in (closure.first, closure.last)]
-        off = displacement_between(displacement_between(*true), closure.displacement)
-        assert math.hypot(*off[:2]) < 0.5
-        assert abs(off[2]) < math.radians(5)
+    assert are_right(found, trace)
     # The rooms of the house look alike, so that two relations of its halves are possible.
     assert len(joint[1].trace.closures) == sum(len(part.trace.closures) for part in joint[2])
     # Another building has no visits that agree.
     others = [parts[0], joint[2][0]]
-    apart = join_logs([drives[0], halves[0]], others)[1].trace
+    apart = join_logs([tours[0], halves[0]], others)[1].trace
     assert len(apart.closures) == sum(len(part.trace.closures) for part in others)
 
 
 def test_relations_of_three_drives_agree() -> None:
     """Nothing else is needed of drives than the middles of their visits, in one frame."""
     visits = [SimpleNamespace(middle=np.array([5.0 * (k % 3), 7.0 * (k // 3)])) for k in range(9)]
-    drives: Any = [SimpleNamespace(visits=visits)] * 3
+    drives: Any = [visits] * 3
 
     def matched(off: float, *places: int) -> list[VisitMatch]:
         one: Any = SimpleNamespace(turn=0.0, shift=np.array([off, 0.0]), score=1.0)

@@ -40,9 +40,10 @@ from perception.places.distinctive import WIDTH, WINDOW, find_visits
 from perception.places.following import follow, share_failing, turned_wrongly
 from perception.places.live import LiveLog
 from perception.places.partings import with_partings
-from perception.places.tracing import DRIFT, to_trace
+from perception.places.tracing import DRIFT, to_trace, with_drives
 from perception.places.track import Track
 from perception.places.units import HOPELESS
+from perception.places.unrelated import closures_across_cuts, parts_of
 from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Damage, RobotLog, Scan
 from perception.reciprocal import ReciprocalTransformer
@@ -211,10 +212,14 @@ def _imported(
         closings = agreeing(track, visits, closings)
         track = calibrated(track, visits, closings)
         visits, closings = with_partings(track, visits, closings)
-        trace = to_trace(log, track, visits, closings, name)
+        across, part = closures_across_cuts(track, visits), parts_of(track, visits)
+        trace = to_trace(log, track, visits, [*closings, *across], name)
+        known = sorted({part[closing.last] for closing in across})
+        trace = with_drives(trace, part, known)
+        starts = tuple(track.cuts[number - 1] for number in known)
     with _timed(seconds, "views"):
         trace = with_views(trace)
-    return Imported(trace, track, width, visits, seconds, notes)
+    return Imported(trace, track, width, visits, seconds, notes, starts)
 
 
 def stream_visits(

@@ -9,9 +9,10 @@ to its heading.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -86,6 +87,26 @@ def to_trace(
         extra={"beams": {"first": -90, "step": 1}},
         closures=tuple(closure_of(found, arrivals) for found in closings),
     )
+
+
+def with_drives(trace: Trace, part: Sequence[int], known: Collection[int]) -> Trace:
+    """Let a drive start at the first step of some parts of a trace.
+
+    The motion to such a step is unknown, but closures say where it is.
+
+    Args:
+        trace: The trace of a log.
+        part: For each visit, the number of its part.
+        known: The numbers of the parts that closures connect to earlier ones.
+    """
+    steps, drives = list(trace.steps), 1
+    for t, (last, step) in enumerate(pairwise(trace.steps)):
+        before, here = (part[int(one.extra["visit"])] for one in (last, step))
+        if before != here in known:
+            drives += 1
+            called = f"{trace.name} part {drives}" if trace.name else f"drive {drives}"
+            steps[t] = replace(last, action=Action(called, "start"))
+    return replace(trace, steps=tuple(steps))
 
 
 def closure_of(found: VisitMatch, arrivals: Sequence[tuple[int, float]]) -> Closure:

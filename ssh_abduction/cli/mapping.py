@@ -228,7 +228,10 @@ class MapQuestion(FileQuestion):
         run = json.loads(files["run.json"])
         run["log"]["source"] = " + ".join(paths)
         run["settings"], run["digest"] = self.settings, content
-        for drive, path in zip(run.get("drives", ()), paths, strict=False):
+        sources, name = iter(paths), ""
+        for drive in run.get("drives", ()):
+            if not (name and drive["name"].startswith(f"{name} part ")):
+                name, path = drive["name"], next(sources)
             drive["source"] = path
         files["run.json"] = (json.dumps(run, indent=2, ensure_ascii=False) + "\n").encode()
         cost, solution = done.solution.cost, done.solution

@@ -21,9 +21,9 @@ def doubt_of(problem: Problem, best: SSHMap) -> str | None:
     """Say why the costs of maps cannot be trusted; None if there is no such reason.
 
     Two places cannot be at one position. If two drives have such places, they overlap by chance. If
-    views look alike nearly everywhere, drives that stay apart may share places all the same. After a
-    missing displacement, the robot may then be at many places. If views differ, the first join
-    across it is not tested by any loop.
+    views look alike nearly everywhere, drives that stay apart may share places all the same, and
+    after a missing displacement the robot may be at many places. The first join across a missing
+    displacement is not tested by any loop.
     """
     overlap = problem.overlap
     if overlap.is_ambiguous and overlap.keeps_apart(best):

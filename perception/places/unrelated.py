@@ -1,0 +1,204 @@
+"""Finds closures between visits whose frames are unrelated, as those of two drives.
+
+Each pair of visits is matched in all rotations, and each reliable match says how the frames relate.
+Places look alike, so a match counts only if at least VOTES visits of the second drive agree on one
+relation, and no other relation has more than half as many.
+
+Relations of three drives form a loop. The two relations on which most visits agree say what the
+third one is. If no match of the third relation agrees with them, it is not believed.
+
+The parts of a drive before and after a cut of its track are like two drives.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, combinations
+
+import numpy as np
+
+from perception.places.closures import KEPT, TURN, VisitMatch, is_reliable
+from perception.places.matching import Scene, Turned, match
+from perception.places.track import Array, Track, points_turned
+from perception.places.visits import Visit, patches_of
+from ssh_abduction.data.groups import gathered
+
+# A match predicts where the visit of another match is. Two matches agree if this is right to within
+# NEAR metres, plus DRIFT metres for each metre between the two visits, and if their rotations
+# differ by less than TWIST radians.
+NEAR, DRIFT, TWIST = 0.7, 0.05, math.radians(10)
+VOTES = 3
+TURNS = [k * TURN for k in range(round(math.tau / TURN))]
+# Of a drive with cuts, about this many visits are matched, as the time grows with the square.
+MATCHED = 200
+
+
+def closures_between(drives: Sequence[Sequence[Visit]]) -> Iterator[VisitMatch]:
+    """Yield the closures between drives, with visits numbered over all drives."""
+    scenes = [scenes_of(visits) for visits in drives]
+    counts = [0, *accumulate(len(visits) for visits in drives)]
+    pairs = [*combinations(range(len(drives)), 2)]
+    found = {(a, b): _reliable_matches(scenes[a], scenes[b]) for a, b in pairs}
+    for (a, b), agreed in agreeing_matches(drives, found).items():
+        for closing in _best_of_each_visit(agreed):
+            yield replace(closing, first=closing.first + counts[a], last=closing.last + counts[b])
+
+
+def parts_of(track: Track, visits: Sequence[Visit]) -> list[int]:
+    """Return, for each visit, how many cuts of the track are before it."""
+    scans = [visit.scan for visit in visits]
+    return [int(count) for count in np.searchsorted(track.cuts, scans, "right")]
+
+
+def closures_across_cuts(track: Track, visits: Sequence[Visit]) -> list[VisitMatch]:
+    """Find the closures between visits before and after cuts of the track of one drive."""
+    some = range(0, len(visits), 1 + len(visits) // MATCHED)
+    parts = gathered(zip(parts_of(track, visits)[:: some.step], visits[:: some.step], strict=True))
+    return [
+        replace(closing, first=some[closing.first], last=some[closing.last])
+        for closing in closures_between([*parts.values()])
+    ]
+
+
+def scenes_of(visits: Sequence[Visit]) -> list[Scene]:
+    """Prepare the local map of each visit for matching."""
+    return [
+        Scene.of(patch, visit.middle)
+        for visit, patch in zip(visits, patches_of(visits), strict=True)
+    ]
+
+
+def _reliable_matches(ours: Sequence[Scene], theirs: Sequence[Scene]) -> list[VisitMatch]:
+    """Match each visit of a drive with each visit of an earlier one, in all rotations."""
+    found: list[VisitMatch] = []
+    for j, scene in enumerate(theirs):
+        turned = Turned.of(scene, TURNS)
+        for i, other in enumerate(ours):
+            matched = match(other, turned)
+            if matched is not None and is_reliable(matched):
+                found.append(VisitMatch(i, j, matched))
+    return found
+
+
+def _best_of_each_visit(agreed: Sequence[VisitMatch]) -> list[VisitMatch]:
+    """Keep the KEPT best matches of each later visit."""
+    kept: list[VisitMatch] = []
+    for j in sorted({closing.last for closing in agreed}):
+        here = [closing for closing in agreed if closing.last == j]
+        kept += sorted(here, key=lambda closing: -closing.match.score)[:KEPT]
+    return kept
+
+
+def agreeing_matches(
+    parts: Sequence[Sequence[Visit]], found: Mapping[tuple[int, int], Sequence[VisitMatch]]
+) -> dict[tuple[int, int], list[VisitMatch]]:
+    """Return, for each pair of drives, the matches that agree on the relation of their frames.
+
+    If two better supported relations lead from one drive of a pair over a third drive to the other
+    one, some matches must agree with them. Otherwise those that do are kept, if they are enough.
+    """
+    agreed = {
+        (a, b): _largest(some, _relations(some, parts[a], parts[b]))
+        for (a, b), some in found.items()
+    }
+    frames: dict[tuple[int, int], _FrameMatches] = {}  # of the relations that are believed
+    for a, b in sorted(agreed, key=lambda pair: -_votes(agreed[pair])):
+        here = _relations(found[a, b], parts[a], parts[b])
+        ways = [
+            (frames[c, b], frames[a, c])
+            for c in range(len(parts))
+            if (c, b) in frames and (a, c) in frames
+        ]
+        if ways:
+            over, back = max(ways, key=lambda way: min(len(way[0].turns), len(way[1].turns)))
+            fits = here.fitting(over, back)
+            fitting = [one for one, fit in zip(found[a, b], fits, strict=True) if fit]
+            if not any(one in fitting for one in agreed[a, b]):
+                agreed[a, b] = fitting if _votes(fitting) >= VOTES else []
+        if agreed[a, b]:
+            frames[a, b] = _relations(agreed[a, b], parts[a], parts[b])
+            frames[b, a] = frames[a, b].inverse()
+    return agreed
+
+
+def _votes(matches: Sequence[VisitMatch]) -> int:
+    return len({one.last for one in matches})
+
+
+@dataclass(frozen=True, eq=False)
+class _FrameMatches:
+    """What n matches say about how two frames relate.
+
+    `turns` are rotations of the later frame, in radians. The middle of the later visit is `here` in
+    the earlier frame and `there` in its own, (n, 2) metres.
+    """
+
+    turns: Array
+    here: Array
+    there: Array
+
+    def agreeing(self, k: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Mask of the matches that agree with match k."""
+        onward = self.there - self.there[k]
+        expected = self.here[k] + points_turned(self.turns[k], onward)
+        far = np.hypot(*(self.here - expected).T)
+        twist = np.abs((self.turns - self.turns[k] + math.pi) % math.tau - math.pi)
+        return np.asarray((far < NEAR + DRIFT * np.hypot(*onward.T)) & (twist < TWIST))
+
+    def inverse(self) -> _FrameMatches:
+        """Return what the matches say if the two drives change places."""
+        return _FrameMatches(-self.turns, self.there, self.here)
+
+    def fitting(self, over: _FrameMatches, back: _FrameMatches) -> list[bool]:
+        """Whether each match agrees with two relations that lead over a third drive.
+
+        `over` leads from the later frame to the frame of the third drive, and `back` from there to
+        the earlier frame. Each is taken at its match that is nearest.
+        """
+        found = []
+        for turn, here, at in zip(self.turns, self.here, self.there, strict=True):
+            point, reach, twist = at, 2 * NEAR, turn
+            for relation in (over, back):
+                onward = point - relation.there
+                k = int(np.argmin(np.hypot(*onward.T)))
+                reach += DRIFT * np.hypot(*onward[k])
+                twist -= relation.turns[k]
+                point = relation.here[k] + points_turned(relation.turns[k], onward[k : k + 1])[0]
+            twist = abs((twist + math.pi) % math.tau - math.pi)
+            found.append(bool(math.dist(point, here) < reach and twist < 2 * TWIST))
+        return found
+
+
+def _relations(
+    found: Sequence[VisitMatch], first: Sequence[Visit], last: Sequence[Visit]
+) -> _FrameMatches:
+    """Collect what matches between the visits of two drives say about their frames."""
+    here = [first[one.first].middle + one.match.shift for one in found]
+    there = [last[one.last].middle for one in found]
+    return _FrameMatches(
+        np.array([one.match.turn for one in found]),
+        np.array(here).reshape(-1, 2),
+        np.array(there).reshape(-1, 2),
+    )
+
+
+def _largest(found: Sequence[VisitMatch], relations: _FrameMatches) -> list[VisitMatch]:
+    """Find the relation of the frames on which most matches agree, and list these matches.
+
+    The list is empty if too few visits agree, or if another relation has more than half as many.
+    """
+    sets = [relations.agreeing(k) for k in range(len(found))]
+    visits = np.array([one.last for one in found], int)
+
+    def votes(mask: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> int:
+        return len(set(visits[mask].tolist()))
+
+    if not sets:
+        return []
+    best = max(sets, key=votes)
+    rivals = [votes(sets[k]) for k in np.flatnonzero(~best)]
+    if votes(best) < VOTES or max(rivals, default=0) > votes(best) / 2:
+        return []
+    return [found[k] for k in np.flatnonzero(best).tolist()]
