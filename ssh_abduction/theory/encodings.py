@@ -60,14 +60,14 @@ def _holds(condition: str, choices: Mapping[str, object]) -> bool:
     """Whether a condition holds in a theory with these fields.
 
     The condition is `field=value|value` (the field has one of these values), `field` or
-    `field|field` (one of these fields is true), or `not field`.
+    `field|field` (one of these fields is true), `field|field=value` (one of both), or `not field`.
     """
-    if "=" in condition:
-        field, values = condition.split("=")
-        return choices[field] in values.split("|")
     if condition.startswith("not "):
         return not choices[condition.removeprefix("not ")]
-    return any(choices[field] for field in condition.split("|"))
+    before, _, values = condition.partition("=")
+    *fields, last = before.split("|")
+    holds = choices[last] in values.split("|") if values else choices[last]
+    return bool(holds) or any(choices[field] for field in fields)
 
 
 def folder() -> Path:
