@@ -12,7 +12,7 @@ from worlds import written
 
 from ssh_abduction import SSHMap, Theory, Trace, export_map, solve
 from ssh_abduction.cli import main
-from ssh_abduction.data import MapError
+from ssh_abduction.data import MapError, together
 from ssh_abduction.explain import explain_place
 from ssh_abduction.rivals import Listing, difference, shared_sides
 
@@ -98,6 +98,14 @@ def test_explain_place_counts_maps_with_a_side() -> None:
 def test_explain_place_of_an_impossible_trace_says_so() -> None:
     found = explain_place(written("a T b A c A d"), 0)
     assert str(found) == "the trace has no map, so nothing is known about place 0"
+
+
+@pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
+def test_explain_place_is_about_the_known_maps() -> None:
+    """The minimal map has one place."""
+    joint = together([Trace.from_steps("a", [])] * 2)
+    known = solve(joint, Theory(elsewhere=[(0, 1)])).maps
+    assert explain_place(joint, 1, known=known).maps == 1
 
 
 def test_explain_place_refuses_unknown_places_and_paths() -> None:

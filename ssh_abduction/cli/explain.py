@@ -73,9 +73,9 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "steps",
         "the numbers of two steps, from 0, or DRIVE:STEP in a joint trace. Leave them out to "
-        "learn why there is no map. Or a place and a path of the first minimal map, such as p7 "
-        "path2, or a place alone, to learn on which side of each path and in which regions it is. "
-        "With a file of maps, also by their names",
+        "learn why there is no map. Or a place and a path, such as p7 path2, or a place alone, to "
+        "learn on which side of each path and in which regions it is. They are of the first "
+        "minimal map or, with a file of maps, of its first map, and may also be named",
         nargs="*",
         default=(),
         metavar="step",
@@ -115,6 +115,8 @@ def run(options: argparse.Namespace) -> int:
     question: PairQuestion | TraceQuestion | PlaceQuestion
     pair: PairInMap | None = None
     if of_place:
+        if listing is not None:
+            limits["known"] = listing.maps[: listing.minimal or None]
         question = PlaceQuestion(trace, *of_place, theory, **limits)
     elif options.steps:
         first, second = (step_named(trace, step) for step in options.steps)

@@ -27,7 +27,7 @@ from ssh_abduction.data.regions import course_named, list_in_words, regions_at
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
-from ssh_abduction.solver import Stop, with_regions
+from ssh_abduction.solver import Cost, Judging, Misfit, Stop, with_regions
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # The side of a path on which a place is known to lie; "on" if it is on the path.
@@ -49,13 +49,14 @@ def explain_place(
 
     Args:
         trace: The trace, with views.
-        place: The id of a place in the first minimal map.
+        place: The id of a place in the first known map or, if none is known, in the first minimal
+            map.
         path: The id of a path in that map; None to explain all paths and all regions of the place.
         theory: The theory; Theory.topological() if None.
         time_limit: Seconds; None for no limit.
         memory_limit: MiB; None for no limit.
-        known: Maps of the trace that are known. The search begins with the known maps that satisfy
-            the theory. So the first map costs no more than these maps.
+        known: Maps of the trace, such as those of a solution. If the first one satisfies the
+            theory, the answer is about the known maps that do, and none is searched for.
 
     Returns:
         A reason for each side that is known, and the number of minimal maps that agree.
@@ -161,14 +162,22 @@ class PlaceQuestion(LimitedQuestion[PlaceExplanation]):
         self._changes: tuple[str, ...] = ()
 
     def _find_out(self) -> None:
-        search = self._solved(self.trace, self.theory, LISTED, self._watch.left())
-        solution = search.solution(tuple(search))
-        self._ended(search)
-        maps = self._maps = solution.minimal_maps or solution.maps
-        self._possible = bool(maps) or (None if search.stopped else False)
+        accepts = Judging(self.problem).accepts
+        if self._known_maps and accepts(self._known_maps[0]):
+            maps = self._maps = tuple(filter(accepts, self._known_maps))
+            self._possible = True
+            cost: Cost | None = Cost.of(maps[0])
+            weighs = self.theory.weigh == "cost"
+            nats = Misfit(self.problem).nats_of(maps[0]) if weighs else None
+        else:
+            search = self._solved(self.trace, self.theory, LISTED, self._watch.left())
+            solution = search.solution(tuple(search))
+            self._ended(search)
+            maps = self._maps = solution.minimal_maps or solution.maps
+            self._possible = bool(maps) or (None if search.stopped else False)
+            cost, nats = search.cost, search.nats
         if maps and self._path is None:
-            found = maps[0], [self._place], search.cost, search.nats
-            self._changes = self._changes_in_words(*found)
+            self._changes = self._changes_in_words(maps[0], [self._place], cost, nats)
 
     def known(self, why: Stop | None = None) -> PlaceExplanation:
         """Return what is known so far. Raises MapError if the map has no such place or path."""
