@@ -16,7 +16,7 @@ from perception.errors import LogError
 from perception.places import importing
 from perception.places.following import turned_wrongly
 from perception.places.importing import import_log, tracked
-from perception.places.jumps import Unknown, describe_cuts, unknown_steps
+from perception.places.jumps import Unknown, describe_cuts, keep_one_source, unknown_steps
 from perception.places.tracing import with_drives
 from perception.places.track import Track
 from perception.readers.scans import Pose, RobotLog, Scan
@@ -185,6 +185,15 @@ def test_alternating_odometry_sources_are_reduced_to_one(
     track, notes = track_and_notes(with_odometry(scans, poses))
     assert track.way[-1] == pytest.approx(metres, abs=8)
     assert "The poses of several sources alternate in the odometry" in notes
+
+
+@pytest.mark.parametrize(("count", "is_noted"), [(20, False), (40, True)])
+def test_few_scans_far_apart_are_of_one_source(
+    scans: tuple[Scan, ...], count: int, is_noted: bool
+) -> None:
+    poses = [(20.0 * (i % 2), 0.1 * i, 0.0) for i in range(count)]
+    log = RobotLog(with_odometry(scans[:count], poses))
+    assert bool(keep_one_source(log)[1]) is is_noted
 
 
 def test_near_alternating_odometry_gives_a_note(scans: tuple[Scan, ...]) -> None:
