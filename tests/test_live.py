@@ -14,7 +14,13 @@ from pathlib import Path
 import pytest
 from coarse import every_second_beam, hall
 from test_distinctive import log_of
-from test_log_checks import backwards, in_degrees, of_two_clocks, with_poses
+from test_log_checks import (
+    backwards,
+    in_degrees,
+    of_two_clocks,
+    with_poses,
+    with_stuck_laser,
+)
 
 from perception.errors import LogError
 from perception.places.importing import import_live, import_log, stream_visits
@@ -150,6 +156,7 @@ def mirrored(scans: Scans) -> Scans:
         (lambda scans: with_poses(scans, lambda x, y, h: (100 * x, 100 * y, h)), "as centimetres"),
         (of_two_clocks, "The clock starts anew before scan 60"),
         (mirrored, "the laser hangs upside down"),
+        (with_stuck_laser, "The laser repeats one scan"),
     ],
 )
 def test_stream_gets_the_warnings_of_a_log(

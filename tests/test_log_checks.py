@@ -97,6 +97,10 @@ def of_two_clocks(scans: Scans) -> Scans:
     return [*scans[:60], *(replace(s, time=(s.time or 0.0) - 1e4) for s in scans[60:120])]
 
 
+def with_stuck_laser(scans: Scans) -> Scans:
+    return [*scans[:40], *(replace(s, ranges=scans[40].ranges) for s in scans[40:46])]
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -117,6 +121,15 @@ def test_warning_for_each_kind_of_bad_log(
     scans: tuple[Scan, ...], change: Callable[[Scans], Scans], told: str
 ) -> None:
     assert told in notes_of(change(scans))
+
+
+def test_track_of_a_stuck_laser_is_unreliable(scans: Scans) -> None:
+    """A robot may stand while its laser repeats a scan."""
+    standing = [*scans[:40], *[scans[40]] * 10]
+    for drive, is_good in [(standing, True), (with_stuck_laser(scans), False)]:
+        _, track, notes = tracked(RobotLog(tuple(drive), source="drive"))
+        assert track.is_reliable is is_good
+        assert ("The laser repeats one scan" in " ".join(notes)) is not is_good
 
 
 def test_missing_odometry_does_not_turn_wrongly(scans: Scans) -> None:

@@ -275,15 +275,17 @@ def tracked(
             tell(note)
 
     log, corrected, whole = log_checks.checked(log)
-    say([*corrected, *whole])
+    stuck = log_checks.describe_stuck_laser(log)
+    say([*corrected, *whole, *stuck])
     track = follow(log)
     say(jumps.describe_cuts(log, track, turned_wrongly(log, track)))
     # If the odometry is wrong throughout, that explains all differences between the trajectories.
-    doubt = None if whole else disagreement(log, track)
+    doubt = None if whole or stuck else disagreement(log, track)
     say([doubt] if doubt else [])
-    track, doubts = log_checks.judged(log, track, explained=bool(whole or doubt or track.cuts))
+    explained = bool(whole or stuck or doubt or track.cuts)
+    track, doubts = log_checks.judged(log, track, explained)
     say(doubts)
-    return log, track, tuple(notes)
+    return log, replace(track, is_reliable=track.is_reliable and not (stuck or doubt)), tuple(notes)
 
 
 def _noted(message: str, notes: Sequence[str]) -> LogError:

@@ -192,11 +192,14 @@ def watched(scans: Iterable[Scan], tell: Teller, source: str = "") -> Iterator[S
     units = _units_of(RobotLog(tuple(first), source=source), tell)
     stretch: list[Scan] = []
     last, begin, standing = first[-1:], 0, jumps.StandstillCheck()
+    laser = log_checks.StuckLaser()
     for number, scan in enumerate(map(units.converted, chain(first, coming))):
         if len(stretch) == LOOKS[-1]:
             stretch, begin, standing = last, number - 1, jumps.StandstillCheck()
         stretch.append(without_ranges(scan))
         standing.add(scan)
+        laser.add(number, scan)
+        tell(laser.notes)
         if len(stretch) in LOOKS:
             tell(_checked(stretch, begin, standing.moved, source))
         last = [scan]

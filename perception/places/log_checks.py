@@ -17,7 +17,7 @@ from perception.places import jumps
 from perception.places.following import share_failing
 from perception.places.track import Array, Track, odometer_covariance, wrapped
 from perception.places.units import FAR_OFF, LEAST_WAY, SIDEWAYS, SPARSE, ahead, units_of, way_of
-from perception.readers.scans import RobotLog
+from perception.readers.scans import RobotLog, Scan
 from perception.readers.stored import in_turn
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.odometry import displacement_between, moved
@@ -45,6 +45,8 @@ NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
 # the RARELY-th percentile of the log.
 INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
 INTRUDING_RARELY, WORSE, RARELY = 0.15, 0.25, 1.0
+# A laser is stuck if it repeats one scan while the robot drives this many metres.
+STUCK = 2.0
 # The laser is dark if DARK scans in a row show no wall.
 DARK = 5
 # Beams that meet walls are at most this many metres long, in the median of a log. Good logs have up
@@ -104,6 +106,45 @@ def describe_feet(log: RobotLog) -> list[str]:
         f"wall is {np.median(shortest):.1f} away in most scans. Divide ranges and positions by "
         f"{FEET:.3f}."
     ]
+
+
+class StuckLaser:
+    """Notices whether the laser repeats one scan while the robot drives on.
+
+    Attributes:
+        notes: A note on the first such stretch, if there is one.
+    """
+
+    def __init__(self) -> None:
+        """Start before the first scan."""
+        self.notes: list[str] = []
+        self._last: Scan | None = None
+        self._metres = 0.0
+
+    def add(self, number: int, scan: Scan) -> None:
+        """Add the next scan, with odometry in metres."""
+        last, self._last = self._last, scan
+        met = (scan.ranges > 0) & (scan.ranges < scan.laser.reach)
+        if last is None or not (
+            met.any() and np.array_equal(scan.ranges, last.ranges, equal_nan=True)
+        ):
+            self._metres = 0.0
+            return
+        self._metres += math.dist(scan.odometry[:2], last.odometry[:2])
+        if self._metres > STUCK and not self.notes:
+            self.notes.append(
+                f"The laser repeats one scan while the robot drives on, up to scan {number} (line "
+                f"or message {scan.line}) at least. So these scans do not show the building. Look "
+                "at the laser and its driver, and record again."
+            )
+
+
+def describe_stuck_laser(log: RobotLog) -> list[str]:
+    """Describe a laser that repeats one scan while the robot drives on."""
+    laser = StuckLaser()
+    for number, scan in enumerate(in_turn(log.scans)):
+        laser.add(number, scan)
+    return laser.notes
 
 
 def refuse_shuffled(log: RobotLog) -> None:
