@@ -29,9 +29,11 @@ from ssh_abduction.data import Closure, MapError, Odometry, SolverError, TheoryE
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.solver import Search, Status, Watch
+from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.costs import beams, weighing
 from ssh_abduction.solver.costs.estimating import estimated, rivals_of
 from ssh_abduction.solver.costs.misfit import Misfit
+from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.geometry.fit import Poses, fit
 from ssh_abduction.solver.solution.weighed import FITTED, Rival, Weighed
 from ssh_abduction.theory.settle import settle
@@ -379,6 +381,20 @@ def test_stopped_search_is_not_sure(route: truth.Known) -> None:
     assert f"among the {len(solution.weighed.rivals)} maps found)" in solution.weighed.sentence
     alone = replace(solution.weighed, rivals=solution.weighed.rivals[:1])
     assert "no other map was found, so it is unknown which joins are doubtful" in alone.sentence
+
+
+def test_map_and_cost_agree_if_a_limit_ends_the_computation_of_a_cost(
+    route: truth.Known, weighed_route: Solution
+) -> None:
+    search = Search(route.trace)
+    priced, unpriced = weighed_route.maps[0], solve(route.trace, Theory(weigh="count")).maps[0]
+    assert search._weighing is not None
+    search._weighing.add(priced)
+    search._parts.known.keep(Found.of(unpriced, search.theory), unpriced.labels)
+    over = patch.object(Misfit, "nats_of", side_effect=LimitError("time limit"))
+    with over, pytest.raises(LimitError):
+        search._weighing.keep_best()
+    assert search.best == priced
 
 
 @pytest.mark.parametrize(

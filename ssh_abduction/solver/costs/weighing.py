@@ -230,18 +230,23 @@ class Weighing:
             yield from forcing.bounds(best.nats, self.bound)
 
     def keep_best(self) -> None:
-        """Compute the cost of the search's best map. Make the cheapest known map the best one."""
+        """Compute the cost of the search's best map. Make the cheapest known map the best one.
+
+        If a limit ends the computation, the cheapest map whose cost is known becomes the best one.
+        """
         known = self._parts.known
-        if known.best is not None:
-            self.add(known.best)
-        if not self.proven:
-            first, dstates = next(iter(self._prices)), known.bound.dstates or 0
-            counts = {"dstates": dstates, "tenths": max(known.bound.tenths or 0, 10 * dstates)}
-            least = {**self._least, first: counts[first]}
-            self.bound = max(self.bound, self._price(least) + self._base)
-        if self.candidates:
-            best = self.candidates[0].map
-            known.keep(Found.of(best, self._parts.task.theory), best.dstate_at)
+        try:
+            if known.best is not None:
+                self.add(known.best)
+        finally:
+            if not self.proven:
+                first, dstates = next(iter(self._prices)), known.bound.dstates or 0
+                counts = {"dstates": dstates, "tenths": max(known.bound.tenths or 0, 10 * dstates)}
+                least = {**self._least, first: counts[first]}
+                self.bound = max(self.bound, self._price(least) + self._base)
+            if self.candidates:
+                best = self.candidates[0].map
+                known.keep(Found.of(best, self._parts.task.theory), best.dstate_at)
 
     def maps(self) -> Generator[Priced, None, None]:
         """Yield the maps of least cost, then maps that cost up to `within` nats more.
