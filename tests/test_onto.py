@@ -221,6 +221,10 @@ def test_onto_refuses_a_solution_without_map_or_trace() -> None:
     faulty = solve(MONDAY, Theory.causal().replace(misread=1.0))
     with pytest.raises(SolverError, match="expected a map without faults"):
         solve(TUESDAY, onto=faulty)
+    with pytest.raises(SolverError, match="expected a map without faults"):
+        solve(TUESDAY, Theory(misread=1.0), onto=standing)
+    with pytest.raises(SolverError, match="onto: expected a topological theory, as the existing"):
+        solve(TUESDAY, Theory.causal(), onto=standing)
 
 
 def test_digest_has_each_link_once() -> None:

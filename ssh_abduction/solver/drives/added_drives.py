@@ -85,6 +85,7 @@ def solve_onto(
     """
     old, ssh_map = _existing(existing)
     theory = checked_theory(theory or existing.theory.replace(returns=0))
+    _check_theory(theory, existing)
     joint = together([old, trace])
     theory.check_steps(joint)
     if corrections is not None:
@@ -211,12 +212,21 @@ def _existing(existing: object) -> tuple[Trace, SSHMap]:
             "onto: expected a solution with a map and its trace, got one without; read a file that "
             "solve -o wrote"
         )
-    if solution.maps[0].faults or solution.theory.has_faults:
+    return solution.trace, solution.maps[0]
+
+
+def _check_theory(theory: Theory, existing: Solution) -> None:
+    """Raise SolverError if a theory allows faults, or lacks the places of the existing map."""
+    if theory.has_faults or existing.theory.has_faults or existing.maps[0].faults:
         raise SolverError(
             "onto: expected a map without faults, got a theory that allows them; solve all drives "
             "together"
         )
-    return solution.trace, solution.maps[0]
+    if theory.level == "causal" and existing.theory.level != "causal":
+        raise SolverError(
+            "onto: expected a topological theory, as the existing map has places, got "
+            "level=causal; take --theory topological"
+        )
 
 
 def _check_assertions(theory: Theory, old: Trace, ssh_map: SSHMap) -> None:
