@@ -342,6 +342,18 @@ def test_check_finds_a_false_probability(
     assert said in capsys.readouterr().out
 
 
+def test_check_finds_false_counts_of_a_weighed_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trace = Trace.from_steps("ab", ["travel"], displacements=[(10, 0, 0)])
+    data, file = solve(trace, within=1).to_dict(), tmp_path / "maps.json"
+    data["maps"][0]["cost"]["places"] += 1
+    file.write_text(json.dumps(data))
+    trace.save(tmp_path / "trace.jsonl")
+    assert main(["check", str(file), str(tmp_path / "trace.jsonl")]) == 1
+    assert "maps[0].cost: expected 2 dstates, 2 places, 1 paths, as" in capsys.readouterr().err
+
+
 def test_check_computes_the_costs_of_all_rivals_or_counts_the_others(
     weighed_route: Solution,
     tmp_path: Path,

@@ -159,7 +159,10 @@ class _Claims:
         if self.theory.without:
             return  # if axioms are left out, clingo may count more than the maps show
         if self.theory.weigh == "cost":
-            return  # maps of one cost in nats may have different counts (checker/cost_claims.py)
+            # Maps of one cost in nats may have different counts (checker/cost_claims.py).
+            if "within" in self.answer:
+                yield from self._costs_of_each(self._shown())
+            return
         if "within" in self.answer:
             yield from self._costs_within(self.answer["within"])
             return
@@ -211,7 +214,7 @@ class _Claims:
                     f"maps: expected equal numbers of {preferred} in maps {i} and {i + 1}, which "
                     f"are of one level, got {best} and {here}"
                 )
-        shown = [{k: v for k, v in counts.items() if v or k != "excuses"} for counts in self.counts]
+        shown = self._shown()
         yield from self._costs_of_each(shown)
         begins = [
             i for i in range(len(shown)) if i == 0 or self._preferred(i) != self._preferred(i - 1)
@@ -226,6 +229,10 @@ class _Claims:
                 f"levels: expected {brief(levels)}, as the maps have these, got "
                 f"{brief(self.answer['levels'])}"
             )
+
+    def _shown(self) -> list[dict[str, int]]:
+        """Return the counts of each map as an answer writes them: no excuses if there are none."""
+        return [{k: v for k, v in counts.items() if v or k != "excuses"} for counts in self.counts]
 
     def _costs_of_each(self, shown: Sequence[Mapping[str, int]]) -> Iterator[str]:
         """Check that each map has the cost that is claimed for it."""
