@@ -225,7 +225,7 @@ def _check_theory(theory: Theory, existing: Solution) -> None:
     if theory.level == "causal" and existing.theory.level != "causal":
         raise SolverError(
             "onto: expected a topological theory, as the existing map has places, got "
-            "level=causal; take --theory topological"
+            "level=causal; take Theory.topological() (solve --theory topological)"
         )
 
 
