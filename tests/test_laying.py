@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from unittest.mock import patch
 
@@ -42,6 +43,29 @@ def test_onto_lays_drives_on_the_map_one_by_one() -> None:
         assert 0 < solution.weighed.bound < solution.weighed.nats
         assert solution.weighed.searched
         assert solution.confidence > 0.99
+
+
+@pytest.mark.parametrize("shared", [0, 1])
+def test_drive_joins_the_pieces_of_the_existing_map(shared: int) -> None:
+    """One common place was too little to join the first two drives."""
+
+    def along(first: int, stop: int, name: str) -> Trace:
+        gone = [(2.0 + i % 3, 0, 0) for i in range(first, stop - 1)]
+        views = [str(i) for i in range(first, stop)]
+        return Trace.from_steps(views, ["travel"] * len(gone), displacements=gone, name=name)
+
+    begin, end = along(0, 20, "begin"), along(20 - shared, 40, "end")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # no common view
+        pieces = solve([begin, end], time_limit=1)
+    assert len(pieces[0].pieces) == 2
+    solution = solve(along(0, 40, "all"), onto=pieces)
+    assert len(solution[0].dstates) == len(solution[0].places) == 40
+    assert len(solution[0].pieces) == 1
+    assert solution.trace is not None
+    assert check(solution.trace, solution[0], solution.theory) == ()
+    assert solution.weighed is not None
+    assert solution.weighed.bound < solution.weighed.nats
 
 
 ROOM = "abcd"  # what a robot sees at the corners of a square room, facing along the wall ahead

@@ -49,12 +49,13 @@ def can_lay(theory: Theory) -> bool:
 def laid(
     old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem, watch: Watch, since: int
 ) -> Solution | None:
-    """Find a joint map of little cost that keeps the map of the old drives.
+    """Find a joint map of little cost that keeps each piece of the map of the old drives.
 
     `trace` has the new drives, and the problem all drives, under a theory that `can_lay`. The
     solution has the cheapest of up to three maps: in one the new drives are pieces of their own,
-    and in the others they are joined to the old ones. None if no such map satisfies the axioms. The
-    displacements of the first `since` steps are known to agree with the map.
+    and in the others they are joined to the old ones. Pieces of the old map may be joined, too.
+    None if no such map satisfies the axioms. The displacements of the first `since` steps are known
+    to agree with the map.
     """
     from ssh_abduction.solver.costs.misfit import Misfit  # loads numpy
     from ssh_abduction.solver.guesses.existing import ExistingMap
@@ -63,7 +64,9 @@ def laid(
     judging, existing, misfit = Judging(problem), ExistingMap(old, ssh_map), Misfit(problem)
     maps = _joint_maps(existing, old, ssh_map, trace, problem)
     found = sorted(((misfit.nats_of(m), m) for m in maps), key=lambda pair: pair[0])
-    while found and not judging.accepts_grown(found[0][1], since):
+    while found and not judging.accepts_grown(
+        found[0][1], since if _is_kept(ssh_map, found[0][1]) else 0
+    ):
         del found[0]
     if not found:
         return None
@@ -74,7 +77,7 @@ def laid(
     known = [rival_of(m, nats) for nats, m in found]
     moved = rivals_of(problem, misfit, best, ESTIMATING, len(old))
     weighed = Weighed(
-        bound=nats_of(replace(Cost.of(ssh_map), paths=0), theory) + kept.chi2 / 2,
+        bound=max(nats_of(cost, theory) for cost in _costs(ssh_map)) + kept.chi2 / 2,
         within=0.0,
         rivals=(known[0], *(replace(rival, estimated=True) for rival in known[1:]), *moved),
         searched=best.fit.p >= IMPROBABLE and not may_join_more(problem, known),
@@ -104,7 +107,7 @@ def unproven(
         status=Status.FEASIBLE,
         maps=(found,),
         cost=Cost.of(found),
-        bound=Bound(len(ssh_map.dstates)),
+        bound=Bound(max(cost.dstates for cost in _costs(ssh_map))),
         complete=False,
         theory=problem.theory,
         steps=len(joint),
@@ -117,6 +120,20 @@ def unproven(
             onto=tuple(drive.name for drive in drives_of(old)),
         ),
     )
+
+
+def _is_kept(ssh_map: SSHMap, found: SSHMap) -> bool:
+    """Whether a joint map joins no two dstates or places of a map of the first drives."""
+    labels = found.dstate_at[: len(ssh_map.dstate_at)]
+    places = {found.dstates[s].place for s in labels}
+    return len({*labels}) == len(ssh_map.dstates) and len(places) == max(len(ssh_map.places), 1)
+
+
+def _costs(ssh_map: SSHMap) -> Iterator[Cost]:
+    """Yield the cost of each piece of a map, without paths."""
+    for piece in ssh_map.pieces:
+        places = {ssh_map.dstates[s].place for s in piece} - {None}
+        yield replace(Cost.of(ssh_map), dstates=len(piece), places=len(places), paths=0)
 
 
 def _joint_maps(

@@ -57,10 +57,11 @@ class ExistingMap:
         return replace(digest, steps=(digest.steps[0], *steps))
 
     def maps(self, problem: Problem, labels: Sequence[int]) -> Iterator[SSHMap]:
-        """Yield maps of a digest and new drives. They keep this map; the most joined one is last.
+        """Yield maps of a digest and new drives. They keep the pieces of this map.
 
-        The caller has to check them. The trace of the problem is a digest of the old drives, and
-        then the new ones. `labels` has the dstate of each step of the digest.
+        The cheapest one is last. The caller has to check them. The trace of the problem is a digest
+        of the old drives, and then the new ones. `labels` has the dstate of each step of the
+        digest.
         """
         log = Log(problem.trace, problem.theory, problem.pairs)
         joining = Joining(problem, log)
@@ -83,4 +84,4 @@ class ExistingMap:
             log,
             sights,
         )
-        return replace(part, kept=frozenset(number.values()))
+        return replace(part, kept=frozenset((s, piece) for s in number.values()))

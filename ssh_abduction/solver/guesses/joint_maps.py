@@ -11,7 +11,8 @@ anchors are used only if that map breaks an axiom.
 
 The two maps with most closures, or the best anchor, are joined first: `overlaying.py` merges the
 places and dstates that coincide. Then the joint map may be joined to others. Maps that no anchor
-connects stay pieces. Some of the maps may be the pieces of a map of old drives that must be kept.
+connects stay pieces. Some of the maps may be the pieces of a map of old drives. Each of these
+pieces must be kept, but they may be joined to each other.
 
 Reference:
     Carpin 2008, "Fast and accurate map merging for multi-robot systems" (votes for a turn and a
@@ -107,7 +108,7 @@ class Joining:
 
         If the cheapest map has pieces, also yield the cheapest map in which two of them are joined.
         The caller has to check all maps. If `standing` is not empty, it has the pieces of a map of
-        the first drives that must be kept.
+        the first drives. Each piece must be kept.
         """
         first = sum(len(part.labels) for part in standing)
         drives = [drive for drive in drives_of(self._problem.trace) if drive.first >= first]
@@ -118,7 +119,6 @@ class Joining:
         anchors = {
             (first, second): self._anchors(first, second)
             for first, second in combinations(alone, 2)
-            if second not in standing
         }
         starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
         joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
@@ -131,8 +131,7 @@ class Joining:
         dearer = []
         for two in combinations(best, 2):
             pair = two[::-1] if two[::-1] in self._laid else two
-            both = None if pair[1] in standing else self._joined(*pair, math.inf)
-            if both is not None:
+            if (both := self._joined(*pair, math.inf)) is not None:
                 dearer.append([*(part for part in best if part not in pair), both])
         if dearer:
             yield from self._beside(min(dearer, key=self._nats_of))

@@ -5,13 +5,14 @@ has two parts whose frames are unrelated at first. Merging two dstates fixes the
 other. From then on the two places that most surely coincide are merged first, and the poses are
 conditioned on each merge. Dstates that one action leads to from merged dstates are merged, too. If
 gateways may change between drives, places with different gateways may be merged, at a price for
-each change. Dstates and places of a map that must be kept are never merged with each other.
+each change. Dstates and places of one piece of a map that must be kept are never merged with each
+other.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from statistics import median
@@ -49,7 +50,7 @@ class Part:
         seen: For each dstate, what its steps show, as numbers.
         stars: For each dstate, the star of its last step.
         sights: For each place, what each drive saw of it.
-        kept: The dstates of a map that must be kept.
+        kept: The dstates of a map that must be kept, each with its piece of that map.
     """
 
     labels: Mapping[int, int]
@@ -63,7 +64,7 @@ class Part:
     mean: Array
     covariance: Array
     nats: float
-    kept: frozenset[int] = frozenset()
+    kept: frozenset[tuple[int, int]] = frozenset()
 
     @classmethod
     def of(cls, found: Hypothesis, first: int, log: Log, sights: Sights) -> Part:
@@ -154,7 +155,7 @@ class Part:
             np.concatenate([self.mean, other.mean]),
             covariance,
             self.nats + other.nats,
-            self.kept | {dstates + s for s in other.kept},
+            self.kept | {(dstates + s, piece) for s, piece in other.kept},
         )
 
 
@@ -167,8 +168,8 @@ class _State:
         place: For each place, the first place that it is merged with.
         sights: For each first place, what each drive saw of it.
         links: For each first dstate, the dstate that each of its actions leads to.
-        kept: The dstates of a map that must be kept. A dstate that is merged with an earlier one
-            is replaced by that one.
+        kept: The dstates of a map that must be kept, each with its piece of that map. A dstate that
+            is merged with an earlier one is replaced by that one.
         kept_places: The places of that map, in the same way.
     """
 
@@ -179,8 +180,8 @@ class _State:
     mean: Array
     covariance: Array
     nats: float
-    kept: frozenset[int]
-    kept_places: frozenset[int]
+    kept: frozenset[tuple[int, int]]
+    kept_places: frozenset[tuple[int, int]]
 
     def copy(self) -> _State:
         """Copy everything that a merge changes in place."""
@@ -215,7 +216,7 @@ class Overlay:
             both.covariance,
             both.nats + problem.overlap.between(standing.labels, drive.labels),
             both.kept,
-            frozenset(both.places[s] for s in both.kept),
+            frozenset((both.places[s], piece) for s, piece in both.kept),
         )
         at = {t: both.places[s] for t, s in both.labels.items()}
         self._dstates_apart = KeptApart.of_dstates(problem, both.labels)
@@ -280,7 +281,7 @@ class Overlay:
         dstates, places = sorted(set(state.dstate)), sorted(set(state.place))
         number = {s: i for i, s in enumerate(dstates)}
         place = {p: i for i, p in enumerate(places)}
-        kept = frozenset(number[s] for s in state.kept)
+        kept = frozenset((number[s], piece) for s, piece in state.kept)
         position = both.position[places]
         poses = [*np.stack([position, position + 1], 1).ravel(), *both.heading[dstates]]
         n = 2 * len(places)
@@ -479,18 +480,25 @@ class Overlay:
         found = []
         for s, x in combinations(self._dstates_at(place), 2):
             off, square = self._twist(s, x)
-            may_be_one = not {s, x} <= self._state.kept and self._look_alike(s, x)
+            may_be_one = not _are_of_one(self._state.kept, s, x) and self._look_alike(s, x)
             is_one_way = abs(off) < TURNED and square < 2 * self._prices[0]
             if is_one_way and may_be_one:
                 found.append((square, (s, x)))
         return found
 
 
-def _merged(kept: frozenset[int], first: int, second: int) -> frozenset[int]:
+def _are_of_one(kept: Collection[tuple[int, int]], first: int, second: int) -> bool:
+    """Whether two dstates or places are in one piece of the map that must be kept."""
+    return not {k for s, k in kept if s == first}.isdisjoint(k for s, k in kept if s == second)
+
+
+def _merged(
+    kept: frozenset[tuple[int, int]], first: int, second: int
+) -> frozenset[tuple[int, int]]:
     """Replace the second of two merged dstates or places by the first, if it is kept.
 
-    Raises _ClashError if both are kept.
+    Raises _ClashError if both are in one piece of the map that must be kept.
     """
-    if {first, second} <= kept:
+    if _are_of_one(kept, first, second):
         raise _ClashError
-    return kept - {second} | {first} if second in kept else kept
+    return frozenset((first if s == second else s, piece) for s, piece in kept)
