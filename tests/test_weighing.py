@@ -688,6 +688,26 @@ def test_views_that_are_alike_do_not_replace_a_missing_displacement(
         assert ("too much alike to tell where the robot was" in weighed.sentence) is not known
 
 
+def test_checker_begins_near_closures_that_connect_parts() -> None:
+    """Two drives through a triangle share no place. Closures say how they lie."""
+    right, left, behind = (0.0, 0.0, -1.8), (0.0, 0.0, 1.8), (0.0, 0.0, -3.1)
+    monday = [(7.7, 0.4, 0.1), left, (7.5, 1.7, 0.5), behind, (7.5, -1.8, -0.5), right]
+    tuesday = [right, (7.4, -1.8, -0.4)]
+    noise = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.001))
+    trace = Trace.from_steps(
+        "a" * 11,
+        [*["travel", "around"] * 4, "around", "travel"],
+        displacements=[*monday, (7.7, -0.3, -0.1), None, *tuesday],
+    )
+    closures = (
+        Closure(7, 8, (0.1, 0.0, 0.0), noise),
+        Closure(3, 10, (0.1, 0.1, -1.5), noise),
+    )
+    places = (0, 1, 1, 2, 2, 1, 1, 0, 4, 4, 5)
+    trace = replace(trace, odometry=Odometry(offset=0.2, facing=0.1), closures=closures)
+    assert misfit(trace, range(11), places) < 10
+
+
 @pytest.mark.parametrize("most", [1, 2, None])
 def test_limit_of_maps_says_whether_more_maps_cost_as_little(most: int | None) -> None:
     """The first and the last way of a U may be along one path, in two orders of its places."""

@@ -6,26 +6,21 @@ and the drift, each in standard deviations. A map demands that its loops close, 
 steps of each closure lie as the closure says: c(z) = 0. The misfit is the least sum of z² with c(z)
 = 0. It is found by Gauss-Newton: the next z is the smallest solution w of J w = J z - c(z), where J
 holds the derivatives of c. This is the update of an iterated Kalman filter for all loops at once.
-
-A displacement is missing where a drive starts, or where it was not logged. Between two gaps lies a
-*stretch* of steps, whose poses by dead reckoning have a frame of their own. If two stretches have a
-dstate or two places in common, this determines how their frames lie relative to each other. Such
-guesses of missing displacements are only a starting point: the misfit does not depend on them.
 """
 
 from __future__ import annotations
 
-import cmath
 import math
 from collections import Counter, defaultdict
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
-from itertools import accumulate, combinations, pairwise
+from itertools import accumulate, combinations
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from ssh_abduction.checker.stretches import likely_moves
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
@@ -53,14 +48,9 @@ LONGEST = 400
 # The time for the cost of a map grows with the third power of the steps. Costs of rivals are
 # checked for at most the time of five in the longest trace.
 WORK = 5 * LONGEST**3
-# The direction from one place to another is too uncertain to use if they are closer than this many
-# metres.
-NEAR = 1.0
 # Two places are at one position if they are nearer than CROWDED times the shortest travel. A move
 # is a travel if it is longer than TRAVEL of the longest one.
 CROWDED, TRAVEL = 0.4, 0.1
-
-_Frame = tuple[complex, float]  # the position and the heading of the origin of a stretch
 
 
 def misfit(trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> float:
@@ -258,7 +248,7 @@ class _Errors:
         # If a heading after a gap is too far off, Gauss-Newton fails. So begin near the solution.
         self._is_missing = np.array([step.displacement is None for step in trace.steps])
         missing = [t for t in range(1, size) if self._is_missing[t]]
-        for t, likely in likely_moves(self._moved, missing, dstates, places):
+        for t, likely in likely_moves(self._moved, missing, dstates, places, trace.closures):
             self._moved[t] = likely
         self._sigma = np.array([odometry.scale, odometry.bend])
         # The closures, each with the root of its covariance.
@@ -421,75 +411,3 @@ def _off_dstates(trace: Trace) -> Array:
             found += [[far, far, max(odometry.facing, SMALLEST)]] * steps
             steps = 0
     return np.array(found)
-
-
-def likely_moves(
-    moved: NDArray[np.float64],
-    missing: Collection[int],
-    dstates: Sequence[int],
-    places: Sequence[int],
-) -> Iterator[tuple[int, tuple[float, float, float]]]:
-    """Guess the displacements that lead to the `missing` steps.
-
-    `moved`, of shape (n, 3), has the displacement that leads to each step, in metres and radians.
-    `dstates` and `places` have the dstate and the place of each step.
-    """
-    begins = [0, *sorted(missing)]
-    stretch = [range(a, b) for a, b in pairwise([*begins, len(moved)])]
-    pose: list[_Frame] = []
-    for t, (dx, dy, turned) in enumerate(moved.tolist()):
-        if t in begins:
-            pose.append((0j, 0.0))
-            continue
-        at, heading = pose[-1]
-        pose.append((at + cmath.rect(1, heading) * complex(dx, dy), heading + turned))
-    known: dict[int, int] = {}  # for each dstate, a step whose stretch has a frame
-    position: dict[int, complex] = {}  # for each place, where it is
-    waiting = list(range(len(stretch)))
-    while waiting:
-        number, frame = next(
-            (
-                (number, frame)
-                for number in waiting
-                if (frame := _frame(stretch[number], pose, dstates, places, known, position))
-            ),
-            (waiting[0], (0j, 0.0)),
-        )
-        waiting.remove(number)
-        for t in stretch[number]:
-            at, heading = pose[t]
-            pose[t] = frame[0] + cmath.rect(1, frame[1]) * at, frame[1] + heading
-            known.setdefault(dstates[t], t)
-            position.setdefault(places[t], pose[t][0])
-    for t in sorted(missing):
-        (at, heading), (after, facing) = pose[t - 1], pose[t]
-        gone = (after - at) * cmath.rect(1, -heading)
-        yield t, (gone.real, gone.imag, math.remainder(facing - heading, math.tau))
-
-
-def _frame(
-    steps: range,
-    pose: Sequence[_Frame],
-    dstates: Sequence[int],
-    places: Sequence[int],
-    known: dict[int, int],
-    position: dict[int, complex],
-) -> _Frame | None:
-    """Find the origin of a stretch of steps, from a dstate or two places with known poses.
-
-    None if the stretch has neither.
-    """
-    for t in steps:
-        if dstates[t] in known:
-            at, heading = pose[known[dstates[t]]]
-            turn = heading - pose[t][1]
-            return at - cmath.rect(1, turn) * pose[t][0], turn
-    there = [t for t in steps if places[t] in position]
-    for t in there:
-        for u in there:
-            way = position[places[u]] - position[places[t]]
-            mine = pose[u][0] - pose[t][0]
-            if min(abs(way), abs(mine)) > NEAR:
-                turn = cmath.phase(way) - cmath.phase(mine)
-                return position[places[t]] - cmath.rect(1, turn) * pose[t][0], turn
-    return None
