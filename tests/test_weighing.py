@@ -340,6 +340,10 @@ def test_check_finds_a_false_probability(
     weighed_route.trace.save(files[1])
     assert main(["check", *map(str, files)]) == 20
     assert said in capsys.readouterr().out
+    assert main(["check", "--bound", *map(str, files)]) == 20
+    told = capsys.readouterr().out
+    assert "1 of 1 maps satisfy" in told
+    assert "more is left out: a claim about costs is false" in told
 
 
 def test_check_finds_false_counts_of_a_weighed_map(
