@@ -107,6 +107,10 @@ def with_stuck_laser(scans: Scans) -> Scans:
         (lambda scans: backwards(scans[:80]), "drives backwards all the way"),
         (lambda scans: in_degrees(scans[:80]), "headings of the odometry are read as degrees"),
         (lambda scans: sideways(scans[:100]), "headings are wrong: write them in radians"),
+        (
+            lambda scans: with_poses(scans[:100], lambda x, y, h: (x, y, h + math.radians(100))),
+            "drives backwards for 18 % of its way",
+        ),
         (in_blocks, "So does a log that is not in the order of the drive"),
         (kidnapped, "before and after scan 100 (line or message 171) contradict each other"),
         (covered, "The laser sees no wall in 50 scans, from scan 100 "),

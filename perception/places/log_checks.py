@@ -250,10 +250,11 @@ def _about_odometry(log: RobotLog, unseen: bool | None) -> list[str]:
             "or the log is not in order. Stop one of them, or sort the log."
         ]
     if way_of(log) >= LEAST_WAY and abs(straight) <= SIDEWAYS and usual <= SPARSE:
+        share = round(100 * straight)
         return [
-            f"The robot drives ahead for {100 * straight:.0f} % of its way by the odometry. Unless "
-            "it can drive sideways, its headings are wrong: write them in radians, "
-            "counterclockwise."
+            f"The robot drives {'backwards' if share < 0 else 'ahead'} for {abs(share)} % of its "
+            "way by the odometry. Unless it can drive sideways, its headings are wrong: write them "
+            "in radians, counterclockwise."
         ]
     return []
 
