@@ -54,13 +54,13 @@ def test_drive_joins_the_pieces_of_the_existing_map(shared: int) -> None:
         views = [str(i) for i in range(first, stop)]
         return Trace.from_steps(views, ["travel"] * len(gone), displacements=gone, name=name)
 
-    begin, end = along(0, 20, "begin"), along(20 - shared, 40, "end")
+    begin, end = along(0, 35, "begin"), along(35 - shared, 70, "end")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # no common view
-        pieces = solve([begin, end], time_limit=1)
+        pieces = solve(end, onto=solve(begin))
     assert len(pieces[0].pieces) == 2
-    solution = solve(along(0, 40, "all"), onto=pieces)
-    assert len(solution[0].dstates) == len(solution[0].places) == 40
+    solution = solve(along(0, 70, "all"), onto=pieces)
+    assert len(solution[0].dstates) == len(solution[0].places) == 70
     assert len(solution[0].pieces) == 1
     assert solution.trace is not None
     assert check(solution.trace, solution[0], solution.theory) == ()

@@ -1,4 +1,4 @@
-"""Which dstates, and which places, the steps of a trace keep apart."""
+"""Which dstates, and which places, the steps of a trace or an existing map keep apart."""
 
 from __future__ import annotations
 
@@ -6,28 +6,46 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.theory.pairs import pairs_in
 from ssh_abduction.theory.settle import Problem
 
 
 class KeptApart:
-    """The dstates (or the places) of a map that are two, because two of their steps are apart."""
+    """The dstates (or the places) of a map that are two, because two of their steps are apart.
 
-    def __init__(self, labels: Mapping[int, int], pairs: Iterable[tuple[int, int]]) -> None:
-        """Read pairs of steps that are apart. `labels` numbers steps; other steps are left out."""
+    Those of one piece of a map that must be kept are two, as well.
+    """
+
+    def __init__(
+        self,
+        labels: Mapping[int, int],
+        pairs: Iterable[tuple[int, int]],
+        kept: Iterable[tuple[int, int]] = (),
+    ) -> None:
+        """Read pairs of steps that are apart. `labels` numbers steps; other steps are left out.
+
+        `kept` has the numbers that a map keeps apart from each other, each with its piece.
+        """
         size = max(labels.values()) + 1
         self._apart = np.zeros((size, size), bool)
+        for of_piece in gathered((piece, number) for number, piece in kept).values():
+            self._apart[np.ix_(of_piece, of_piece)] = True
         for t, u in pairs:
             if t in labels and u in labels:
                 self._apart[labels[t], labels[u]] = self._apart[labels[u], labels[t]] = True
 
     @staticmethod
-    def of_dstates(problem: Problem, labels: Mapping[int, int]) -> KeptApart:
-        """List the dstates that the evidence about pairs of steps keeps apart."""
-        return KeptApart(labels, pairs_in(problem.pairs.apart))
+    def of_dstates(
+        problem: Problem, labels: Mapping[int, int], kept: Iterable[tuple[int, int]]
+    ) -> KeptApart:
+        """List the dstates that the evidence about pairs of steps, or a map, keeps apart."""
+        return KeptApart(labels, pairs_in(problem.pairs.apart), kept)
 
     @staticmethod
-    def of_places(problem: Problem, labels: Mapping[int, int]) -> KeptApart:
+    def of_places(
+        problem: Problem, labels: Mapping[int, int], kept: Iterable[tuple[int, int]]
+    ) -> KeptApart:
         """List the places that are apart by evidence, or as a travel leads from one to the other.
 
         Travels are ignored if they may stay at a place, or if actions may have slipped.
@@ -36,7 +54,7 @@ class KeptApart:
         leaves = theory.level == "topological" and "travel_leaves" in theory.hard
         travels = [(t, t + 1) for t, action in actions if action.kind == "travel"]
         known = travels if leaves and not theory.slipped else []
-        return KeptApart(labels, [*pairs_in(problem.pairs.elsewhere), *known])
+        return KeptApart(labels, [*pairs_in(problem.pairs.elsewhere), *known], kept)
 
     def includes(self, merged: Sequence[int], first: int, second: int) -> bool:
         """Whether any number merged into `first` is apart from any that is merged into `second`.

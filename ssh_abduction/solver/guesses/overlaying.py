@@ -12,7 +12,7 @@ other.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from statistics import median
@@ -168,9 +168,6 @@ class _State:
         place: For each place, the first place that it is merged with.
         sights: For each first place, what each drive saw of it.
         links: For each first dstate, the dstate that each of its actions leads to.
-        kept: The dstates of a map that must be kept, each with its piece of that map. A dstate that
-            is merged with an earlier one is replaced by that one.
-        kept_places: The places of that map, in the same way.
     """
 
     dstate: list[int]
@@ -180,8 +177,6 @@ class _State:
     mean: Array
     covariance: Array
     nats: float
-    kept: frozenset[tuple[int, int]]
-    kept_places: frozenset[tuple[int, int]]
 
     def copy(self) -> _State:
         """Copy everything that a merge changes in place."""
@@ -215,12 +210,11 @@ class Overlay:
             both.mean,
             both.covariance,
             both.nats + problem.overlap.between(standing.labels, drive.labels),
-            both.kept,
-            frozenset((both.places[s], piece) for s, piece in both.kept),
         )
         at = {t: both.places[s] for t, s in both.labels.items()}
-        self._dstates_apart = KeptApart.of_dstates(problem, both.labels)
-        self._places_apart = KeptApart.of_places(problem, at)
+        self._dstates_apart = KeptApart.of_dstates(problem, both.labels, both.kept)
+        places = ((both.places[s], piece) for s, piece in both.kept)
+        self._places_apart = KeptApart.of_places(problem, at, places)
         # The cost of changed gateways if two places are one; inf if they cannot be.
         self._costs = np.full(2 * (len(both.sights),), math.inf)
         for (p, seen), (q, others) in combinations(enumerate(both.sights), 2):
@@ -281,7 +275,6 @@ class Overlay:
         dstates, places = sorted(set(state.dstate)), sorted(set(state.place))
         number = {s: i for i, s in enumerate(dstates)}
         place = {p: i for i, p in enumerate(places)}
-        kept = frozenset((number[s], piece) for s, piece in state.kept)
         position = both.position[places]
         poses = [*np.stack([position, position + 1], 1).ravel(), *both.heading[dstates]]
         n = 2 * len(places)
@@ -301,7 +294,7 @@ class Overlay:
             state.mean[poses],
             state.covariance[np.ix_(poses, poses)],
             state.nats,
-            kept,
+            frozenset((number[state.dstate[s]], piece) for s, piece in both.kept),
         )
 
     def _lay(self, new: int, at: Array, angle: float, is_turn_known: bool = False) -> None:
@@ -392,7 +385,6 @@ class Overlay:
                 continue
             if not self._look_alike(s, x) or self._dstates_apart.includes(state.dstate, s, x):
                 raise _ClashError
-            state.kept = _merged(state.kept, s, x)
             for action, there in state.links[x].items():
                 if action in state.links[s]:
                     pairs.append((state.links[s][action], there))
@@ -416,7 +408,6 @@ class Overlay:
             raise _ClashError
         if heading is None and not self._may_face(p, q):
             raise _ClashError
-        state.kept_places = _merged(state.kept_places, p, q)
         state.sights[p] = {**state.sights[p], **state.sights[q]}
         state.place = [p if i == q else i for i in state.place]
         same = [(position[p], position[q]), (position[p] + 1, position[q] + 1)]
@@ -480,25 +471,9 @@ class Overlay:
         found = []
         for s, x in combinations(self._dstates_at(place), 2):
             off, square = self._twist(s, x)
-            may_be_one = not _are_of_one(self._state.kept, s, x) and self._look_alike(s, x)
+            is_apart = self._dstates_apart.includes(self._state.dstate, s, x)
+            may_be_one = not is_apart and self._look_alike(s, x)
             is_one_way = abs(off) < TURNED and square < 2 * self._prices[0]
             if is_one_way and may_be_one:
                 found.append((square, (s, x)))
         return found
-
-
-def _are_of_one(kept: Collection[tuple[int, int]], first: int, second: int) -> bool:
-    """Whether two dstates or places are in one piece of the map that must be kept."""
-    return not {k for s, k in kept if s == first}.isdisjoint(k for s, k in kept if s == second)
-
-
-def _merged(
-    kept: frozenset[tuple[int, int]], first: int, second: int
-) -> frozenset[tuple[int, int]]:
-    """Replace the second of two merged dstates or places by the first, if it is kept.
-
-    Raises _ClashError if both are in one piece of the map that must be kept.
-    """
-    if _are_of_one(kept, first, second):
-        raise _ClashError
-    return frozenset((first if s == second else s, piece) for s, piece in kept)
