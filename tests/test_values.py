@@ -480,8 +480,8 @@ def test_solution_of_another_trace_is_refused(tmp_path: Path) -> None:
         match="expected 400, one for each step of the trace, got 23; solve this trace",
     ):
         Solution.load(tmp_path / "maps.json", RECTANGLE)
-    solve([ACES[:4], replace(ACES[3:7], name="b")], max_maps=1).save(tmp_path / "joint.json")
-    with pytest.raises(MapError, match="got 8; the map is of 2 drives, so give their joint trace"):
+    solve([ACES[:4], replace(ACES[3:8], name="b")], max_maps=1).save(tmp_path / "joint.json")
+    with pytest.raises(MapError, match="got 9; the map is of 2 drives, so give their joint trace"):
         Solution.load(tmp_path / "joint.json", ACES)
     other = ACES.with_views(["hall", *ACES.views[1:]])  # type: ignore[list-item]
     with pytest.raises(

@@ -27,7 +27,7 @@ from ssh_abduction.data.regions import course_named, list_in_words, regions_at
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
-from ssh_abduction.solver import Cost, Judging, Misfit, Stop, with_regions
+from ssh_abduction.solver import Cost, Judging, Stop, with_regions
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # The side of a path on which a place is known to lie; "on" if it is on the path.
@@ -162,6 +162,8 @@ class PlaceQuestion(LimitedQuestion[PlaceExplanation]):
         self._changes: tuple[str, ...] = ()
 
     def _find_out(self) -> None:
+        from ssh_abduction.solver import Misfit  # loads numpy
+
         accepts = Judging(self.problem).accepts
         if self._known_maps and accepts(self._known_maps[0]):
             maps = self._maps = tuple(filter(accepts, self._known_maps))
