@@ -97,7 +97,7 @@ PATIENCE, MORE = 10.0, 5.0
 # Finding joins that all cheap maps have takes at most this share of the time, and PATIENCE seconds.
 FORCING = 0.4
 # Estimating rivals may end OVERTIME seconds late. It gets at least LEAST_ESTIMATING seconds.
-OVERTIME, LEAST_ESTIMATING = 0.7, 0.1
+OVERTIME, LEAST_ESTIMATING = 0.5, 0.1
 
 # Lists the minimal maps of a trace and a theory within some seconds, and says whether they are
 # proven.
