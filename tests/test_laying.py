@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from itertools import pairwise
 from pathlib import Path
 from unittest.mock import patch
 
@@ -12,8 +13,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from onto import walks
 
-from ssh_abduction import Solution, Trace, check, solve
+from ssh_abduction import Solution, Theory, Trace, check, solve
 from ssh_abduction.cli import main
+from ssh_abduction.data import Action
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.drives import added_drives
 
@@ -66,6 +68,25 @@ def test_drive_joins_the_pieces_of_the_existing_map(shared: int) -> None:
     assert check(solution.trace, solution[0], solution.theory) == ()
     assert solution.weighed is not None
     assert solution.weighed.bound < solution.weighed.nats
+
+
+def test_piece_that_displacements_do_not_connect_is_kept() -> None:
+    """The displacement of the action "lost" is missing. Views of both parts look alike."""
+    views = [*range(6), *range(3, 9)]
+    old = Trace.from_steps(
+        map(str, views),
+        [Action("travel" if x == s + 1 else "lost", "travel") for s, x in pairwise(views)],
+        displacements=[(5, 0, 0) if x == s + 1 else None for s, x in pairwise(views)],
+    )
+    all_seen = Trace.from_steps("012345678", ["travel"] * 8, displacements=[(5, 0, 0)] * 8)
+    apart = [(3, 6), (4, 7), (5, 8)]
+    before = solve(old, Theory.causal().replace(different=apart))
+    with patch.object(added_drives, "READABLE", 0):
+        solution = solve(all_seen, Theory.causal(), onto=before)
+    assert len(before[0].pieces) == 1
+    assert solution[0].dstate_at[: len(old)] == before[0].dstate_at
+    assert solution.weighed is not None
+    assert solution.weighed.bound <= solution.weighed.nats
 
 
 ROOM = "abcd"  # what a robot sees at the corners of a square room, facing along the wall ahead

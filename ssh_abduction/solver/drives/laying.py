@@ -99,8 +99,8 @@ def unproven(
 ) -> Solution:
     """Make a solution of a joint map that was found without a search.
 
-    It keeps the map of the old drives. `stopped` says why there is no proof. `weighed` has the cost
-    of the map and of its rivals; None if they were not computed.
+    It keeps each piece of the map of the old drives. `stopped` says why there is no proof.
+    `weighed` has the cost of the map and of its rivals; None if they were not computed.
     """
     joint = problem.trace
     return Solution(
@@ -139,7 +139,7 @@ def _costs(ssh_map: SSHMap) -> Iterator[Cost]:
 def _joint_maps(
     existing: ExistingMap, old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem
 ) -> Iterator[SSHMap]:
-    """Yield joint maps that keep the map of the old drives. The caller has to check them."""
+    """Yield joint maps that keep each piece of the old map. The caller has to check them."""
     digest = Digest.of(old, ssh_map, short=True)
     short = existing.with_displacements(digest.trace, digest.labels)
     with warnings.catch_warnings():  # ignore that a digest may equal the new drives

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -39,20 +40,28 @@ class ExistingMap:
         """Fit the poses to the old drives and their map."""
         self.broken = 0.0
         with one_thread("blas"):
-            self._piece, self._mean, self._covariance = Poses.of_map(old, ssh_map).gaussian()
+            self._part_of, self._mean, self._covariance = Poses.of_map(old, ssh_map).gaussian()
+        self._piece = {s: i for i, piece in enumerate(ssh_map.pieces) for s in piece}
         self._places = numbered(-1 - s.id if s.place is None else s.place for s in ssh_map.dstates)
 
     def with_displacements(self, digest: Trace, labels: Sequence[int]) -> Trace:
-        """Give each action of a digest the displacement between the steps before and after it."""
+        """Give each action of a digest the displacement between the steps before and after it.
+
+        It stays unknown if no displacement of the old drives connects these steps.
+        """
         positions = 2 * (max(self._places) + 1)
         at = self._mean[:positions].reshape(-1, 2)[self._places][list(labels)]
         facing = self._mean[positions:][list(labels)]
         gone = vectors_turned(at[1:] - at[:-1], -facing[:-1])
         turns = np.remainder(facing[1:] - facing[:-1] + np.pi, 2 * np.pi) - np.pi
         moves = zip(*gone.T.tolist(), turns.tolist(), strict=True)
+        known = [
+            self._part_of[s] == self._part_of[x] and not action.starts
+            for (s, x), action in zip(pairwise(labels), digest.actions, strict=True)
+        ]
         steps = [
-            step if action.starts else replace(step, displacement=move)
-            for step, action, move in zip(digest.steps[1:], digest.actions, moves, strict=True)
+            replace(step, displacement=move) if is_known else step
+            for step, is_known, move in zip(digest.steps[1:], known, moves, strict=True)
         ]
         return replace(digest, steps=(digest.steps[0], *steps))
 
@@ -65,23 +74,26 @@ class ExistingMap:
         """
         log = Log(problem.trace, problem.theory, problem.pairs)
         joining = Joining(problem, log)
-        pieces = dict.fromkeys(self._piece)
-        yield from joining.maps([self._part(i, labels, log, joining.sights) for i in pieces])
+        parts = dict.fromkeys(self._part_of)
+        yield from joining.maps([self._part(i, labels, log, joining.sights) for i in parts])
         self.broken = joining.broken
 
-    def _part(self, piece: int, labels: Sequence[int], log: Log, sights: Sights) -> Part:
-        """Make the `Part` for a piece of the map. Its cost is 0, as the map must be kept."""
-        dstates = [s for s, other in enumerate(self._piece) if other == piece]
-        number = {s: i for i, s in enumerate(dstates)}
+    def _part(self, number: int, labels: Sequence[int], log: Log, sights: Sights) -> Part:
+        """Make the `Part` for a part of the map that displacements connect.
+
+        Its cost is 0, as the map must be kept.
+        """
+        dstates = [s for s, other in enumerate(self._part_of) if other == number]
+        index = {s: i for i, s in enumerate(dstates)}
         places = list(dict.fromkeys(self._places[s] for s in dstates))
         first = 2 * (max(self._places) + 1)
         entries = [2 * p + k for p in places for k in (0, 1)] + [first + s for s in dstates]
         part = Part.of_steps(
-            {t: number[s] for t, s in enumerate(labels) if s in number},
+            {t: index[s] for t, s in enumerate(labels) if s in index},
             numbered(self._places[s] for s in dstates),
             (self._mean[entries], self._covariance[np.ix_(entries, entries)]),
             0.0,
             log,
             sights,
         )
-        return replace(part, kept=frozenset((s, piece) for s in number.values()))
+        return replace(part, kept=frozenset((i, self._piece[s]) for s, i in index.items()))
