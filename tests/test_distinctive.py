@@ -249,6 +249,16 @@ def test_successive_visits_to_one_place_are_joined() -> None:
     assert (stay.arrived, stay.left) == (0, 2)
 
 
+def test_track_may_leap_far_beside_a_place() -> None:
+    """The odometer may restart unnoticed, for example."""
+    log, track = log_of(FORK, [(1, 0), (18, 0)])
+    leap = np.where(track.poses[:, :1] > 11, [100.0, 0.0, 0.0], 0.0)
+    middles = [
+        visit.middle[0] for visit in find_visits(log, replace(track, poses=track.poses + leap))
+    ]
+    assert any(abs(x - 10) < 1 for x in middles)
+
+
 def test_wide_robot_has_fewer_ways() -> None:
     log, track = log_of(FORK, [(1, 0), (18, 0)])
     assert len(find_visits(log, track, 0.5)) == 3

@@ -223,3 +223,9 @@ def test_maps_of_logs_name_doubtful_joins() -> None:
     )
     question = MapQuestion(None, {}, {}, 0.5, None, 0, ladder=False)
     assert told in question._answer(0, ["a.log"], done, None).line
+    # Neither the second part of x nor the log that is named like one confuses their sources.
+    drives = [{"name": name} for name in ("x", "x part 3", "x part 2")]
+    files["run.json"] = json.dumps({"log": {}, "drives": drives}).encode()
+    answer = question._answer(0, ["x.log", "x part 2.log"], done, None)
+    run = json.loads(dict(answer.files)["run.json"])
+    assert [drive["source"] for drive in run["drives"]] == ["x.log", "x.log", "x part 2.log"]

@@ -4,7 +4,7 @@ odometers."""
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -50,7 +50,7 @@ def stepwise(scans: Sequence[Scan], step: Callable[[int, Pose], Pose | None]) ->
     return with_odometry(scans, poses)
 
 
-def track_and_notes(scans: Sequence[Scan]) -> tuple[Track, str]:
+def track_and_notes(scans: Iterable[Scan]) -> tuple[Track, str]:
     """The track, and the notes on it."""
     _, track, notes = tracked(RobotLog(tuple(scans), source="drive"))
     return track, " ".join(notes)
@@ -64,13 +64,18 @@ def metres(scans: tuple[Scan, ...]) -> float:
     return float(track.way[-1])
 
 
-@pytest.mark.parametrize(("at", "is_timed"), [({65}, True), ({30, 60, 100}, False)])
+@pytest.mark.parametrize(("at", "pause"), [({65}, 0.0), ({65}, 600.0), ({30, 60, 100}, None)])
 def test_track_is_cut_where_the_odometer_restarts(
-    scans: tuple[Scan, ...], metres: float, at: set[int], is_timed: bool
+    scans: tuple[Scan, ...], metres: float, at: set[int], pause: float | None
 ) -> None:
+    """In a pause of 600 seconds, the robot could have driven back to its start."""
     broken = stepwise(scans, lambda i, step: None if i in at else step)
     track, notes = track_and_notes(
-        broken if is_timed else [replace(scan, time=None) for scan in broken]
+        replace(
+            scan,
+            time=None if pause is None or scan.time is None else scan.time + pause * (i >= min(at)),
+        )
+        for i, scan in enumerate(broken)
     )
     assert (set(track.cuts), track.breaks) == (at, ())
     assert track.way[-1] == pytest.approx(metres, abs=3)

@@ -157,7 +157,8 @@ class _Detector:
             elif way - chain.sightings[0].way >= LIFE:
                 self._end(chain)
                 late = [one for one in chain.sightings if one.way >= way - 2 * BESIDE]
-                self._open.append(_Chain(next(self._numbers), late))
+                if late:
+                    self._open.append(_Chain(next(self._numbers), late))
 
     def _junctions_at(self, scan: int) -> list[Junction]:
         """The junctions near the robot in the local map of a scan, the largest first."""

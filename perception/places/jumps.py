@@ -344,7 +344,9 @@ def _impossible(
         timed = (seconds > 0) & ~jumped
         fastest = float(np.percentile(far[timed] / seconds[timed], 95)) if timed.any() else 0.0
         driven = paused & (far <= FASTER * fastest * seconds)
-        jumped, doubtful = jumped & ~driven, doubtful & ~driven
+        # If the odometer restarted, the scan matches only near the previous pose.
+        anew = np.hypot(*log.odometry[1:, :2].T) < ANEW
+        jumped, doubtful = jumped & ~driven, doubtful & ~(driven & ~anew)
     return jumped, doubtful
 
 

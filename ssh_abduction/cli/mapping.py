@@ -228,11 +228,10 @@ class MapQuestion(FileQuestion):
         run = json.loads(files["run.json"])
         run["log"]["source"] = " + ".join(paths)
         run["settings"], run["digest"] = self.settings, content
-        sources, name = iter(paths), ""
+        sources, path = {named_after(path): path for path in paths}, paths[0]
         for drive in run.get("drives", ()):
-            if not (name and drive["name"].startswith(f"{name} part ")):
-                name, path = drive["name"], next(sources)
-            drive["source"] = path
+            # A part of a log after a jump of the odometer has another name than any log.
+            drive["source"] = path = sources.get(drive["name"], path)
         files["run.json"] = (json.dumps(run, indent=2, ensure_ascii=False) + "\n").encode()
         cost, solution = done.solution.cost, done.solution
         told_paths = (
