@@ -47,27 +47,29 @@ def test_onto_lays_drives_on_the_map_one_by_one() -> None:
         assert solution.confidence > 0.99
 
 
-@pytest.mark.parametrize("shared", [0, 1])
-def test_drive_joins_the_pieces_of_the_existing_map(shared: int) -> None:
-    """One common place was too little to join the first two drives."""
+@pytest.mark.parametrize(("places", "shared"), [(5, 1), (70, 0), (70, 1)])
+def test_drive_joins_the_pieces_of_the_existing_map(places: int, shared: int) -> None:
+    """One common place was too little to join the first two drives. Few steps get a search."""
 
     def along(first: int, stop: int, name: str) -> Trace:
         gone = [(2.0 + i % 3, 0, 0) for i in range(first, stop - 1)]
         views = [str(i) for i in range(first, stop)]
         return Trace.from_steps(views, ["travel"] * len(gone), displacements=gone, name=name)
 
-    begin, end = along(0, 35, "begin"), along(35 - shared, 70, "end")
+    middle = places // 2
+    begin, end = along(0, middle, "begin"), along(middle - shared, places, "end")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # no common view
         pieces = solve(end, onto=solve(begin))
     assert len(pieces[0].pieces) == 2
-    solution = solve(along(0, 70, "all"), onto=pieces)
-    assert len(solution[0].dstates) == len(solution[0].places) == 70
+    solution = solve(along(0, places, "all"), onto=pieces)
+    assert len(solution[0].dstates) == len(solution[0].places) == places
     assert len(solution[0].pieces) == 1
     assert solution.trace is not None
     assert check(solution.trace, solution[0], solution.theory) == ()
     assert solution.weighed is not None
-    assert solution.weighed.bound < solution.weighed.nats
+    assert solution.weighed.proven is (places == 5)
+    assert solution.weighed.bound <= solution.weighed.nats
 
 
 def test_piece_that_displacements_do_not_connect_is_kept() -> None:

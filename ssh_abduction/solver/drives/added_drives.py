@@ -80,8 +80,9 @@ def solve_onto(
     """Find the minimal joint maps of new and old drives that keep the map of the old drives.
 
     The existing solution has the trace of the old drives, and its first map is the one to keep. Its
-    theory is the default; steps in a theory are steps of the joint trace. Corrections of a person
-    are obeyed. Raises SolverError without a map or trace, or if the new drive contradicts the map.
+    theory is the default; steps in a theory are steps of the joint trace. With displacements, new
+    drives may join pieces of that map. Corrections of a person are obeyed. Raises SolverError
+    without a map or trace, or if the new drive contradicts the map.
     """
     old, ssh_map = _existing(existing)
     theory = checked_theory(theory or existing.theory.replace(returns=0))
@@ -102,6 +103,9 @@ def solve_onto(
             return _named(on_map, ssh_map, corrections)
     short = solving.speedups.that_hold_for(in_use).digest and in_use.displacement == "none"
     digest = Digest.of(old, ssh_map, short=short)
+    if in_use.weigh == "cost":  # otherwise the smallest map joins all that looks alike
+        pieces = enumerate(ssh_map.pieces)
+        digest = replace(digest, kept={s: i for i, piece in pieces for s in piece})
     with warnings.catch_warnings():  # ignore that a digest may equal the new drive
         warnings.simplefilter("ignore")
         part = together([digest.trace, trace.without_displacements() if short else trace])
@@ -120,7 +124,7 @@ def solve_onto(
     support = Support(
         odometry_warning=found.support.odometry_warning,
         weigh_warning=found.support.weigh_warning,
-        weighed=None if short or not kept else _weighed(found, len(old), ssh_map),
+        weighed=None if short or not kept else _weighed(found, digest, ssh_map),
         onto=tuple(drive.name for drive in drives_of(old)),
     )
     return _named(replace(solution, support=support), ssh_map, corrections)
@@ -248,21 +252,21 @@ def _check_assertions(theory: Theory, old: Trace, ssh_map: SSHMap) -> None:
 def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, joins: bool) -> Theory:
     """Return the theory for a digest and a new drive, with assertions that keep the existing map.
 
-    They say that steps at different dstates or places of that map are different. Assertions of the
+    They say that steps at different dstates or places of a piece are different. Assertions of the
     theory about old steps are moved to steps of the digest. If `joins`, steps at one dstate of that
     map are also asserted to be one dstate. The fast engine for frames can obey such assertions. For
     other theories, they switch fast engines off.
     """
     place = [ssh_map.dstates[s].place for s in digest.labels]
     first = first_index_of(digest.labels)
-    apart, elsewhere = [], []
+    apart: list[tuple[int, int]] = []
+    elsewhere: list[tuple[int, int]] = []
     for s, i in first.items():
         # If equal steps are asserted to be equal, one step of each dstate is enough.
         for x, j in first.items() if joins else ((x, j) for j, x in enumerate(digest.labels)):
-            if s != x and place[i] != place[j]:
-                elsewhere.append((min(i, j), max(i, j)))
-            elif s != x:
-                apart.append((min(i, j), max(i, j)))
+            if digest.must_differ(s, x):
+                pairs = apart if place[i] == place[j] else elsewhere
+                pairs.append((min(i, j), max(i, j)))
     shift = len(digest.labels) - len(old)
 
     def moved(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -285,33 +289,39 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, join
 
 def _keeps(found: SSHMap, digest: Digest, ssh_map: SSHMap) -> bool:
     """Whether a map of a digest and a new drive has the dstates and places of the existing map."""
-    return not any(_broken(found, digest, ssh_map))
+    return not any(_broken(found.dstate_at, _places_in(found), digest, ssh_map))
+
+
+def _places_in(found: SSHMap) -> list[int | None]:
+    """Return the place of each step of a map."""
+    return [found.dstates[s].place for s in found.dstate_at]
 
 
 def _broken(
-    found: SSHMap, digest: Digest, ssh_map: SSHMap
+    dstates: Sequence[int], places: Sequence[int | None], digest: Digest, ssh_map: SSHMap
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Find what a map of a digest and a new drive changes in the existing map.
 
-    Returns pairs of dstates of the existing map that are merged, and pairs of dstates whose places
-    are merged or split. A dstate that is split is paired with itself.
+    The map is given by the dstate and the place of each step. Returns pairs of dstates of the
+    existing map that are merged, and pairs of dstates whose places are merged or split. A dstate
+    that is split is paired with itself.
     """
     number: dict[int, int] = {}
-    split = {
-        (s, s)
-        for s, x in zip(digest.labels, found.dstate_at, strict=False)
-        if number.setdefault(s, x) != x
-    }
-    pairs = list(combinations(number, 2))
+    place: dict[int, int | None] = {}
+    split = set[tuple[int, int]]()
+    for s, x, p in zip(digest.labels, dstates, places, strict=False):
+        place.setdefault(s, p)
+        if number.setdefault(s, x) != x:
+            split.add((s, s))
+    pairs = [pair for pair in combinations(number, 2) if digest.must_differ(*pair)]
     merged = {(s, x) for s, x in pairs if number[s] == number[x]}
-    places = {
+    moved = {
         (s, x)
         for s, x in pairs
-        if (ssh_map.dstates[s].place == ssh_map.dstates[x].place)
-        != (found.dstates[number[s]].place == found.dstates[number[x]].place)
+        if (ssh_map.dstates[s].place == ssh_map.dstates[x].place) != (place[s] == place[x])
         and ssh_map.dstates[s].place is not None
     }
-    return sorted(split | merged), sorted(places)
+    return sorted(split | merged), sorted(moved)
 
 
 def _with_assertions(
@@ -340,16 +350,14 @@ def _with_assertions(
     return again, tuple(m for m in again.maps if _keeps(m, digest, ssh_map))
 
 
-def _weighed(found: Solution, old: int, ssh_map: SSHMap) -> Weighed | None:
+def _weighed(found: Solution, digest: Digest, ssh_map: SSHMap) -> Weighed | None:
     """Return the costs of the maps found, with the rivals that keep the existing map."""
     if found.weighed is None:
         return None
-    dstates = ssh_map.dstate_at
-    places = tuple(ssh_map.dstates[s].place for s in dstates)
     rivals = tuple(
         rival
         for rival in found.weighed.rivals
-        if rival.dstates[:old] == dstates and rival.places[:old] in ((), places)
+        if not any(_broken(rival.dstates, rival.places or rival.dstates, digest, ssh_map))
     )
     return replace(found.weighed, rivals=rivals) if rivals else None
 
@@ -360,7 +368,8 @@ def _contradiction(
     """Make the error that says what contradicts the existing map, and what to do."""
     reason, drives = "no map keeps the existing map", drives_of(old)
     if found.maps:
-        dstates, places = _broken(found.maps[0], digest, ssh_map)
+        best = found.maps[0]
+        dstates, places = _broken(best.dstate_at, _places_in(best), digest, ssh_map)
         first = first_index_of(ssh_map.dstate_at)
         pairs = [
             f"{step_name(drives, first[s])} and {step_name(drives, first[x])}" for s, x in places
@@ -368,7 +377,7 @@ def _contradiction(
         parts = [counted(len(dstates), "dstates")] if dstates else []
         parts += [f"the places of {', '.join(pairs[:3])}"] if pairs else []
         reason = (
-            f"the best map found, of {counted(len(found.maps[0].dstates), 'dstates')}, changes "
+            f"the best map found, of {counted(len(best.dstates), 'dstates')}, changes "
             f"{' and '.join(parts)}"
         )
     new = ", ".join(drive.name for drive in drives_of(trace))

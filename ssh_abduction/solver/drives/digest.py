@@ -6,7 +6,8 @@ of all drives.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 from ssh_abduction.data.action import Action
 from ssh_abduction.data.maps import SSHMap
@@ -16,13 +17,18 @@ from ssh_abduction.data.trace import Trace
 
 @dataclass(frozen=True)
 class Digest:
-    """A short trace that the solver gets instead of the old drives, with the labels of its steps.
+    """A short trace that the solver gets instead of the old drives.
 
-    A label is the dstate in the existing map.
+    Attributes:
+        trace: The short trace.
+        labels: For each step, its dstate in the existing map.
+        kept: For each dstate, the part of the existing map that must be kept; empty if the whole
+            map must be kept.
     """
 
     trace: Trace
     labels: tuple[int, ...]
+    kept: Mapping[int, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, trace: Trace, ssh_map: SSHMap, *, short: bool) -> Digest:
@@ -46,6 +52,10 @@ class Digest:
                 steps.append(replace(step, action=None))
                 labels.append(s)
         return cls(Trace(tuple(steps), drive="standing"), tuple(labels))
+
+    def must_differ(self, dstate: int, other: int) -> bool:
+        """Whether two dstates of the existing map must stay two, and their places as they are."""
+        return dstate != other and self.kept.get(dstate) == self.kept.get(other)
 
     def labels_of_all(self, found: SSHMap, ssh_map: SSHMap) -> tuple[int, ...]:
         """Return the dstate of each step of all drives in the map `found`."""
