@@ -471,9 +471,11 @@ class Overlay:
         found = []
         for s, x in combinations(self._dstates_at(place), 2):
             off, square = self._twist(s, x)
-            is_apart = self._dstates_apart.includes(self._state.dstate, s, x)
-            may_be_one = not is_apart and self._look_alike(s, x)
             is_one_way = abs(off) < TURNED and square < 2 * self._prices[0]
-            if is_one_way and may_be_one:
+            if (
+                is_one_way
+                and self._look_alike(s, x)
+                and not self._dstates_apart.includes(self._state.dstate, s, x)
+            ):
                 found.append((square, (s, x)))
         return found
