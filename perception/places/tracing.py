@@ -102,7 +102,7 @@ def with_drives(trace: Trace, part: Sequence[int], known: Collection[int]) -> Tr
     steps, drives = list(trace.steps), 1
     for t, (last, step) in enumerate(pairwise(trace.steps)):
         before, here = (part[int(one.extra["visit"])] for one in (last, step))
-        if before != here in known:
+        if here != before and here in known:
             drives += 1
             called = f"{trace.name} part {drives}" if trace.name else f"drive {drives}"
             steps[t] = replace(last, action=Action(called, "start"))

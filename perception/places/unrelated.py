@@ -31,7 +31,7 @@ from ssh_abduction.data.groups import NodeClasses, gathered
 NEAR, DRIFT, TWIST = 0.7, 0.05, math.radians(10)
 VOTES = 3
 TURNS = [k * TURN for k in range(round(math.tau / TURN))]
-# Of a drive with cuts, about this many visits are matched, as the time grows with the square.
+# Of a drive with cuts, at most this many visits are matched, as the time grows with the square.
 MATCHED = 200
 
 

@@ -36,7 +36,8 @@ def likely_moves(
     """Guess the displacements that lead to the `missing` steps.
 
     `moved`, of shape (n, 3), has the displacement that leads to each step, in metres and radians.
-    `dstates` and `places` have the dstate and the place of each step.
+    `dstates` and `places` have the dstate and the place of each step. `closures` are used where
+    these say nothing.
     """
     begins = [0, *sorted(missing)]
     stretch = [range(a, b) for a, b in pairwise([*begins, len(moved)])]
