@@ -74,8 +74,8 @@ def add_parser(verbs: Verbs) -> None:
         "steps",
         "the numbers of two steps, from 0, or DRIVE:STEP in a joint trace. Leave them out to "
         "learn why there is no map. Or a place and a path, such as p7 path2, or a place alone, to "
-        "learn on which side of each path and in which regions it is. They are of the first "
-        "minimal map or, with a file of maps, of its first map, and may also be named",
+        "learn on which side of each path and in which regions it is. They belong to the first "
+        "minimal map. With a file of maps, they belong to its first map, and names work, too",
         nargs="*",
         default=(),
         metavar="step",
