@@ -47,14 +47,16 @@ def test_onto_lays_drives_on_the_map_one_by_one() -> None:
         assert solution.confidence > 0.99
 
 
+def along(first: int, stop: int, name: str) -> Trace:
+    """Make a drive past the places first … stop - 1 of one street."""
+    gone = [(2.0 + i % 3, 0, 0) for i in range(first, stop - 1)]
+    views = [str(i) for i in range(first, stop)]
+    return Trace.from_steps(views, ["travel"] * len(gone), displacements=gone, name=name)
+
+
 @pytest.mark.parametrize(("places", "shared"), [(5, 1), (70, 0), (70, 1)])
 def test_drive_joins_the_pieces_of_the_existing_map(places: int, shared: int) -> None:
     """One common place was too little to join the first two drives. Few steps get a search."""
-
-    def along(first: int, stop: int, name: str) -> Trace:
-        gone = [(2.0 + i % 3, 0, 0) for i in range(first, stop - 1)]
-        views = [str(i) for i in range(first, stop)]
-        return Trace.from_steps(views, ["travel"] * len(gone), displacements=gone, name=name)
 
     middle = places // 2
     begin, end = along(0, middle, "begin"), along(middle - shared, places, "end")
@@ -70,6 +72,15 @@ def test_drive_joins_the_pieces_of_the_existing_map(places: int, shared: int) ->
     assert solution.weighed is not None
     assert solution.weighed.proven is (places == 5)
     assert solution.weighed.bound <= solution.weighed.nats
+
+
+@pytest.mark.filterwarnings("ignore:views. trace")
+def test_laid_drive_joins_one_piece_if_a_person_denies_the_other() -> None:
+    """Two places of the pieces are said to be apart. The drive saw both as one place."""
+    pieces = solve(along(35, 70, "end"), onto=solve(along(0, 36, "begin")))
+    denied = pieces.theory.replace(returns=0, elsewhere=[(35, 36)])
+    solution = solve(along(0, 70, "all"), denied, onto=pieces)
+    assert (len(solution[0].dstates), len(solution[0].pieces)) == (105, 2)
 
 
 def test_piece_that_displacements_do_not_connect_is_kept() -> None:

@@ -109,7 +109,7 @@ def solve_onto(
     with warnings.catch_warnings():  # ignore that a digest may equal the new drive
         warnings.simplefilter("ignore")
         part = together([digest.trace, trace.without_displacements() if short else trace])
-    pinned = _pinned(theory, digest, ssh_map, old, joins=in_use.star == "frame")
+    pinned = _pinned(theory, digest, ssh_map, joins=in_use.star == "frame")
     found = solving.solve(part, pinned)
     kept = tuple(m for m in found.maps if _keeps(m, digest, ssh_map))
     ended = found.stopped in _LIMITS
@@ -249,7 +249,7 @@ def _check_assertions(theory: Theory, old: Trace, ssh_map: SSHMap) -> None:
                 )
 
 
-def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, joins: bool) -> Theory:
+def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, *, joins: bool) -> Theory:
     """Return the theory for a digest and a new drive, with assertions that keep the existing map.
 
     They say that steps at different dstates or places of a piece are different. Assertions of the
@@ -267,23 +267,15 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, old: Trace, *, join
             if digest.must_differ(s, x):
                 pairs = apart if place[i] == place[j] else elsewhere
                 pairs.append((min(i, j), max(i, j)))
-    shift = len(digest.labels) - len(old)
-
-    def moved(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-        steps = [
-            tuple(first[ssh_map.dstate_at[t]] if t < len(old) else t + shift for t in pair)
-            for pair in pairs
-        ]
-        return [(i, j) for i, j in steps if i != j]
-
-    same = [pair for pair in moved(theory.same) if max(pair) >= len(digest.labels)]
+    labels = ssh_map.dstate_at
+    same = [pair for pair in digest.moved(theory.same, labels) if max(pair) >= len(digest.labels)]
     if joins:
         same += [(first[s], t) for t, s in enumerate(digest.labels) if first[s] != t]
     return theory.replace(
         same=tuple(same),
-        different=(*moved(theory.different), *apart),
-        elsewhere=(*moved(theory.elsewhere), *elsewhere),
-        same_place=tuple(moved(theory.same_place)),
+        different=(*digest.moved(theory.different, labels), *apart),
+        elsewhere=(*digest.moved(theory.elsewhere, labels), *elsewhere),
+        same_place=tuple(digest.moved(theory.same_place, labels)),
     )
 
 

@@ -6,10 +6,11 @@ of all drives.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from ssh_abduction.data.action import Action
+from ssh_abduction.data.groups import first_index_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace
@@ -56,6 +57,21 @@ class Digest:
     def must_differ(self, dstate: int, other: int) -> bool:
         """Whether two dstates of the existing map must stay two, and their places as they are."""
         return dstate != other and self.kept.get(dstate) == self.kept.get(other)
+
+    def moved(
+        self, pairs: Iterable[tuple[int, int]], labels: Sequence[int]
+    ) -> list[tuple[int, int]]:
+        """Move pairs of steps of all drives to the trace of this digest and the new drives.
+
+        `labels` has the dstate of each step of the old drives. A pair of such steps at one dstate
+        is left out.
+        """
+        first, shift = first_index_of(self.labels), len(self.labels) - len(labels)
+        steps = (
+            tuple(first[labels[t]] if t < len(labels) else t + shift for t in pair)
+            for pair in pairs
+        )
+        return [(i, j) for i, j in steps if i != j]
 
     def labels_of_all(self, found: SSHMap, ssh_map: SSHMap) -> tuple[int, ...]:
         """Return the dstate of each step of all drives in the map `found`."""

@@ -145,9 +145,15 @@ def _joint_maps(
     with warnings.catch_warnings():  # ignore that a digest may equal the new drives
         warnings.simplefilter("ignore")
         part = together([replace(short, odometry=old.odometry), trace])
-    # The joint map is checked against what a user asserts, as that is about other step numbers.
-    free = problem.theory.replace(same=(), different=(), elsewhere=(), same_place=())
-    for found in existing.maps(Problem.of(part, free), digest.labels):
+    theory, labels = problem.theory, ssh_map.dstate_at
+    # The joint map is checked against all that a user asserts.
+    asserted = theory.replace(
+        same=(),
+        different=tuple(digest.moved(theory.different, labels)),
+        elsewhere=tuple(digest.moved(theory.elsewhere, labels)),
+        same_place=(),
+    )
+    for found in existing.maps(Problem.of(part, asserted), digest.labels):
         if whole := _of_all(found, digest.labels_of_all(found, ssh_map), problem):
             yield whole
 
