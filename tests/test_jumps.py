@@ -156,6 +156,12 @@ def test_note_says_that_a_second_drive_may_begin_at_a_jump(scans: tuple[Scan, ..
     assert "If a second drive begins there, cut the log there." in notes
 
 
+def test_restart_after_a_pause_may_be_a_second_drive(scans: tuple[Scan, ...]) -> None:
+    parts = stepwise(scans, lambda i, step: None if i == 60 else step)
+    late = tuple(replace(scan, time=(scan.time or 0.0) + 600) for scan in parts[60:])
+    assert unknown_steps(RobotLog((*parts[:60], *late))) == Unknown(seams=frozenset({60}))
+
+
 def test_missing_scans_with_good_odometry_are_no_jump(scans: tuple[Scan, ...]) -> None:
     assert unknown_steps(RobotLog((*scans[:60], *scans[75:]))) == Unknown()
 

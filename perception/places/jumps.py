@@ -310,6 +310,9 @@ def unknown_steps(log: RobotLog) -> Unknown:
     )
     jumped, doubtful = _impossible(log, seconds, paused)
     seams = frozenset(scan for scan, _ in seams_of(log))
+    # After a long step in a pause, the odometer may have restarted.
+    far, anew = _far(log, 1), np.hypot(*log.odometry[1:, :2].T) < ANEW
+    seams |= _targets(paused & anew & (far > FAR / 2) & ~jumped)
     carried, still = _moved_while_still(log, paused)
     moved = frozenset(k for first, last in still for k in range(first, last + 1))
     return Unknown(
@@ -344,9 +347,7 @@ def _impossible(
         timed = (seconds > 0) & ~jumped
         fastest = float(np.percentile(far[timed] / seconds[timed], 95)) if timed.any() else 0.0
         driven = paused & (far <= FASTER * fastest * seconds)
-        # If the odometer restarted, the scan matches only near the previous pose.
-        anew = np.hypot(*log.odometry[1:, :2].T) < ANEW
-        jumped, doubtful = jumped & ~driven, doubtful & ~(driven & ~anew)
+        jumped, doubtful = jumped & ~driven, doubtful & ~driven
     return jumped, doubtful
 
 
