@@ -82,8 +82,8 @@ def solve(
         on_progress: A function that is called now and then with a `Progress`.
         corrections: Names and corrections of a person, to be obeyed.
         onto: The solution of earlier drives, with their trace. The new drive is added to its first
-            map: all maps found have the dstates and places of that map. This takes about as long as
-            solving the new drive.
+            map: all maps found have the dstates and places of that map. The new drive may join its
+            pieces. This takes about as long as solving the new drive.
 
     Returns:
         The maps, their cost, and what is proven about them.
