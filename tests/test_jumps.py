@@ -98,18 +98,18 @@ def test_trace_has_no_displacement_across_a_cut(
     assert not check(done.trace, solution.maps[0], solution.theory)
 
 
-def test_drive_starts_at_each_part_that_closures_connect() -> None:
-    """The part of visit 2 is not connected, and visits 3 and 4 are in one part."""
+def test_drive_starts_at_each_part_of_a_log() -> None:
+    """Visits 3 and 4 are in one part, and no visit is in part 2."""
     steps = [
         Step(view="a", action=Action.of("travel"), extra={"visit": visit}) for visit in range(5)
     ]
     trace = Trace((*steps[:-1], replace(steps[-1], action=None)), name="drive")
-    found = with_drives(trace, [0, 1, 2, 3, 3], known=[1, 3])
-    assert starts_of(found) == (1, 3)
+    found = with_drives(trace, [0, 0, 1, 3, 3])
+    assert starts_of(found) == (2, 3)
     assert [drive.name for drive in drives_of(found)] == ["drive", "drive part 2", "drive part 3"]
-    unnamed = with_drives(replace(trace, name=None), [0, 0, 0, 1, 1], known=[1])
+    unnamed = with_drives(replace(trace, name=None), [0, 0, 0, 1, 1])
     assert [drive.name for drive in drives_of(unnamed)] == ["drive 1", "drive 2"]
-    assert with_drives(trace, [0, 0, 1, 1, 1], known=[]) == trace
+    assert with_drives(trace, [0] * 5) == trace
 
 
 def test_stuck_odometer_is_replaced_by_scan_matching(

@@ -43,7 +43,7 @@ from perception.places.partings import with_partings
 from perception.places.tracing import DRIFT, to_trace, with_drives
 from perception.places.track import Track
 from perception.places.units import HOPELESS
-from perception.places.unrelated import closures_across_cuts, connected_parts, parts_of
+from perception.places.unrelated import closures_across_cuts, parts_of
 from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Damage, RobotLog, Scan
 from perception.reciprocal import ReciprocalTransformer
@@ -213,10 +213,8 @@ def _imported(
         track = calibrated(track, visits, closings)
         visits, closings = with_partings(track, visits, closings)
         across, part = closures_across_cuts(track, visits), parts_of(track, visits)
-        trace = to_trace(log, track, visits, [*closings, *across], name)
-        known = connected_parts([(part[found.first], part[found.last]) for found in across])
-        trace = with_drives(trace, part, known)
-        starts = tuple(track.cuts[number - 1] for number in known)
+        trace = with_drives(to_trace(log, track, visits, [*closings, *across], name), part)
+        starts = tuple(track.cuts[number - 1] for number in sorted({*part})[1:])
     with _timed(seconds, "views"):
         trace = with_views(trace)
     return Imported(trace, track, width, visits, seconds, notes, starts)

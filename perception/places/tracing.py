@@ -9,7 +9,7 @@ to its heading.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -89,20 +89,17 @@ def to_trace(
     )
 
 
-def with_drives(trace: Trace, part: Sequence[int], known: Collection[int]) -> Trace:
-    """Let a drive start at the first step of some parts of a trace.
-
-    The motion to such a step is unknown, but closures say where it is.
+def with_drives(trace: Trace, part: Sequence[int]) -> Trace:
+    """Let a drive start at the first step of each part of a trace, as the motion to it is unknown.
 
     Args:
         trace: The trace of a log.
         part: For each visit, the number of its part.
-        known: The numbers of the parts that closures connect to earlier ones.
     """
     steps, drives = list(trace.steps), 1
     for t, (last, step) in enumerate(pairwise(trace.steps)):
         before, here = (part[int(one.extra["visit"])] for one in (last, step))
-        if here != before and here in known:
+        if here != before:
             drives += 1
             called = f"{trace.name} part {drives}" if trace.name else f"drive {drives}"
             steps[t] = replace(last, action=Action(called, "start"))

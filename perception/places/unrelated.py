@@ -13,9 +13,9 @@ The parts of a drive before and after a cut of its track are like two drives.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, chain, combinations
+from itertools import accumulate, combinations
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from perception.places.closures import KEPT, TURN, VisitMatch, is_reliable
 from perception.places.matching import Scene, Turned, match
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit, patches_of
-from ssh_abduction.data.groups import NodeClasses, gathered
+from ssh_abduction.data.groups import gathered
 
 # A match predicts where the visit of another match is. Two matches agree if this is right to within
 # NEAR metres, plus DRIFT metres for each metre between the two visits, and if their rotations
@@ -50,19 +50,6 @@ def parts_of(track: Track, visits: Sequence[Visit]) -> list[int]:
     """Return, for each visit, how many cuts of the track are before it."""
     scans = [visit.scan for visit in visits]
     return [int(count) for count in np.searchsorted(track.cuts, scans, "right")]
-
-
-def connected_parts(pairs: Collection[tuple[int, int]]) -> list[int]:
-    """List the parts that pairs connect to earlier parts, directly or over other parts.
-
-    >>> connected_parts([(1, 3), (0, 3), (5, 6)])
-    [1, 3, 6]
-    """
-    groups = NodeClasses[int]()
-    for first, last in pairs:
-        groups.merge(first, last)
-    members = gathered((groups.of(part), part) for part in sorted({*chain(*pairs)}))
-    return sorted(part for _, *later in members.values() for part in later)
 
 
 def closures_across_cuts(track: Track, visits: Sequence[Visit]) -> list[VisitMatch]:
