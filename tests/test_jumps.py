@@ -98,18 +98,19 @@ def test_trace_has_no_displacement_across_a_cut(
     assert not check(done.trace, solution.maps[0], solution.theory)
 
 
-def test_drive_starts_at_each_part_of_a_log() -> None:
-    """Visits 3 and 4 are in one part, and no visit is in part 2."""
+def test_drive_starts_where_the_odometer_jumped() -> None:
+    """At visit 3 the odometer stood still, and before visit 5 the robot was carried."""
     steps = [
-        Step(view="a", action=Action.of("travel"), extra={"visit": visit}) for visit in range(5)
+        Step(view="a", action=Action.of("travel"), extra={"visit": visit}) for visit in range(6)
     ]
+    steps[4] = replace(steps[4], action=Action.that_slipped(4))
     trace = Trace((*steps[:-1], replace(steps[-1], action=None)), name="drive")
-    found = with_drives(trace, [0, 0, 1, 3, 3])
-    assert starts_of(found) == (2, 3)
+    found = with_drives(trace, [0, 1, 2, 4, 4, 5])
+    assert starts_of(found) == (1, 2)
     assert [drive.name for drive in drives_of(found)] == ["drive", "drive part 2", "drive part 3"]
-    unnamed = with_drives(replace(trace, name=None), [0, 0, 0, 1, 1])
+    unnamed = with_drives(replace(trace, name=None), [0, 0, 0, 1, 1, 1])
     assert [drive.name for drive in drives_of(unnamed)] == ["drive 1", "drive 2"]
-    assert with_drives(trace, [0] * 5) == trace
+    assert with_drives(trace, [0] * 6) == trace
 
 
 def test_stuck_odometer_is_replaced_by_scan_matching(

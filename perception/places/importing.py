@@ -49,6 +49,7 @@ from perception.readers.scans import Damage, RobotLog, Scan
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
 from ssh_abduction.data.checks import a_number
+from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.loggers import log_of
@@ -214,7 +215,8 @@ def _imported(
         visits, closings = with_partings(track, visits, closings)
         across, part = closures_across_cuts(track, visits), parts_of(track, visits)
         trace = with_drives(to_trace(log, track, visits, [*closings, *across], name), part)
-        starts = tuple(track.cuts[number - 1] for number in sorted({*part})[1:])
+        begun = (part[int(trace.steps[t].extra["visit"])] for t in starts_of(trace))
+        starts = tuple(track.cuts[number - 1] for number in begun)
     with _timed(seconds, "views"):
         trace = with_views(trace)
     return Imported(trace, track, width, visits, seconds, notes, starts)

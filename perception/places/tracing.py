@@ -90,16 +90,19 @@ def to_trace(
 
 
 def with_drives(trace: Trace, part: Sequence[int]) -> Trace:
-    """Let a drive start at the first step of each part of a trace, as the motion to it is unknown.
+    """Let a drive start where the odometer jumped, as the motion to that step is unknown.
+
+    Several cuts between two visits are an odometer that stood still, and not a jump.
 
     Args:
         trace: The trace of a log.
-        part: For each visit, the number of its part.
+        part: For each visit, how many cuts of the track are before it.
     """
     steps, drives = list(trace.steps), 1
     for t, (last, step) in enumerate(pairwise(trace.steps)):
         before, here = (part[int(one.extra["visit"])] for one in (last, step))
-        if here != before:
+        slipped = last.action is not None and last.action.slipped  # the robot was carried
+        if here == before + 1 and not slipped:
             drives += 1
             called = f"{trace.name} part {drives}" if trace.name else f"drive {drives}"
             steps[t] = replace(last, action=Action(called, "start"))
