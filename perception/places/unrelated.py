@@ -54,6 +54,8 @@ def parts_of(track: Track, visits: Sequence[Visit]) -> list[int]:
 
 def closures_across_cuts(track: Track, visits: Sequence[Visit]) -> list[VisitMatch]:
     """Find the closures between visits before and after cuts of the track of one drive."""
+    if not track.cuts:
+        return []
     some = range(0, len(visits), 1 + len(visits) // MATCHED)
     parts = gathered(zip(parts_of(track, visits)[:: some.step], visits[:: some.step], strict=True))
     return [

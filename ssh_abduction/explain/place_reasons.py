@@ -162,15 +162,16 @@ class PlaceQuestion(LimitedQuestion[PlaceExplanation]):
         self._changes: tuple[str, ...] = ()
 
     def _find_out(self) -> None:
-        from ssh_abduction.solver import Misfit  # loads numpy
-
         accepts = Judging(self.problem).accepts
         if self._known_maps and accepts(self._known_maps[0]):
             maps = self._maps = tuple(filter(accepts, self._known_maps))
             self._possible = True
             cost: Cost | None = Cost.of(maps[0])
-            weighs = self.theory.weigh == "cost"
-            nats = Misfit(self.problem).nats_of(maps[0]) if weighs else None
+            nats = None
+            if self.theory.weigh == "cost":
+                from ssh_abduction.solver import Misfit  # loads numpy
+
+                nats = Misfit(self.problem).nats_of(maps[0])
         else:
             search = self._solved(self.trace, self.theory, LISTED, self._watch.left())
             solution = search.solution(tuple(search))
