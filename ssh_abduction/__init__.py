@@ -45,7 +45,7 @@ _MOVED = {"Path": "data.MapPath", "SSHError": "data.AbductionError"} | {
         "data": "Action DState Fit LocaliserError MapError Odometry Pose RangeError SolverError "
         "Step TheoryError TraceError",
         "evaluation": "Evaluation MapEvaluation VisitsEvaluation evaluate_visits",
-        "evaluation.ladder": "Rung ladder",
+        "evaluation.rungs": "Rung ladder",
         "online": "Belief Chances Exploration Move Route",
         "page": "Page",
         "rivals": "Comparison Difference Experiment Listing difference",

@@ -53,7 +53,7 @@ from ssh_abduction.data import (
     save_corrections,
 )
 from ssh_abduction.evaluation import evaluate_visits
-from ssh_abduction.evaluation.ladder import ladder
+from ssh_abduction.evaluation.rungs import ladder
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.online import Chances
 from ssh_abduction.rivals import Listing, difference

@@ -13,7 +13,7 @@ import truth
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import Odometry
-from ssh_abduction.evaluation.ladder import UnderWay, ladder
+from ssh_abduction.evaluation.rungs import UnderWay, ladder
 
 SQUARE = Trace.from_steps(
     "ab" * 4 + "a", ["travel", "right"] * 4, displacements=[(10, 0, 0), (0, 0, -1.5708)] * 4

@@ -39,6 +39,7 @@ from ssh_abduction.cli import (
     facts,
     import_log,
     ladder,
+    list_axioms,
     localise,
     map_logs,
     naming,
@@ -47,7 +48,6 @@ from ssh_abduction.cli import (
     show,
     simulate,
     solve,
-    theory,
     train,
     view,
 )
@@ -76,7 +76,7 @@ VERBS: Mapping[str, tuple[ModuleType, ...]] = {
     "use: drive and localise by a map": (localise, route, show, export, view, naming, correct),
     "learn: recognise places from images": (train,),
     "make: simulated robots and the paper's experiments": (simulate, reproduction, examples),
-    "about: the axioms, their input, and your shell": (theory, facts, completion),
+    "about: the axioms, their input, and your shell": (list_axioms, facts, completion),
 }
 WORDS = (
     "A trace lists the steps of a drive. Each step has a view (the class of the image there), the "

@@ -17,7 +17,7 @@ from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop
 
 if TYPE_CHECKING:
-    from ssh_abduction.evaluation.ladder import Rung
+    from ssh_abduction.evaluation.rungs import Rung
 
 UNKNOWN = "–"
 HEAD = ("", "minimal maps", "dstates", "places", "paths", "the true one", "accuracy", "seconds")
@@ -48,7 +48,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.evaluation.ladder import UnderWay, ladder  # loads scipy
+    from ssh_abduction.evaluation.rungs import UnderWay, ladder  # loads scipy
 
     trace, theory = Trace.load(options.trace), theory_of(options)
     rungs: list[Rung] = []

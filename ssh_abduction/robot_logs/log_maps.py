@@ -34,7 +34,7 @@ from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
+from ssh_abduction.evaluation.rungs import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import report
 from ssh_abduction.runtime.deprecated import renamed_parameters

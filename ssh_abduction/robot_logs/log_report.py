@@ -18,7 +18,7 @@ from ssh_abduction.checker.joins import joins_in_words
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.files import filled
 from ssh_abduction.data.words import counted
-from ssh_abduction.evaluation.ladder import Rung
+from ssh_abduction.evaluation.rungs import Rung
 from ssh_abduction.output.drawing import escaped
 from ssh_abduction.output.undecided import place_of_steps
 from ssh_abduction.rivals.drive_joins import joins_of_drives

@@ -6,7 +6,7 @@ pair of steps tested alone, "+ geometry" tests two such pairs together, and "+ p
 that the map can be drawn without a crossing.
 
 >>> from ssh_abduction import Theory, Trace
->>> from ssh_abduction.evaluation.ladder import ladder
+>>> from ssh_abduction.evaluation.rungs import ladder
 >>> square = [(10, 0, 0), (0, 0, -1.5708)] * 4
 >>> trace = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=square)
 >>> [(rung.name, rung.solution.cost.places, rung.solution.count) for rung in ladder(trace)]
