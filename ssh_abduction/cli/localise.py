@@ -85,7 +85,7 @@ def add_parser(verbs: Verbs) -> None:
         default=False,
     )
     parser.add(
-        "--plot PNG", "draw how unsure the belief is at each step (its entropy)", type=picture_file
+        "--plot PNG", "draw into this file how unsure the belief is at each step", type=picture_file
     )
     parser.add("--json", "print JSON")
 

@@ -172,7 +172,7 @@ class Obeying:
         alone = [self.trace[t : t + 1].without_displacements() for t in steps]
         nothing: dict[str, Any] = dict.fromkeys(ASSERTIONS, ())
         theory = self.without.replace(displacement="none", **{**nothing, said.kind: ((0, 1),)})
-        with warnings.catch_warnings():  # ignore that two steps may show the same, or nothing alike
+        with warnings.catch_warnings():  # of drives that are equal, or have nothing in common
             warnings.simplefilter("ignore")
             return explain(together(alone, ["first", "second"]), theory) is not None
 

@@ -49,7 +49,7 @@ def _with_regions(ssh_map: SSHMap) -> str:
 
 
 def named_maps(found: Sequence[SSHMap], data: Any, file: str) -> tuple[SSHMap, ...]:
-    """Return the maps found in the data of a file, with the names beside it. Raises MapError."""
+    """Return the maps found in a file, with the names of corrections.yaml. Raises MapError."""
     steps = len(found[0].dstate_at) if found else 0
     drives = drives_in(FieldReader(file), data, steps) if found else ()
     return named_beside(found, drives, file)

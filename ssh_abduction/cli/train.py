@@ -49,7 +49,7 @@ def add_parser(verbs: Verbs) -> None:
         "folds N", "number of folds of the cross-validation (default: 10)", 10, type=int
     )
     curve.add("--seed", "random seed of the folds (default: 0)", type=seed, default=0)
-    curve.add("--plot PNG", "draw the learning curve", type=picture_file)
+    curve.add("--plot PNG", "draw the learning curve into this file", type=picture_file)
     curve.add("--json", "print JSON")
     apart = verbs.add(
         "tell-apart",
@@ -61,7 +61,7 @@ def add_parser(verbs: Verbs) -> None:
     apart.add(
         "--dstates I,J", "two dstates of the map (default: each pair that shares a view)", type=pair
     )
-    apart.add("--plot PNG", "draw the beams over the scans", type=picture_file)
+    apart.add("--plot PNG", "draw the beams over the scans, into this file", type=picture_file)
     apart.add("--json", "print how much each beam helps, by each method, as JSON")
     for parser in (train, curve, apart):
         add_maps(parser)

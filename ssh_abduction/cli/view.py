@@ -61,7 +61,10 @@ def add_parser(verbs: Verbs) -> None:
         dest="followed",
         type=trace_path,
     )
-    parser.add("--belief FILE", "output of localise --json for the trace of --run, or for TRACE")
+    parser.add(
+        "--belief FILE",
+        "file with what localise --json printed for the trace of --run, or for TRACE",
+    )
     parser.add(
         "--serve",
         "serve the page, on this computer only, so that it can explain why two steps are one "

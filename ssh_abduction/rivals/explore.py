@@ -272,7 +272,7 @@ class Laboratory:
         best: tuple[float, int, int] | None = None  # gain per action, row, action
         for layer in walk.layers():
             if best and math.log(total / least) / (layer.depth + 1) <= best[0]:
-                break  # no longer sequence can gain more
+                break  # longer sequences gain less per action
             for first, action, there, seen in walk.moves(layer):
                 differ = (there >= 0).all(axis=1) & (seen != seen[:, :1]).any(axis=1)
                 for i in np.flatnonzero(differ).tolist():

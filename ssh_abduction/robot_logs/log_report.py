@@ -156,7 +156,7 @@ def _faults(solution: Solution) -> str:
 
 
 def _settings(run: Mapping[str, Any]) -> str:
-    """Make the table of the settings: what counts as a place, and the theory."""
+    """Make the table of the settings: what is a place, the width of the robot, the theory."""
     told = ((n, value) for n, value in run["theory"].items() if value not in (None, False, [], 0))
     theory = ", ".join(f"{name} {value}" for name, value in told)
     why = "where the free space forks, or the robot turned, began or ended"

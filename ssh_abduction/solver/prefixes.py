@@ -193,7 +193,7 @@ class Prefixes:
     def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
         """Begin again with more names for paths, if the proof of this cost needs them."""
         if not isinstance(self.engine, StepEngine):
-            return False  # names for paths are never short
+            return False  # other engines always have enough names for paths
         needed = paths_needed(self._task, self.engine.size, cost)
         if needed <= self.engine.paths:
             return False

@@ -85,7 +85,7 @@ class Misfit:
     ) -> float:
         """Return half the misfit of a whole course, as `of_course`, and the price of crowding.
 
-        This is the price of places at one position.
+        Crowding is that two places are at one position.
         """
         headings, positions, _ = groups = _groups_of(dstates, places, wrong)
         square, at = self._of_groups(groups)

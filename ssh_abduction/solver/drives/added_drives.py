@@ -84,6 +84,7 @@ def solve_onto(
     drives may join pieces of that map. Corrections of a person are obeyed. Raises SolverError
     without a map or trace, or if the new drive contradicts the map.
     """
+    # 1. The joint problem, of old and new drives.
     old, ssh_map = _existing(existing)
     theory = checked_theory(theory or existing.theory.replace(returns=0))
     _check_theory(theory, existing)
@@ -95,12 +96,16 @@ def solve_onto(
     _check_assertions(theory, old, ssh_map)
     problem = settle(joint, theory)
     in_use = problem.theory
+
+    # 2. Long drives: map the new ones alone, and lay their maps on the old map.
     if solving.speedups.greedy and len(joint) > READABLE and can_lay(in_use):
         judged = all(getattr(in_use, f) == getattr(existing.theory, f) for f in _JUDGES)
         since = len(old) if judged else 0
         on_map = _laid_in_time(old, ssh_map, trace, problem, solving.watch, since)
         if on_map is not None:
             return _named(on_map, ssh_map, corrections)
+
+    # 3. A short trace that stands for the old map (its digest), and the new drive.
     short = solving.speedups.that_hold_for(in_use).digest and in_use.displacement == "none"
     digest = Digest.of(old, ssh_map, short=short)
     if in_use.weigh == "cost":  # otherwise the smallest map joins all that looks alike
@@ -109,12 +114,16 @@ def solve_onto(
     with warnings.catch_warnings():  # ignore that a digest may equal the new drive
         warnings.simplefilter("ignore")
         part = together([digest.trace, trace.without_displacements() if short else trace])
+
+    # 4. The minimal maps of this trace that keep the old map.
     pinned = _pinned(theory, digest, ssh_map, joins=in_use.star == "frame")
     found = solving.solve(part, pinned)
     kept = tuple(m for m in found.maps if _keeps(m, digest, ssh_map))
     ended = found.stopped in _LIMITS
     if not kept and not ended and found.status is not Status.UNSATISFIABLE:
         found, kept = _with_assertions(part, pinned, digest, ssh_map, found, solving)
+
+    # 5. Their labels for all steps of all drives.
     maps = tuple(_of_all_drives(m, digest, ssh_map, joint, in_use) for m in kept)
     if not maps and ended and (grown := _grown(ssh_map, old, problem)):
         found, maps = replace(found, status=Status.FEASIBLE, cost=Cost.of(grown)), (grown,)

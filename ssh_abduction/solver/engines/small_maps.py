@@ -72,9 +72,10 @@ class SmallMaps:
                 yield dstates_merged(self._pinned.chart, near)
 
     def _maps_of_guesses(self, pinned: Pinned) -> Iterator[list[int]]:
-        """Guess dstates, and yield the labels of a map near each guess. A guess that is a map ends.
+        """Guess dstates, and yield the labels of a map near each guess.
 
-        There is no guess if that takes too much memory.
+        The first guess that is itself a map is the last one. There is no guess if that takes too
+        much memory.
         """
         steps = pinned.chart
         chart = Chart.turned(self._task.trace, self._task.log, len(steps.seen))

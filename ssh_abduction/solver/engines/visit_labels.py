@@ -41,8 +41,8 @@ from ssh_abduction.solver.engines.visit_program import VisitProgram, fits_in_tim
 from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 
-# At first, give clingo only the first visits: as long as at most this many pairs of them may be at
-# one place. It gets other visits if answers need them.
+# At first, give clingo only the first visits: those with at most this many pairs that may be at one
+# place. It gets other visits if answers need them.
 FIRST_PAIRS = 10_000
 # If the number of nodes has grown by this factor, make a new control, as the order of choice only
 # suits the nodes that it was made for.

@@ -6,8 +6,8 @@ other. An anchor is good if many other dstates then coincide with dstates that s
 that cross may share places, but no dstate. So an anchor may also be two places whose stars agree if
 one map is turned. It is good if many other places then coincide with places that may be one.
 
-If closures (matches of local maps) connect two drives, they say how one map lies on the other, and
-anchors are used only if that map breaks an axiom.
+If closures (matches of local maps) connect two drives, they say how one map lies on the other.
+Anchors are then used only if the map that is joined in this way breaks an axiom.
 
 The two maps with most closures, or the best anchor, are joined first: `overlaying.py` merges the
 places and dstates that coincide. Then the joint map may be joined to others. Maps that no anchor
