@@ -724,6 +724,28 @@ def test_cut_line_is_damaged_wherever_it_was_cut(tmp_path: Path, tag: str) -> No
         assert [d.line for d in read_text(tmp_path / "a.log", *cut).damaged] == [at + 1], end
 
 
+def test_edge_that_was_cut_gives_no_motion(tmp_path: Path) -> None:
+    """Half a number still is a number."""
+    lines = [
+        line
+        for i in range(30)
+        for line in (
+            f"VERTEX2 {i} {pose((0.55 * i, 0, 0))}",
+            flaser((0.55 * i, 0, 0), (0.55 * i, 0, 0)),
+            *([f"EDGE2 {i - 1} {i} 0.500000 0.000000 0.000000 1 0 1 1 0 0"] if i else []),
+        )
+    ]
+    at = lines.index(next(line for line in lines if line.startswith("EDGE2 14")))
+    lines[at] = lines[at][: lines[at].index("0000 1")]
+    log = read_text(tmp_path / "a.log", *lines)
+    assert [damage.line for damage in log.damaged] == [at + 1]
+    assert any("No EDGE2 tells how the robot moved before" in note for note in log.notes)
+
+
+def test_lines_may_begin_with_spaces(tmp_path: Path) -> None:
+    assert len(read_text(tmp_path / "a.log", *[f"  {flaser(START, START)}"] * 3)) == 3
+
+
 def test_byte_order_mark_loses_no_scan(tmp_path: Path) -> None:
     (tmp_path / "a.log").write_text(flaser(START, START), encoding="utf-8-sig")
     log = read_log(tmp_path / "a.log")

@@ -97,7 +97,7 @@ def head_of(file: IO[bytes], scans: int) -> bytes:
     head: list[bytes] = []
     while scans and (line := file.readline(LONGEST_LINE)):
         head.append(line)
-        scans -= line.startswith(tuple(kind.encode() for kind in KINDS))
+        scans -= line.lstrip().startswith(tuple(kind.encode() for kind in KINDS))
     return b"".join(head)
 
 

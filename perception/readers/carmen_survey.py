@@ -362,6 +362,8 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
     since: dict[str, int] = {}  # Number of ODOM lines since the last scan of each kind.
     # A scan that waits for the next ODOM line, with the ODOM line before it.
     waiting: tuple[Survey, ScanLine, tuple[Pose, float | None] | None] | None = None
+    # For each edge, the kind of its line and how many words that has.
+    written: dict[tuple[int, int], tuple[bytes, int]] = {}
     for number, raw in lines(file, source):
         tokens = raw.split() if raw is not None else []
         if not tokens or not NAME.match(tokens[0]):
@@ -383,7 +385,9 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
                 found.graph.vertices.append(vertex_of(tokens))
             elif tag in EDGES and with_graph:
                 ends, motion = edge_of(tokens)
-                found.graph.edges.setdefault(ends, motion)
+                found.lengths.setdefault(tag, Counter())[len(tokens)] += 1
+                if len(tokens) > written.get(ends, (b"", 0))[1]:
+                    found.graph.edges[ends], written[ends] = motion, (tag, len(tokens))
             elif (line := scan_line(tokens)) is not None:
                 survey = found.kinds.setdefault(line.kind, Survey())
                 _count(survey, line)
@@ -400,6 +404,9 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
             continue
         if len(found.tags) < 100 or tag.decode("ascii") in found.tags:
             found.tags[tag[:20].decode("ascii")] += 1
+    for ends, (tag, count) in written.items():
+        if count < found.usual_length(tag):  # The line was cut, and its last number may be, too.
+            del found.graph.edges[ends]
     return found
 
 
