@@ -16,6 +16,7 @@ from coarse import every_second_beam, hall
 from perception.errors import LogError
 from perception.places import importing, log_checks
 from perception.places.importing import import_log, tracked
+from perception.readers.echoes import LaserOptions, interpret_log
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.data.odometry import displacement_between, moved
@@ -179,6 +180,12 @@ def test_reader_refuses_ranges_beyond_the_reach_that_the_log_gives(
     ]
     with pytest.raises(LogError, match=r"within the reach of the laser, .* m, got hardly any"):
         tracked(RobotLog(tuple(beyond), source="drive"))
+
+
+def test_reach_that_the_user_gives_is_told_as_given(scans: tuple[Scan, ...]) -> None:
+    log, _ = interpret_log(scans, LaserOptions(no_return=0.7))
+    with pytest.raises(LogError, match=r"within the reach of the laser, 0\.7 m"):
+        tracked(RobotLog(log, source="drive"))
 
 
 def test_odometry_of_scans_a_metre_apart_is_converted(scans: Scans) -> None:

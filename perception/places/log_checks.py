@@ -75,7 +75,7 @@ def refuse_lengths(log: RobotLog) -> None:
     if np.median(shares) < MEETING and math.isfinite(reach):
         raise LogError(
             f"{named(log.source)}: expected beams that meet walls within the reach of the laser, "
-            f"{reach:g} m, got hardly any in most scans; if the ranges are in centimetres or "
+            f"{reach:.4g} m, got hardly any in most scans; if the ranges are in centimetres or "
             "millimetres, divide them, or say how far the laser reaches (--set no_return=METRES)"
         )
     usual = float(np.median(lengths or [0.0]))
