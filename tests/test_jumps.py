@@ -81,7 +81,7 @@ def test_track_is_cut_where_the_odometer_restarts(
     assert track.way[-1] == pytest.approx(metres, abs=3)
     assert f"The odometry jumps {'once' if len(at) == 1 else '3 times'} in {COUNT} scans" in notes
     assert "starts anew from 0" in notes
-    assert "Map both parts together if they are of one building" in notes
+    assert "Local maps that match may connect what lies before and after" in notes
 
 
 def test_trace_has_no_displacement_across_a_cut(
@@ -154,7 +154,7 @@ def test_note_says_that_a_second_drive_may_begin_at_a_jump(scans: tuple[Scan, ..
     )
     assert track.cuts == (60,)
     assert "starts anew" not in notes
-    assert "If a second drive begins there, cut the log there." in notes
+    assert "If a drive through another building begins there, cut the log there" in notes
 
 
 def test_restart_after_a_pause_may_be_a_second_drive(scans: tuple[Scan, ...]) -> None:

@@ -56,8 +56,8 @@ NO_RANGE = 25.0
 # A step to within this many metres of the origin means that the odometer restarted.
 ANEW = 1.0
 TWO_DRIVES = (
-    " If a second drive begins there, cut the log there. Map both parts together if they are of "
-    "one building, and each alone otherwise."
+    " Local maps that match may connect what lies before and after. If a drive through another "
+    "building begins there, cut the log there, and map each part alone."
 )
 
 
