@@ -396,6 +396,20 @@ def test_report_says_why_there_is_no_map_or_proof() -> None:
 
 
 @pytest.mark.parametrize(
+    ("choices", "advised"),
+    [({}, True), ({"boundary": "defeasible"}, False), ({"misread": 4}, False)],
+)
+def test_misread_is_advised_only_if_the_theory_may_allow_it(
+    choices: dict[str, Any], advised: bool
+) -> None:
+    theory = Theory.topological().replace(**choices)
+    nothing = replace(
+        solve(Trace.from_steps([0, 1], ["travel"]), theory), status=Status.UNSATISFIABLE, maps=()
+    )
+    assert ("misread" in str(how_it_ended(nothing, 5.0))) == advised
+
+
+@pytest.mark.parametrize(
     ("flags", "said"),
     [
         (["-o", "{file}"], "expected another file to write than the one to read"),

@@ -36,7 +36,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation.rungs import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
-from ssh_abduction.robot_logs.log_report import report
+from ssh_abduction.robot_logs.log_report import may_misread, report
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import (
@@ -241,9 +241,12 @@ def seconds_left(log: RobotLog, imported: Imported) -> float:
 def how_it_ended(solution: Solution, allowed: float) -> str | None:
     """Say why a search found no map or proved none minimal; None if there is nothing to say."""
     if solution.status is Status.UNSATISFIABLE:
+        let = (
+            "Let some steps be wrong (--set misread=4), or ask" if may_misread(solution) else "Ask"
+        )
         return (
-            "No map satisfies the axioms. Let some steps be wrong (--set misread=4), or ask why: "
-            "ssh-abduction explain FOLDER, with the folder of this map."
+            f"No map satisfies the axioms. {let} why: ssh-abduction explain FOLDER, with the "
+            "folder of this map."
         )
     if solution.stopped != "time limit" or solution.status is Status.OPTIMAL:
         return None

@@ -16,6 +16,7 @@ from perception.places.importing import Imported
 from perception.readers.scans import RobotLog
 from ssh_abduction.checker.joins import joins_in_words
 from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.files import filled
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.rungs import Rung
@@ -62,6 +63,14 @@ def report(
     ]
     body = "\n".join(part for part in parts if part)
     return filled(TEMPLATE, name=escaped(name), body=body)
+
+
+def may_misread(solution: Solution) -> bool:
+    """Check whether the theory of a solution forbids misread views, but could allow them."""
+    try:
+        return not solution.theory.misread and bool(solution.theory.replace(misread=4))
+    except TheoryError:
+        return False
 
 
 def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
@@ -151,7 +160,8 @@ def _faults(solution: Solution) -> str:
     if theory.changed:
         return "<h2>What changed between drives</h2>" + found
     if not (theory.misread or theory.slipped or theory.jumped):
-        found = _paragraph("Nothing: the theory allows no faults (--set misread=4 would).")
+        would = " (--set misread=4 would)" if may_misread(solution) else ""
+        found = _paragraph(f"Nothing: the theory allows no faults{would}.")
     return "<h2>What the map treats as wrong</h2>" + found
 
 
