@@ -666,6 +666,19 @@ def test_file_of_corrections_in_place_of_maps_is_an_error(
     assert f"got a file of corrections; name the folder: {building}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("verb", ["show", "name", "solve"])
+def test_folder_that_is_called_like_corrections_is_an_error(
+    verb: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(solving(folder, "round")) == 0
+    building = folder / "building"
+    (building / "corrections.yaml").mkdir()
+    capsys.readouterr()
+    calls = {"show": ["show", str(building)], "name": ["name", str(building), "p0", "hall"]}
+    assert main(calls.get(verb) or solving(folder, "round")) == 1
+    assert "expected a file of corrections, got a folder" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("text", [None, "places: 3\n", "format: ssh-corrections\nversion: ["])
 def test_other_yaml_in_place_of_maps_is_not_called_corrections(
     text: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -11,7 +11,13 @@ from pathlib import Path
 
 from ssh_abduction.cli.options import maps_path, read_maps, trace_beside, trace_of_maps
 from ssh_abduction.data.corrections import Corrections, Naming
-from ssh_abduction.data.corrections_file import FILE, direction, load_corrections, save_corrections
+from ssh_abduction.data.corrections_file import (
+    FILE,
+    beside,
+    direction,
+    load_corrections,
+    save_corrections,
+)
 from ssh_abduction.data.drives import Drive, step_name, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
 from ssh_abduction.data.map_parts import NAMED, thing_named
@@ -70,9 +76,8 @@ class SavedMap:
             )
         theory = data.get("theory") if isinstance(data, dict) else None
         ssh_map = listing.maps[listing.number(str(number))]
-        beside = file.parent / FILE
-        if beside.is_file():
-            said = load_corrections(beside)
+        if (corrections := beside(file)) is not None:
+            said = load_corrections(corrections)
             said.check_drives(known)
         else:  # keep the names that the map has
             said = Corrections.of_names(ssh_map, listing.drives)
@@ -96,8 +101,8 @@ class SavedMap:
         Raises MapError if a gateway contradicts the trace, or a drive or a step is unknown.
         """
         corrections.known_in(self.drives)
-        beside = trace_beside(str(self.file))
-        trace = Trace.load(beside) if beside else trace_of_maps(str(self.file))
+        own = trace_beside(str(self.file))
+        trace = Trace.load(own) if own else trace_of_maps(str(self.file))
         if trace is not None:
             corrections.corrected(trace)
         file = self.file.parent / FILE

@@ -77,11 +77,18 @@ def file_in(path: str | os.PathLike[str]) -> Path:
 
 
 def beside(maps: str | os.PathLike[str] | None) -> Path | None:
-    """Return the file of corrections beside a file of maps; None if there is none."""
+    """Return the file of corrections beside a file of maps; None if there is none.
+
+    Raises MapError if a folder has its name.
+    """
     if maps is None or str(maps) == "-":
         return None
     file = Path(a_path("maps", maps, MapError)).parent / FILE
-    return file if file.is_file() else None
+    if file.is_dir():
+        raise MapError(
+            f"{named(file)}: expected a file of corrections, got a folder; give it another name"
+        )
+    return file if file.exists() else None
 
 
 def named_beside(
