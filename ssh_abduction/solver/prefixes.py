@@ -239,17 +239,20 @@ class Prefixes:
             came, refusal = 0, None
             for found in self.engine.maps_of_cost(self._known.cost, asked):
                 came += 1
+                # 1. A map that does not replay to the end shows that the prefix has to grow.
                 replayed = self._replay(found.map)
                 if replayed.outcome is not Outcome.PREDICTED:
                     stuck = max(stuck, len(replayed.labels))
                     if not streaming:
                         break
                     continue
+                # 2. Leave out maps that were given before, of this prefix or of an earlier one.
                 whole = self._whole(found.map, replayed)
                 if whole in given or any(
                     self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed
                 ):
                     continue
+                # 3. Leave out maps that evidence rejects. If the engine can forbid them, list anew.
                 remembers = self._judging.may_refuse and (asked or len(given) < REMEMBERED)
                 if self._judging.why_refused(whole):
                     refusal = (
@@ -260,6 +263,7 @@ class Prefixes:
                     continue
                 if remembers:
                     given.add(whole)
+                # 4. Give the map, or hold it back until its prefix is known to be long enough.
                 if streaming:
                     yield whole
                     continue
@@ -268,7 +272,7 @@ class Prefixes:
                     streaming = True
                     yield from held
                     held.clear()
-            if refusal:  # list anew, without the rejected maps if the engine can forbid them
+            if refusal:
                 can_forbid = self._forbid_in_engine(refusal)
                 continue
             if stuck or not asked or came < asked:
