@@ -23,7 +23,7 @@ def add_parser(verbs: Verbs) -> None:
         "_ssh-abduction in a folder of $fpath; "
         "fish: write it to ~/.config/fish/completions/ssh-abduction.fish",
     )
-    parser.add("shell", "the shell that completes", choices=SHELLS)
+    parser.add("shell", "the shell to print the script for", choices=SHELLS)
 
 
 def run(options: argparse.Namespace) -> int:
