@@ -104,10 +104,13 @@ def ruled(text: str, theory: Theory) -> Theory:
     return theory.replace(rules=[Rules("own.lp", text)])
 
 
+@pytest.mark.parametrize("fault", [{}, {"misread": 1.5}, {"slipped": 3.0}])
 @pytest.mark.parametrize("name", KEPT)
-def test_map_that_satisfies_own_rules_is_returned_at_the_limit(name: str) -> None:
+def test_map_that_satisfies_own_rules_is_returned_at_the_limit(
+    name: str, fault: dict[str, float]
+) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
-    theory = ruled(KEPT[name], Theory.topological())
+    theory = ruled(KEPT[name], Theory.topological().replace(**fault))
     with patch.multiple(fallback, OVERTIME=100.0):
         solution = solve(trace, theory, time_limit=1e-6)
     assert solution.status is Status.FEASIBLE
@@ -161,6 +164,20 @@ def test_rules_about_atoms_without_facts_cannot_be_checked(body: str) -> None:
     )
 
 
+@pytest.mark.parametrize("kind", ["misread", "slipped"])
+@pytest.mark.parametrize("body", READ)
+def test_own_rules_select_the_same_maps_with_faults_as_clingo(body: str, kind: str) -> None:
+    plain = Theory.topological().replace(**{kind: 0.5})
+    theory = ruled(f"#program step(t).\n:- {body}.", plain)
+    problem = Problem.of(SMALL, settle(SMALL, theory).theory)
+    found, free = (solve(SMALL, asked, max_maps=None) for asked in (theory, plain))
+    assert can_be_asked(problem.theory)
+    assert all(keeps_own_rules(problem, ssh_map) for ssh_map in found.maps)
+    if found.cost == free.cost:
+        kept = {ssh_map for ssh_map in free.maps if keeps_own_rules(problem, ssh_map)}
+        assert kept == {*found.maps}
+
+
 def sketched(trace: Trace, theory: Theory) -> list[SSHMap]:
     """The maps of the sketches of a trace that reach its end."""
     return [
@@ -206,6 +223,15 @@ def test_sketch_ends_paths_at_dead_ends_only(first: list[int], places: int) -> N
     small, large = sketched(trace, theory)
     assert len(small.places) == 2
     assert len(large.places) == places
+    assert check(trace, small, theory) == check(trace, large, theory) == ()
+
+
+def test_sketch_reads_the_end_of_a_path_from_all_steps_at_a_place() -> None:
+    """The second step does not see what is behind it, but the first step saw no gateway there."""
+    stars = [(0, 1, 1, 0), (1, 1, None, 0), (0, 0, 1, 0), (1, 0, 0, 0), (0, 0, 1, 1)]
+    trace = Trace.from_steps("abcde", ["right", "travel", "around", "travel"], stars=stars)
+    theory = settle(trace).theory
+    small, large = sketched(trace, theory)
     assert check(trace, small, theory) == check(trace, large, theory) == ()
 
 

@@ -57,8 +57,9 @@ class Stages:
         mends = row("mending").holds_for(task.theory) and may_name(task)
         if mends and self._mend():
             return
-        # Only the readable encodings have changed gateways.
-        if (mends or task.theory.changed) and steps > choosing.READABLE:
+        # Otherwise only the readable encodings find faults of maps with places.
+        finds = task.theory.has_faults and task.theory.level == "topological"
+        if (mends or finds) and steps > choosing.READABLE:
             raise LimitError("no proof")
         if parts.known.status is Status.OPTIMAL:  # an earlier search proved a map minimal
             if not engine.size:

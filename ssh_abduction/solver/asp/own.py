@@ -54,12 +54,12 @@ FRAME = """
 def can_be_asked(theory: Theory) -> bool:
     """Whether `keeps_own_rules` can check the rules of a theory in which no field is "auto".
 
-    It can if the rules read only what a map and a trace show. Maps with faults, or with partial
-    orders of paths, do not show all that rules may read.
+    It can if the rules read only what a map and a trace show. Maps with partial orders of paths do
+    not show all that rules may read.
     """
     if not theory.rules:
         return True
-    settled = not theory.has_faults and (theory.level == "causal" or theory.path_order == "total")
+    settled = theory.level == "causal" or theory.path_order == "total"
     return settled and all(
         read_by(rules, theory.rules) <= SHOWN | OF_TRACE for rules in theory.rules
     )
@@ -76,7 +76,7 @@ def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
     control = Control(check=look_at_clock)
     steps = range(len(trace))
     control.add("base", [], readable.theory_facts(theory, len(ssh_map.paths)))
-    control.add("base", [], readable.trace_facts(problem, 0, len(trace)))
+    control.add("base", [], readable.trace_facts(problem, 0, len(trace), evidence=False))
     control.add("base", [], "\n".join(f"{fact}." for fact in _shown(trace, ssh_map)))
     control.add("base", [], f"query({len(trace) - 1}).\n{FRAME}")
     control.add("base", [], readable.own_rules(theory))
@@ -125,8 +125,11 @@ def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
         yield from (
             f"before({number},{p},{q})" for i, p in enumerate(order) for q in order[i + 1 :]
         )
+    slipped = {fault.step for fault in ssh_map.faults if fault.kind == "slipped"}
     for t, action in enumerate(trace.actions):
-        if action.kind == "travel" and not action.slipped:
+        if action.slipped or t in slipped:
+            continue
+        if action.kind == "travel":
             yield f"travel({t})"
-        elif action.turn is not None and not action.slipped:
+        elif action.turn is not None:
             yield f"turn({t},{action.turn})"

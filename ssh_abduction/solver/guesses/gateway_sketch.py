@@ -216,27 +216,28 @@ class GatewaySketch(Sketch):
         if "gateway_end" not in self._axioms or _leads_on(self._star_seen, 0):
             return super()._travel(here, step)
         path, direction = self._find_course(here)
-        order = self._orders[path]
+        place, order = self._states[here].place, self._orders[path]
         last = order[-1 if direction == 1 else 0]
-        if last != self._states[here].place and self._ends(last, path, direction):
+        is_next = abs(order.index(last) - order.index(place)) == 1
+        goes_on = self._may_go_on(last, path, direction)
+        if last != place and (not goes_on or (self._homing and is_next)):
             there = self._known_ahead(last, path, direction, step)
-            if there is None:
-                raise Contradiction
-            return there
+            if there is not None:
+                return there
+        if not goes_on:
+            raise Contradiction
         there = self._new_place(step)
         order.insert(len(order) if direction == 1 else 0, self._states[there].place)
         self._set_course(there, path, direction)
         return there
 
-    def _ends(self, place: int, path: int, direction: int) -> bool:
-        """Whether a path ends at a place: a star seen there has no gateway that leads on."""
-        for s, star in self._shown[place].sights:
-            known = self._states[s]
-            if known.path == path and not _leads_on(
-                star, 0 if known.direction == direction else 180
-            ):
-                return True
-        return False
+    def _may_go_on(self, last: int, path: int, direction: int) -> bool:
+        """Whether a path may lead on from its last place, by the gateways seen there."""
+        order = self._orders[path]
+        order.insert(len(order) if direction == 1 else 0, len(self._stars))
+        fitted = frames_that_fit(*self._sights(self._shown[last]), self._axioms, as_shown=False)
+        del order[-1 if direction == 1 else 0]
+        return fitted is not None
 
     def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
         there = self._along.get((place, path, direction))

@@ -73,8 +73,11 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     )
 
 
-def trace_facts(problem: Problem, start: int, stop: int) -> str:
-    """Return the facts for steps `start` to `stop - 1`, and for the actions that lead to them."""
+def trace_facts(problem: Problem, start: int, stop: int, evidence: bool = True) -> str:
+    """Return the facts for steps `start` to `stop - 1`, and for the actions that lead to them.
+
+    Facts about pairs of steps are many. Without `evidence`, they are left out.
+    """
     trace, theory = problem.trace, problem.theory
     facts = []
     for t in range(start, stop):
@@ -100,7 +103,9 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
         ]
     if theory.star == "gateways":
         facts += _gateway_facts(trace, start, stop, changes=bool(theory.changed))
-    return "\n".join([*facts, *_evidence_facts(problem, start, stop)])
+    if evidence:
+        facts += _evidence_facts(problem, start, stop)
+    return "\n".join(facts)
 
 
 def _fault_facts(problem: Problem, start: int, stop: int, done: Iterable[int]) -> Iterator[str]:
