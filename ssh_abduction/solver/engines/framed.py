@@ -72,12 +72,10 @@ class FramedEngine:
 
     @property
     def size(self) -> int:
-        """The number of first steps that are the prefix."""
         return self._visits.size if self._framed else self._unframed_size
 
     @property
     def bound(self) -> int | None:
-        """A proven lower bound on the dstates of the prefix (first steps); None if unknown."""
         return self._visits.bound
 
     @property
@@ -85,7 +83,6 @@ class FramedEngine:
         return self._visits.chart
 
     def over(self, task: Task) -> FramedEngine:
-        """Go on with a longer trace and new limits, and return this engine itself."""
         self._task = self._fitting.task = task
         self.asker.watch = task.watch
         self._visits.work_on(task)
@@ -93,18 +90,15 @@ class FramedEngine:
         return self
 
     def next_size(self, failed: int) -> int:
-        """Return the size to grow to when no map of the prefix explains step `failed`."""
         return next_charted_size(self.size, failed, len(self._task.trace))
 
     def grow(self, size: int) -> None:
-        """Make the first `size` steps the prefix."""
         if size != self.size:
             self._best = None
         self._framed = self._visits.grow(size)
         self._unframed_size = size
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
-        """Yield maps of the first steps, each cheaper than the one before; the last is minimal."""
         if not self._framed:
             return
         first = self._first_with_paths()
@@ -139,7 +133,6 @@ class FramedEngine:
         return fitted[0] if fitted else None
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        """Yield `enough` maps of the prefix with this cost, or all of them if `enough` is 0."""
         if not self._framed:
             return
         mode = listing(cost)
