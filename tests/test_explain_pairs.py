@@ -451,6 +451,8 @@ def test_explain_prints_the_argument(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "functional_view" in capsys.readouterr().out
     assert main(["explain", str(impossible)]) == 20
     assert "if the view at step 3 were 'b'" in capsys.readouterr().out
+    assert main(["explain", str(impossible), "--json"]) == 20
+    assert json.loads(capsys.readouterr().out)["mends"][-1]["instead"] == "'b'"
     assert main(["explain", str(impossible), "0", "2"]) == 20
     assert main(["explain", str(rectangle), "0"]) == 1
     assert main(["explain", str(rectangle), "0", "10"]) == 1
