@@ -198,7 +198,7 @@ def with_named_faults(ssh_map: SSHMap, drives: Sequence[Drive]) -> SSHMap:
 
 def joined_drives(drives: Sequence[Drive], ssh_map: SSHMap) -> tuple[tuple[str, ...], ...]:
     """Group the names of drives that a map joins: their steps are in one piece of the map."""
-    piece_of = {s: i for i, piece in enumerate(ssh_map.pieces) for s in piece}
+    piece_of = ssh_map.piece_of
     groups: list[tuple[set[int], list[str]]] = []  # the pieces and the drives of each group
     for drive in drives:
         pieces = {piece_of[label] for label in ssh_map.dstate_at[drive.first : drive.stop]}

@@ -234,6 +234,11 @@ class SSHMap:
         return tuple(tuple(sorted(piece)) for piece in parts(sorted(beside), beside.__getitem__))
 
     @property
+    def piece_of(self) -> dict[int, int]:
+        """The number of the piece of each dstate."""
+        return {s: number for number, piece in enumerate(self.pieces) for s in piece}
+
+    @property
     def floors(self) -> tuple[tuple[int, ...], ...]:
         """The ids of the dstates on each floor, in order of first visit; empty without lifts.
 

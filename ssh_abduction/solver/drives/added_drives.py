@@ -93,7 +93,7 @@ def solve_onto(
     if corrections is not None:
         joint, theory = obeyed(corrections, joint, theory)
         old, trace = joint[: len(old)], joint[len(old) :]
-    _check_assertions(theory, old, ssh_map)
+    says_joined = _check_assertions(theory, old, ssh_map)
     problem = settle(joint, theory)
     in_use = problem.theory
 
@@ -108,9 +108,9 @@ def solve_onto(
     # 3. A short trace that stands for the old map (its digest), and the new drive.
     short = solving.speedups.that_hold_for(in_use).digest and in_use.displacement == "none"
     digest = Digest.of(old, ssh_map, short=short)
-    if in_use.weigh == "cost":  # otherwise the smallest map joins all that looks alike
-        pieces = enumerate(ssh_map.pieces)
-        digest = replace(digest, kept={s: i for i, piece in pieces for s in piece})
+    # Pieces may join. Without displacements, the smallest map joins all that looks alike.
+    if in_use.weigh == "cost" or says_joined:
+        digest = replace(digest, kept=ssh_map.piece_of)
     with warnings.catch_warnings():  # ignore that a digest may equal the new drive
         warnings.simplefilter("ignore")
         part = together([digest.trace, trace.without_displacements() if short else trace])
@@ -242,20 +242,28 @@ def _check_theory(theory: Theory, existing: Solution) -> None:
         )
 
 
-def _check_assertions(theory: Theory, old: Trace, ssh_map: SSHMap) -> None:
-    """Raise SolverError if the existing map contradicts what a theory asserts of the old steps."""
-    dstates = ssh_map.dstate_at
+def _check_assertions(theory: Theory, old: Trace, ssh_map: SSHMap) -> bool:
+    """Raise SolverError if the existing map contradicts what a theory asserts of the old steps.
+
+    Return whether the theory joins pieces of the map, which is no contradiction.
+    """
+    dstates, piece_of, joins = ssh_map.dstate_at, ssh_map.piece_of, False
     places = [ssh_map.dstates[s].place for s in dstates]
     for kind in ASSERTIONS:
         ids = dstates if kind in ("same", "different") else places
         for i, j in getattr(theory, kind):
             known = max(i, j) < len(old) and ids[i] is not None
-            if known and (ids[i] == ids[j]) != kind.startswith("same"):
+            if not known or (ids[i] == ids[j]) == kind.startswith("same"):
+                continue
+            if piece_of[dstates[i]] != piece_of[dstates[j]]:
+                joins = True
+            else:
                 steps = ", ".join(step_name(drives_of(old), t) for t in (i, j))
                 raise SolverError(
                     f"onto: expected a map that obeys '{kind}: {steps}', got one that "
                     "does not; map the old drives again, or solve all drives together"
                 )
+    return joins
 
 
 def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, *, joins: bool) -> Theory:
@@ -277,7 +285,7 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, *, joins: bool) -> 
                 pairs = apart if place[i] == place[j] else elsewhere
                 pairs.append((min(i, j), max(i, j)))
     labels = ssh_map.dstate_at
-    same = [pair for pair in digest.moved(theory.same, labels) if max(pair) >= len(digest.labels)]
+    same = digest.moved(theory.same, labels)
     if joins:
         same += [(first[s], t) for t, s in enumerate(digest.labels) if first[s] != t]
     return theory.replace(

@@ -41,7 +41,7 @@ class ExistingMap:
         self.broken = 0.0
         with one_thread("blas"):
             self._part_of, self._mean, self._covariance = Poses.of_map(old, ssh_map).gaussian()
-        self._piece = {s: i for i, piece in enumerate(ssh_map.pieces) for s in piece}
+        self._piece = ssh_map.piece_of
         self._places = numbered(-1 - s.id if s.place is None else s.place for s in ssh_map.dstates)
 
     def with_displacements(self, digest: Trace, labels: Sequence[int]) -> Trace:
