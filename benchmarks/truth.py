@@ -290,9 +290,9 @@ def joins(solution: Solution, known: Known) -> tuple[tuple[float, bool], ...]:
 
     Returns:
         For each join, the probability that the solver gives it, and whether it is true. Empty if
-        maps are counted.
+        maps are counted, or if their costs cannot be trusted.
     """
-    if solution.weighed is None:
+    if solution.weighed is None or solution.weighed.doubt is not None:
         return ()
     ssh_map = solution.maps[0]
     at = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]

@@ -49,7 +49,7 @@ def test_onto_lays_drives_on_the_map_one_by_one() -> None:
 
 def along(first: int, stop: int, name: str) -> Trace:
     """Make a drive past the places first … stop - 1 of one street."""
-    gone = [(2.0 + i % 3, 0, 0) for i in range(first, stop - 1)]
+    gone = [(8.0 + i % 3, 0, 0) for i in range(first, stop - 1)]
     views = [str(i) for i in range(first, stop)]
     return Trace.from_steps(views, ["travel"] * len(gone), displacements=gone, name=name)
 
@@ -75,12 +75,34 @@ def test_drive_joins_the_pieces_of_the_existing_map(places: int, shared: int) ->
 
 
 @pytest.mark.filterwarnings("ignore:views. trace")
-def test_laid_drive_joins_one_piece_if_a_person_denies_the_other() -> None:
-    """Two places of the pieces are said to be apart. The drive saw both as one place."""
+def test_laid_drive_keeps_two_places_apart_that_a_person_denies() -> None:
+    """They are of two pieces of the existing map, and the drive saw both as one place."""
     pieces = solve(along(35, 70, "end"), onto=solve(along(0, 36, "begin")))
     denied = pieces.theory.replace(returns=0, elsewhere=[(35, 36)])
     solution = solve(along(0, 70, "all"), denied, onto=pieces)
-    assert (len(solution[0].dstates), len(solution[0].pieces)) == (105, 2)
+    assert (len(solution[0].dstates), len(solution[0].pieces)) == (71, 1)
+
+
+@pytest.mark.filterwarnings("ignore:views. trace")
+@pytest.mark.parametrize("kind", ["different", "elsewhere"])
+def test_laid_drive_is_joined_beyond_a_place_that_a_person_denies(kind: str) -> None:
+    """One travel leads to the denied place from the place before it. So that one is apart, too."""
+    existing = solve(along(0, 65, "monday"))
+    denied = existing.theory.replace(returns=0, **{kind: [(11, 66)]})
+    solution = solve(along(10, 40, "tuesday"), denied, onto=existing)
+    assert (len(solution[0].dstates), len(solution[0].pieces)) == (67, 1)
+
+
+@pytest.mark.filterwarnings("ignore:.*no view in common")
+@pytest.mark.parametrize("places", [5, 70])
+def test_person_joins_the_pieces_of_the_existing_map(places: int) -> None:
+    middle = places // 2
+    begin, end = along(0, middle, "begin"), along(middle - 1, places, "end")
+    pieces = solve(end, onto=solve(begin))
+    assert len(pieces[0].pieces) == 2
+    said = pieces.theory.replace(returns=0, same=[(middle - 1, middle)])
+    solution = solve(along(middle, places, "all"), said, onto=pieces)
+    assert (len(solution[0].dstates), len(solution[0].pieces)) == (places, 1)
 
 
 def test_piece_that_displacements_do_not_connect_is_kept() -> None:

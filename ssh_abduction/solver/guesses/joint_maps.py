@@ -37,6 +37,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import valid_map
+from ssh_abduction.solver.guesses.kept_apart import denied_pairs
 from ssh_abduction.solver.guesses.overlaying import Overlay, Part
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.steps.log import Log
@@ -223,12 +224,14 @@ class Joining:
         `near` metres.
         """
         alike = np.array([[bool(seen & other) for other in second.seen] for seen in first.seen])
+        denied = denied_pairs(self._problem.theory, first, second)
         (at, facing), (there, turned) = first.poses, second.poses
         ways = [
             (s, x, facing[s] - turned[x])
             for s, x in np.argwhere(alike).tolist()
             if changes[first.places[s], second.places[x]] < math.inf
             and self.sights.are_alike(first.stars[s], second.stars[x])
+            and (s, x) not in denied
         ]
         for s, x, turn in _voted(first, second, ways, near):
             twist = facing[:, None] - turned - turn

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.theory.pairs import pairs_in
 from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.theory import Theory
+
+if TYPE_CHECKING:
+    from ssh_abduction.solver.guesses.overlaying import Part
 
 
 class KeptApart:
@@ -63,3 +68,23 @@ class KeptApart:
         """
         into = np.asarray(merged)
         return self._apart[np.ix_(into == first, into == second)].any().item()
+
+
+def denied_pairs(theory: Theory, first: Part, second: Part) -> set[tuple[int, int]]:
+    """List the pairs of dstates of two maps that a person says are different.
+
+    If one action leads from two dstates to such a pair, they are different, too.
+    """
+    here, there = first.labels, second.labels
+    said = (pair for i, j in (*theory.different, *theory.elsewhere) for pair in ((i, j), (j, i)))
+    todo = {(here[i], there[j]) for i, j in said if i in here and j in there}
+    found = set[tuple[int, int]]()
+    while todo:
+        found.add(pair := todo.pop())
+        todo |= {
+            (s, x)
+            for (s, action), y in first.links.items()
+            for (x, other), z in second.links.items()
+            if action == other and (y, z) == pair
+        } - found
+    return found

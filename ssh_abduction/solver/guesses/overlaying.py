@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.geometry.equations import spreads_of
-from ssh_abduction.solver.guesses.kept_apart import KeptApart
+from ssh_abduction.solver.guesses.kept_apart import KeptApart, denied_pairs
 from ssh_abduction.solver.guesses.pieces import poses_turned
 from ssh_abduction.solver.guesses.reckoning import BLUR, Hypothesis, conditioned
 from ssh_abduction.solver.guesses.sights import Sight, Sights
@@ -194,7 +194,6 @@ class Overlay:
         self._theory = theory = problem.theory
         both = standing.beside(drive)
         self._both, self._sights, self._overlap = both, sights, problem.overlap
-        self._steps = both.step_at
         self._old = len(standing.places), len(standing.sights)
         self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
         slack = SLACK * both.usual_travel(problem.trace)
@@ -219,6 +218,8 @@ class Overlay:
         self._costs = np.full(2 * (len(both.sights),), math.inf)
         for (p, seen), (q, others) in combinations(enumerate(both.sights), 2):
             self._costs[p, q] = sights.merged(seen, others)
+        old = len(standing.places)
+        self._denied = {(s, old + x) for s, x in denied_pairs(theory, standing, drive)}
         self._ties = ties_between(problem.trace, both, len(standing.places))
         # These change while the two maps are merged.
         self._state, self._changes = self._apart, self._costs
@@ -406,6 +407,10 @@ class Overlay:
         changes = self._sights.merged(state.sights[p], state.sights[q])
         if math.isinf(changes) or self._places_apart.includes(state.place, p, q):
             raise _ClashError
+        for s, x in self._denied:  # they would face one way on one path
+            at = {state.place[self._both.places[i]] for i in (s, x)}
+            if at == {p, q} and abs(self._twist(s, x)[0]) < TURNED:
+                raise _ClashError
         if heading is None and not self._may_face(p, q):
             raise _ClashError
         state.sights[p] = {**state.sights[p], **state.sights[q]}
@@ -424,7 +429,8 @@ class Overlay:
         if self._theory.changed:
             return True
         (s, *_), (x, *_) = self._dstates_at(p), self._dstates_at(q)
-        turns = self._sights.turns(self._steps[s], self._steps[x])
+        step_at = self._both.step_at
+        turns = self._sights.turns(step_at[s], step_at[x])
         twists = [self._twist(s, x, turn) for turn in turns]
         return not twists or any(abs(off) < TURNED or square < FAR for off, square in twists)
 
