@@ -93,6 +93,22 @@ MONDAY = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
 TUESDAY = Trace.from_steps("bcd", ["around", "travel"], name="tuesday")
 
 
+@pytest.mark.filterwarnings("ignore:.*no view in common")
+def test_solve_onto_says_that_a_drive_joins_pieces(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = str(tmp_path / "m.json")
+    for name, views in (("begin", "ab"), ("end", "cde"), ("all", "abcde")):
+        moves = [(9.0, 0, 0)] * (len(views) - 1)
+        drive = Trace.from_steps(views, ["travel"] * len(moves), displacements=moves, name=name)
+        drive.save(tmp_path / f"{name}.jsonl")
+        onto = ["--onto", maps] if name != "begin" else []
+        assert main(["solve", str(tmp_path / f"{name}.jsonl"), *onto, "-o", maps]) == 0
+    told = capsys.readouterr().out
+    assert "the map of begin is kept; the map is in 2 pieces" in told
+    assert "the 2 pieces of the map of begin, end are kept, and joined to 1; the map joins" in told
+
+
 @pytest.mark.filterwarnings("always:traces 1 and 2 have the same steps")
 def test_solve_onto_adds_a_drive_in_the_shell(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -49,6 +49,10 @@ def run(options: argparse.Namespace) -> int:
         return exit_code(solution)
     count = len(solution.maps)
     print(headline(solution, count, None))
-    lines = (*findings(solution), first_map(solution, count), *told_apart(solution, count))
+    lines = (
+        *findings(solution, existing.maps[0]),
+        first_map(solution, count),
+        *told_apart(solution, count),
+    )
     print("\n".join(lines))
     return exit_code(solution)

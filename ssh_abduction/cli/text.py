@@ -114,17 +114,30 @@ def _counts_of(cost: Cost, theory: Theory) -> dict[str, float]:
     return counts
 
 
-def findings(solution: Solution) -> Iterator[str]:
-    """Yield the lines between the headline and the maps: what joins drives, and how surely."""
+def findings(solution: Solution, existing: SSHMap | None = None) -> Iterator[str]:
+    """Yield the lines between the headline and the maps: what joins drives, and how surely.
+
+    `existing` is the map to which drives were added, if there was one.
+    """
     yield from by_displacements(solution)
     if solution.joined:
-        kept = solution.support.onto
-        standing = f"the map of {', '.join(kept)} is kept; " if kept else ""
+        standing = _kept(existing, solution) if existing else ""
         yield printable(standing + solution.joined)
     if solution.maps and (floors := floors_in_words(solution.maps[0])):
         yield floors
     if solution.weighed is None and solution.sureness:  # else the headline says it
         yield solution.sureness
+
+
+def _kept(existing: SSHMap, solution: Solution) -> str:
+    """Say whether drives that were added to a map joined its pieces."""
+    found, names = solution.maps[0], ", ".join(solution.support.onto)
+    piece_of = found.piece_of
+    left = {piece_of[s] for s in found.dstate_at[: len(existing.dstate_at)]}
+    pieces = len(existing.pieces)
+    if len(left) == pieces:
+        return f"the map of {names} is kept; "
+    return f"the {pieces} pieces of the map of {names} are kept, and joined to {len(left)}; "
 
 
 def first_map(solution: Solution, count: int) -> str:
