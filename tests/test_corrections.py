@@ -94,6 +94,9 @@ def test_new_name_or_gateway_replaces_the_old_one() -> None:
         MapError, match=r"another name than 'hall', as names\[0\], the place of monday:1, has it"
     ):
         said.with_name("hall", "place", "monday:3")
+    both = said.with_name("den", "place", "monday:3")  # the first name of a place counts
+    renamed = both.with_name("kitchen", "place", "monday:1")
+    assert [n.name for n in renamed.names] == ["kitchen", "den"]
     for kind in ("path", "region"):
         with pytest.raises(MapError, match=f"got name 'hall' of the {kind} of monday:3; rename"):
             said.with_name("hall", kind, "monday:3")
@@ -117,6 +120,7 @@ def test_new_name_or_gateway_replaces_the_old_one() -> None:
         ("same:\n- [monday:1, monday:01]\n", r"same\[0\]: expected two different steps"),
         ("gateways:\n- {closed: {monday:1: up}}\n", "expected ahead, right, back, left, or degr"),
         ("gateways:\n- {monday:1: left}\n", "expected only open, closed, note, got 'monday:1'"),
+        ("gateways:\n- open: {}\n", r"gateways\[0\].open: expected steps and directions, such"),
         ("rooms: []\n", "file: expected only format, version"),
         ("same: [\n", "expected YAML, got"),
     ],
@@ -829,8 +833,20 @@ def test_solve_warns_of_names_that_the_map_does_not_have(
     assert main(solving(folder)) == 0
     told = capsys.readouterr()
     assert "name 'cafe' of the place of tuesday:0: it is not used" in told.err
+    assert "this place is also 'kitchen'; rename or remove one of them" in told.err
+    assert len(load_corrections(folder / "building").names) == 2
     assert "name 'kitchen'" not in told.err
     assert "(kitchen)" in told.out
+
+
+@pytest.mark.parametrize("options", [["tuesday"], ["--jobs", "1"], ["--front", "1"]])
+def test_corrections_of_traces_solved_alone_are_refused(
+    options: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(folder / f"{word}.jsonl") if word == "tuesday" else word for word in options]
+    monday = str(folder / "monday.jsonl")
+    assert main(["solve", monday, *words, "--corrections", str(folder)]) == 1
+    assert "--corrections: expected one trace, or --together, got" in capsys.readouterr().err
 
 
 def test_names_of_drives_may_have_commas(

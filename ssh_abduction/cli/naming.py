@@ -25,7 +25,7 @@ def add_parser(verbs: Verbs) -> None:
         "a place such as p4, a path such as path2, a region such as region3, or its name so far; "
         "or a step such as monday:12, for its place",
     )
-    parser.add("name", 'the name, such as "kitchen"')
+    parser.add("name", 'the name, such as "kitchen"; write -- before a name that begins with -')
     add_map(parser)
 
 

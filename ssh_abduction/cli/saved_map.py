@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 from ssh_abduction.cli.options import maps_path, read_maps, trace_beside, trace_of_maps
-from ssh_abduction.data.corrections import Corrections, Naming
+from ssh_abduction.data.corrections import Corrections, Naming, number_at
 from ssh_abduction.data.corrections_file import (
     FILE,
     beside,
@@ -22,7 +22,6 @@ from ssh_abduction.data.drives import Drive, step_name, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
 from ssh_abduction.data.map_parts import NAMED, thing_named
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import region_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
 from ssh_abduction.rivals.listing import Listing
@@ -138,7 +137,9 @@ class SavedMap:
         kind, number = thing_named(text, self.map.names) or ("", -1)
         if kind not in NAMED:
             return None
-        here = (t for t, s in enumerate(self.map.dstate_at) if self._of(kind, s) == number)
+        here = (
+            t for t, s in enumerate(self.map.dstate_at) if number_at(self.map, kind, s) == number
+        )
         first = next(here, None)
         if first is None:
             raise MapError(
@@ -257,13 +258,7 @@ class SavedMap:
         return 90.0 * (quarter % 4)
 
     def _at(self, kind: str, step: str) -> int | None:
-        return self._of(kind, self.map.dstate_at[step_of(self.drives, step)])
-
-    def _of(self, kind: str, label: int) -> int | None:
-        dstate = self.map.dstates[label]
-        if kind == "region":
-            return region_of(self.map.regions, dstate.place)
-        return dstate.place if kind == "place" else dstate.path
+        return number_at(self.map, kind, self.map.dstate_at[step_of(self.drives, step)])
 
 
 def sentences_of(corrections: Corrections) -> Iterator[str]:

@@ -153,17 +153,23 @@ def run(options: argparse.Namespace) -> int:
         from ssh_abduction.cli import solve_onto
 
         return solve_onto.run(options)
+    many = options.jobs is not None or options.scheduler is not None
+    alone = many or (len(options.traces) > 1 and not options.together)
+    if options.corrections is not None and (alone or options.front is not None):
+        raise AbductionError(
+            "--corrections: expected one trace, or --together, got many traces, --jobs, "
+            "--scheduler or --front; leave it out"
+        )
     if options.front is not None:
         from ssh_abduction.cli import solve_front
 
         return solve_front.run(options)
-    many = options.jobs is not None or options.scheduler is not None
     if options.together and many:
         raise AbductionError(
             "--together: expected one search for all traces, got --jobs or --scheduler; leave "
             "them out"
         )
-    if many or (len(options.traces) > 1 and not options.together):
+    if alone:
         if options.output is not None:
             raise AbductionError(
                 "--output: expected one trace, or --together, got many traces; take --json, which "

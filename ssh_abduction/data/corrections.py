@@ -147,11 +147,8 @@ class Corrections:
         """
         checked_map(ssh_map)
         drives = _drives(drives)
-        places = [ssh_map.dstates[s].place for s in ssh_map.dstate_at]
         numbers = {
-            "place": places,
-            "path": [ssh_map.dstates[s].path for s in ssh_map.dstate_at],
-            "region": [region_of(ssh_map.regions, place) for place in places],
+            kind: [number_at(ssh_map, kind, label) for label in ssh_map.dstate_at] for kind in NAMED
         }
         return cls(
             names=tuple(
@@ -177,8 +174,10 @@ class Corrections:
             MapError: Another place, path or region has this name, or an argument is wrong.
         """
         one_of("kind", kind, NAMED, MapError)
-        kept = [n for n in self.names if (n.kind, n.step) != (kind, step)]
-        return replace(self, names=(*kept, Naming(_a_name(name), kind, _a_step("step", step))))
+        said = Naming(_a_name(name), kind, _a_step("step", step))
+        # Keep the order: the first one of several names of a place counts.
+        names = [said if (n.kind, n.step) == (kind, step) else n for n in self.names]
+        return replace(self, names=(*names, *([] if said in names else [said])))
 
     def with_pair(self, kind: str, first: str, second: str) -> Corrections:
         """Say that two steps are one dstate or at one place, or that they are different ones.
@@ -345,9 +344,8 @@ class Corrections:
         checked_map(ssh_map)
         found: dict[tuple[str, int], str] = {}
         for naming in self.known_in(drives).names:
-            dstate = ssh_map.dstates[ssh_map.dstate_at[self._number(drives, naming.step)]]
-            region = region_of(ssh_map.regions, dstate.place)
-            number = {"place": dstate.place, "path": dstate.path, "region": region}[naming.kind]
+            label = ssh_map.dstate_at[self._number(drives, naming.step)]
+            number = number_at(ssh_map, naming.kind, label)
             if number is not None:
                 found.setdefault((naming.kind, number), naming.name)
         names = (Name(kind, number, text) for (kind, number), text in sorted(found.items()))
@@ -412,6 +410,14 @@ class Corrections:
             raise self._contradicted(said, f"the robot left {name} through it; say it is open")
         if near_quarter(way) == 2 and before is not None and before.kind == "travel":
             raise self._contradicted(said, f"the robot came to {name} through it; say it is open")
+
+
+def number_at(ssh_map: SSHMap, kind: str, label: int) -> int | None:
+    """Return the number of the place, path or region of a dstate; None if it has none."""
+    dstate = ssh_map.dstates[label]
+    if kind == "region":
+        return region_of(ssh_map.regions, dstate.place)
+    return dstate.place if kind == "place" else dstate.path
 
 
 def direction_in_words(way: float) -> str:

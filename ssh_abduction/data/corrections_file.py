@@ -212,7 +212,9 @@ class _CorrectionsReader(FieldReader):
             raise self.wrong(where, "one of open, closed", value)
         is_open = "open" in record
         field = f"{where}.{'open' if is_open else 'closed'}"
-        seen = self._object(record["open" if is_open else "closed"], field)
+        seen = record["open" if is_open else "closed"]
+        if not seen or not isinstance(seen, Mapping):
+            raise self.wrong(field, "steps and directions, such as monday:12: left", seen)
         return Passage(
             is_open,
             tuple((self._step(s, field), self._way(w, f"{field}.{s}")) for s, w in seen.items()),

@@ -12,6 +12,7 @@ from ssh_abduction.data.corrections import (
     Passage,
     checked_corrections,
     direction_in_words,
+    number_at,
 )
 from ssh_abduction.data.drives import (
     Drive,
@@ -22,7 +23,7 @@ from ssh_abduction.data.drives import (
     step_of,
     travels_of,
 )
-from ssh_abduction.data.errors import named
+from ssh_abduction.data.errors import brief, named
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import with_gateway
 from ssh_abduction.data.step import Step
@@ -100,13 +101,19 @@ def _unused_names(corrections: Corrections, solution: Solution) -> Iterator[str]
     if not solution.maps or solution.trace is None:
         return
     drives = drives_of(solution.trace)
-    used = {name.text for name in corrections.named(solution.maps[0], drives).names}
+    ssh_map = corrections.named(solution.maps[0], drives)
     for naming in corrections.known_in(drives).names:
-        if naming.name not in used:
+        label = ssh_map.dstate_at[step_of(drives, naming.step)]
+        used = ssh_map.name_of(naming.kind, number_at(ssh_map, naming.kind, label))
+        if used != naming.name:
+            why = (
+                f"this step has no {naming.kind}; name another step"
+                if used is None
+                else f"this {naming.kind} is also {brief(used)}; rename or remove one of them"
+            )
             yield (
                 f"{named(corrections.source or 'corrections')}: {naming}: it is not used: in the "
-                f"first map, this step has no {naming.kind}, or its {naming.kind} has an earlier "
-                "name; rename one of them"
+                f"first map, {why}"
             )
 
 
