@@ -16,6 +16,7 @@ from strategies import STARS
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
+from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Start, Status, choosing
 from ssh_abduction.solver.asp.control import Control
@@ -39,7 +40,7 @@ from ssh_abduction.solver.guesses import annealing, sampling
 from ssh_abduction.solver.guesses.annealing import annealed
 from ssh_abduction.solver.guesses.merging import merged
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.solver.steps.chart import QUARTERS, Chart, FramedChart
+from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory.settle import Problem, settle

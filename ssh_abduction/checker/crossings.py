@@ -28,6 +28,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TypeAlias
 
+from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.groups import reached
 from ssh_abduction.data.star import Openings
 from ssh_abduction.theory.planarity import can_be_drawn, clockwise_orders, has_way, is_planar
@@ -36,8 +37,6 @@ from ssh_abduction.theory.planarity import can_be_drawn, clockwise_orders, has_w
 Arm: TypeAlias = tuple[int, int]
 # The clockwise position of each arm around its place. Arms of one gateway share a position.
 Option: TypeAlias = Mapping[Arm, int]
-
-QUARTERS = {"right": 1, "around": 2, "left": 3}
 
 
 class Edges:

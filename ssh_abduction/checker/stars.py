@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ssh_abduction.checker.crossings import QUARTERS
 from ssh_abduction.checker.moves import Course, course_of, heading_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.drives import ALONE
 from ssh_abduction.data.maps import DState
 from ssh_abduction.data.regions import course_named

@@ -10,7 +10,7 @@ from ssh_abduction.cli.options import add_map, add_maps, at_comma, trace_beside
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.saved_map import SavedMap, sentences_of
-from ssh_abduction.data.corrections import PAIRS
+from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.errors import MapError, brief, named, printable
 from ssh_abduction.data.words import counted
 
@@ -39,7 +39,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     add_maps(parser)
     for name, words in HELPS.items():
-        metavar = "I,J" if name in PAIRS else "GATEWAY"
+        metavar = "I,J" if name in ASSERTIONS else "GATEWAY"
         parser.add(f"--{name.replace('_', '-')}", words, action=_InOrder, metavar=metavar)
     parser.add(
         "--name",
@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
     saved = SavedMap.load(options.maps, options.map)
     before = said = saved.corrections
     for kind, value in options.said:
-        if kind in PAIRS:
+        if kind in ASSERTIONS:
             said = said.with_pair(kind, *_pair(saved, kind, value))
         elif kind == "name":
             what, name = value

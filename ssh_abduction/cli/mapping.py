@@ -36,12 +36,11 @@ from ssh_abduction.cli.run_folders import (
     written_elsewhere,
 )
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.corrections import Corrections
+from ssh_abduction.data.corrections import ASSERTIONS, Corrections
 from ssh_abduction.data.corrections_file import beside, load_corrections, to_yaml
 from ssh_abduction.data.errors import AbductionError, MapError, brief, named
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, check_limit, workers
-from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

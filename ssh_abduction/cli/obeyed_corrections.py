@@ -11,7 +11,7 @@ from typing import Any
 
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.saved_map import sentences_of
-from ssh_abduction.data.corrections import Corrections, Passage, Said
+from ssh_abduction.data.corrections import ASSERTIONS, Corrections, Passage, Said
 from ssh_abduction.data.corrections_file import FILE, beside, load_corrections, save_corrections
 from ssh_abduction.data.drives import drives_of, fingerprints_of, step_of, together
 from ssh_abduction.data.errors import MapError, named, printable
@@ -27,7 +27,6 @@ from ssh_abduction.solver import (
     with_correction_warnings,
     with_names,
 )
-from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.theory import Theory
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ssh_abduction.cli.parsing import Parser, true_or_false
+from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.corrections_file import load_corrections
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
@@ -22,7 +23,7 @@ from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
-from ssh_abduction.theory.fields import ASSERTIONS, CHOICES
+from ssh_abduction.theory.fields import CHOICES
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
 
@@ -315,11 +316,10 @@ def picture_file(text: str) -> str:
 
 def check_picture(file: str | None) -> None:
     """Check before long work that a figure can be drawn. Raise AbductionError if it cannot."""
-    if file is None:
-        return
-    from ssh_abduction.evaluation.paper.figures import require_matplotlib
+    if file is not None:
+        from ssh_abduction.evaluation.paper.figures import require_matplotlib
 
-    require_matplotlib()
+        require_matplotlib()
 
 
 def check_number(number: int | None, maps: Sequence[object], where: str) -> None:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import simulator
 from ssh_abduction.cli.options import add_output, seed, write
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted
@@ -24,19 +25,7 @@ if TYPE_CHECKING:
     from ssh_abduction.data.trace import Trace
 
 ENDINGS = (".log", ".clf", ".bag", ".mcap")
-SHIPPED = (
-    "notched-rectangle",
-    "taylor-hall",
-    "triangle",
-    "three-ways",
-    "five-ways",
-    "six-ways",
-    "curved",
-    "cluttered",
-    "doors",
-    "tower-2",
-    "tower-3",
-)
+SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").glob("*.json"))
 
 METRES: dict[str, Any] = {"type": float, "metavar": "METRES"}
 SHARE: dict[str, Any] = {"type": float, "metavar": "SHARE"}

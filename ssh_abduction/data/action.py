@@ -17,8 +17,8 @@ TurnDirection: TypeAlias = Literal["right", "left", "around"]
 _KINDS = ("travel", "turn", "lift", "stairs", "start")
 _TURNS = ("right", "left", "around")
 _FIELDS = ("name", "kind", "turn", "gateway", "bearing")
-_QUARTERS = (None, "right", "around", "left")
-# Degrees clockwise of the turns that have standard names.
+# The right angles clockwise of the turns that have standard names, and the degrees.
+QUARTERS: dict[str | None, int] = {"right": 1, "around": 2, "left": 3}
 TURN_DEGREES = {"right": 90.0, "around": 180.0, "left": 270.0}
 
 
@@ -167,7 +167,7 @@ class Action:
         if self.bearing is None:
             return True
         slot = near_quarter(self.bearing)
-        return slot is not None and _QUARTERS[slot] == self.turn
+        return slot is not None and QUARTERS.get(self.turn, 0) == slot
 
     @staticmethod
     def of(value: Action | str | Mapping[str, Any]) -> Action:

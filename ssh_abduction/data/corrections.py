@@ -37,7 +37,7 @@ from ssh_abduction.data.trace import Trace, checked_trace
 
 FORMAT, VERSION = "ssh-corrections", 1
 # The kinds of pairs of steps, which are fields of a theory.
-PAIRS = ("same", "different", "elsewhere", "same_place")
+ASSERTIONS = ("same", "different", "elsewhere", "same_place")
 # The kinds that contradict a kind if they are said of the same steps.
 _AGAINST = {
     "same": ("different", "elsewhere"),
@@ -192,7 +192,7 @@ class Corrections:
         Raises:
             MapError: An argument is wrong.
         """
-        one_of("kind", kind, PAIRS, MapError)
+        one_of("kind", kind, ASSERTIONS, MapError)
         said = Said(kind, (_a_step("first", first), _a_step("second", second)))
         if said.steps[0] == said.steps[1]:
             raise MapError(
@@ -303,7 +303,7 @@ class Corrections:
                 for said in self.known_in(drives).pairs
                 if said.kind == kind
             )
-            for kind in PAIRS
+            for kind in ASSERTIONS
         }
 
     def corrected(self, trace: Trace) -> Trace:

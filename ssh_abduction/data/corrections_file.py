@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 from ssh_abduction.data.checks import a_path
 from ssh_abduction.data.corrections import (
+    ASSERTIONS,
     DIRECTIONS,
     FORMAT,
-    PAIRS,
     VERSION,
     Corrections,
     Naming,
@@ -121,7 +121,7 @@ def to_yaml(corrections: Corrections) -> str:
         "drives": dict(corrections.drives),
         "names": [{"name": n.name, n.kind: n.step, **_note(n)} for n in corrections.names],
     }
-    for kind in PAIRS:
+    for kind in ASSERTIONS:
         pairs = [said for said in corrections.pairs if said.kind == kind]
         data[kind] = [
             {"steps": [*said.steps], "note": said.note} if said.note else [*said.steps]
@@ -164,7 +164,7 @@ class _CorrectionsReader(FieldReader):
 
     def corrections(self, data: object, source: str) -> Corrections:
         """Convert the data of a file."""
-        fields = ("format", "version", "drives", "names", *PAIRS, "gateways")
+        fields = ("format", "version", "drives", "names", *ASSERTIONS, "gateways")
         record = self._object(data, "file", fields)
         if record.get("format") != FORMAT:
             raise self.wrong("format", f'"{FORMAT}"', record.get("format"))
@@ -178,7 +178,7 @@ class _CorrectionsReader(FieldReader):
             self.each(record, "names", self._naming, optional=True),
             tuple(
                 said
-                for kind in PAIRS
+                for kind in ASSERTIONS
                 for said in self.each(record, kind, partial(self._said, kind), optional=True)
             ),
             self.each(record, "gateways", self._passage, optional=True),

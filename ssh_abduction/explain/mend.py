@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Unpack
 
+from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View
@@ -16,7 +17,6 @@ from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Status, Stop
-from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.old_choices import with_old_choices
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from ssh_abduction.data.closure import closures_among
+from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.settle import Problem, displacement_of
 from ssh_abduction.theory.theory import Theory
 

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
+from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action
@@ -28,7 +29,6 @@ from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.theory.theory import Theory
 
 How: TypeAlias = Literal["link", "implied", "expected", "open"]
-QUARTERS = {"right": 1, "around": 2, "left": 3}
 OF_FRAMES = frozenset({"turn_rotates", "one_dstate_per_heading", "one_heading"})
 _OF_COURSES = frozenset({"turn_around_reverses", "one_dstate_per_course"})
 

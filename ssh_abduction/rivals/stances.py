@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
+from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Action, Trace
-from ssh_abduction.rivals.consequences import OF_FRAMES, QUARTERS, is_possible
+from ssh_abduction.rivals.consequences import OF_FRAMES, is_possible
 from ssh_abduction.rivals.machines import Can, Seen, leads_of
 from ssh_abduction.theory.theory import Theory
 

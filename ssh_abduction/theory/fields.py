@@ -7,6 +7,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from ssh_abduction.data.checks import a_flag, a_whole_number, one_of
+from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.errors import TheoryError, brief, is_finite
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.rules import Rules
@@ -88,8 +89,6 @@ SPOKEN_FOR = {
 }
 MOST_JOINT = 2  # the most returns that may be tested together
 MOST_STEPS = 2**31  # the numbers of steps are below this: clingo's numbers have 32 bits
-ASSERTIONS = ("same", "different", "elsewhere", "same_place")
-FAULTS = ("misread", "misseen", "slipped", "jumped", "changed")
 CAUSAL = "Theory.causal() (--theory causal)"  # for error messages
 
 

@@ -202,6 +202,9 @@ DRIVES = "the field several_drives"
 LIFTS = "the field lifts"
 # Fields that a trace sets, and that the Python code around each fast encoding knows.
 OF_TRACES = (DRIVES, LIFTS)
+# The axioms of evidence about steps only. Such evidence says which steps are different dstates or
+# at different places, and which labels contradict each other.
+PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "closure", "planar", "other_floor")
 # Axioms about links, observations and pairs of steps only. If a map satisfies them, so does the map
 # of its first steps. Two drives may be cut apart, too, because no link joins them.
 SURVIVE_A_CUT = FRAMES | {
@@ -213,18 +216,10 @@ SURVIVE_A_CUT = FRAMES | {
     "side_of_branch, excusable",
     "sides_disjoint",
     "path_between_sides",
-    "planar",
-    "asserted",
     "asserted same",
-    "one_star",
-    "one_pose",
-    "closure",
-    "other_floor",
+    *PAIRS_OF_STEPS,
     *OF_TRACES,
 }
-# The axioms of evidence about steps only. Such evidence says which steps are different dstates or
-# at different places, and which labels contradict each other.
-PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "closure", "planar", "other_floor")
 
 TABLE = (
     Speedup(

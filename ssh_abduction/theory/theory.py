@@ -19,17 +19,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ssh_abduction.data.checks import a_path, a_text, a_whole_number, an_instance, an_object, one_of
+from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.errors import TheoryError, TraceError, brief, named, said_of
 from ssh_abduction.data.files import read_at_most
+from ssh_abduction.data.map_parts import FAULTS
 from ssh_abduction.data.trace import Step, Trace, checked_trace
 from ssh_abduction.data.words import shortly
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.fields import (
-    ASSERTIONS,
     AUTO,
     CAUSAL,
     EXCUSED,
-    FAULTS,
     LAID,
     PREFERRED,
     PRICES,

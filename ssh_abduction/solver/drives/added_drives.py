@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 from ssh_abduction.data.checks import an_instance
-from ssh_abduction.data.corrections import Corrections
+from ssh_abduction.data.corrections import ASSERTIONS, Corrections
 from ssh_abduction.data.drives import drives_of, starts_of, step_name, together
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.gateways import with_allowed_headings
@@ -47,7 +47,6 @@ from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.values import Cost, Effort, Level, Status
-from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory

@@ -24,12 +24,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from ssh_abduction.checker.checker import violations
+from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.runtime.clock import each_looking
 from ssh_abduction.solver.guesses.gateway_sketch import sketches_of
 from ssh_abduction.solver.guesses.sketch import Sketch
-from ssh_abduction.solver.steps.chart import QUARTERS
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.theory.theory import Theory
 

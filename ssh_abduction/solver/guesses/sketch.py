@@ -41,9 +41,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Self
 
+from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace, View
-from ssh_abduction.solver.steps.chart import QUARTERS
 from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
 

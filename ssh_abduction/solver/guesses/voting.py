@@ -26,10 +26,10 @@ from typing import Any
 
 import numpy as np
 
+from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.runtime.clock import each_looking, look_at_clock
-from ssh_abduction.solver.steps.chart import QUARTERS
 from ssh_abduction.theory.pairs import Pairs, pairs_in
 from ssh_abduction.theory.theory import Theory
 

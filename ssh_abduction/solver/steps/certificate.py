@@ -24,10 +24,11 @@ from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.solver.steps.noise import Noise, noise_in
+from ssh_abduction.theory.speedups import CAUSAL
 
 # Steps that are apart (the same actions lead from them to different views) are different dstates
 # by these axioms.
-RESTS_ON = frozenset({"functional_view", "deterministic"})
+RESTS_ON = CAUSAL
 # Write a certificate with its words only if they have at most this many actions together, which are
 # some megabytes. The number of actions may grow with the cube of the number of steps. A checker can
 # compute the words again.

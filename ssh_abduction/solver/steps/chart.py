@@ -26,7 +26,8 @@ from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
-from ssh_abduction.data.trace import Trace, TurnDirection
+from ssh_abduction.data.action import QUARTERS
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.pairs import Earlier
 
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.steps.apart import Continuations
 
 Link: TypeAlias = tuple[int, int, int]  # node, action, node
-QUARTERS: dict[TurnDirection | None, int] = {"right": 1, "around": 2, "left": 3}
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from functools import cache
 from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
+from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.groups import NodeClasses, gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Openings
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
 
 Side = TypeVar("Side", bound=Hashable)
 
-QUARTERS = {"right": 1, "around": 2, "left": 3}
 SLOTS = 4
 BEHIND = 2  # slots from the one that is faced to the one behind
 
