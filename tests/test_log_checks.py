@@ -143,6 +143,30 @@ def test_missing_odometry_does_not_turn_wrongly(scans: Scans) -> None:
     assert "turn differently" not in notes
 
 
+def one_elsewhere(scans: Scans) -> Scans:
+    """One scan of a good drive shows another place."""
+    return [*scans[:60], replace(scans[60], ranges=scans[260].ranges), *scans[61:150]]
+
+
+def hardly_seeing(scans: Scans) -> Scans:
+    """In four scans, eight beams meet walls, which no earlier scan shows."""
+    beam = np.arange(len(scans[0].ranges))
+    usual, few = beam < 45, (beam >= 76) & (beam < 84)
+    return [
+        replace(s, ranges=np.where(few if 120 <= i < 124 else usual, s.ranges, np.nan))
+        for i, s in enumerate(scans[:134])
+    ][95:]
+
+
+@pytest.mark.parametrize("change", [tuple, one_elsewhere, hardly_seeing])
+def test_good_log_gets_no_warning_of_a_carry(
+    scans: tuple[Scan, ...], change: Callable[[Scans], Scans]
+) -> None:
+    notes = notes_of(change(scans))
+    assert "contradict each other" not in notes
+    assert "carried" not in notes
+
+
 def test_good_log_gets_no_warning(scans: tuple[Scan, ...]) -> None:
     assert notes_of(scans) == ""
 

@@ -45,6 +45,8 @@ POOR, HEADINGS = 0.5, 24
 # A scan is of an unseen place if less than STRANGE of its points lies on walls, in IN_A_ROW scans
 # in a row.
 STRANGE, IN_A_ROW = 0.3, 3
+# Fewer points of a scan do not show whether its place was seen before.
+FEW_POINTS = 20
 # After at most this many metres, by odometry, a robot still sees some earlier walls.
 NEARBY = 1.0
 # Standard deviations of the motion without odometry, in metres and radians.
@@ -259,9 +261,12 @@ def _carried(log: RobotLog, track: Track) -> list[int]:
         if not any(map(len, known)):
             continue
         wide = np.diag(UNKNOWN) ** 2
+        seen = [surfaces_in(log.scans[k]) for k in range(i, i + IN_A_ROW)]
+        if min(map(len, seen)) < FEW_POINTS:
+            continue
         shares = [
-            _matched(surfaces_in(log.scans[k]), known, track.pose(k), (0.0, 0.0, 0.0), wide)[2]
-            for k in range(i, i + IN_A_ROW)
+            _matched(surfaces, known, track.pose(k), (0.0, 0.0, 0.0), wide)[2]
+            for k, surfaces in enumerate(seen, i)
         ]
         # The scans must match each other; otherwise the laser sees nothing.
         if max(shares) < STRANGE and track.shares[i + 1 : i + IN_A_ROW].min() >= POOR:

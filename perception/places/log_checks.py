@@ -371,18 +371,23 @@ def _contradictions(log: RobotLog, track: Track) -> list[int]:
     found: list[int] = []
     rare = float(np.nanpercentile(track.shares, RARELY)) - WORSE
     for i in np.flatnonzero(track.shares < POORLY).tolist():
-        pairs = [
-            pair
-            for k in range(max(0, i - BESIDE), i)
-            for n in range(i, min(len(log), i + BESIDE))
-            for pair in ((k, n), (n, k))
-        ]
-        if not pairs or track.cuts_between(i - BESIDE, i):
+        before, after = range(max(0, i - BESIDE), i), range(i, min(len(log), i + BESIDE))
+        if not before or track.cuts_between(i - BESIDE, i):
             continue
-        inside, seen = np.sum([_intruding(log, track, *pair) for pair in pairs], axis=0)
-        if inside > (INTRUDING_RARELY if track.shares[i] < rare else INTRUDING) * seen:
+        most = INTRUDING_RARELY if track.shares[i] < rare else INTRUDING
+        # If the next scans do not contradict, this scan alone was matched wrongly.
+        if _contradict(log, track, before, after, most) and (
+            len(after) == 1 or _contradict(log, track, before, after[1:], most)
+        ):
             found.append(i)
     return found
+
+
+def _contradict(log: RobotLog, track: Track, before: range, after: range, most: float) -> bool:
+    """Whether more than the share `most` of the points of either scans intrude on the others."""
+    pairs = [pair for k in before for n in after for pair in ((k, n), (n, k))]
+    inside, seen = np.sum([_intruding(log, track, *pair) for pair in pairs], axis=0)
+    return bool(inside > most * seen)
 
 
 def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, int]:
