@@ -1,4 +1,4 @@
-"""Closures that contradict other closures are dropped."""
+"""Closures that contradict the track and other closures are dropped."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def closures(visits: Sequence[Visit], bent: float, wrong: dict[int, Array]) -> l
     return found
 
 
-@pytest.mark.parametrize("bent", [0.0, 0.4, -2.0])
+@pytest.mark.parametrize("bent", [0.0, 0.4, -0.4])
 @pytest.mark.parametrize("shift", [(2.0, 0.0), (0.0, -3.0)])
 def test_closure_that_contradicts_most_others_is_dropped(
     bent: float, shift: tuple[float, float]
 ) -> None:
-    track, visits = drive(1e-5, bent)
+    track, visits = drive(5e-4, bent)
     found = closures(visits, bent, {2: np.array(shift)})
     assert [closure.first for closure in agreeing(track, visits, found)] == [6, 5, 4, 3, 1, 0]
     right = closures(visits, bent, {})
@@ -70,6 +70,16 @@ def test_of_two_closures_the_one_with_the_lower_score_is_dropped() -> None:
     assert agreeing(track, visits, [two, one]) == [one]
     better = replace(two, match=replace(two.match, score=0.95))
     assert agreeing(track, visits, [better, one]) == [better]
+
+
+def test_closure_is_dropped_that_contradicts_only_distant_ones() -> None:
+    track, visits = drive(5e-4, 0.4)
+    far = [visits[0], *visits[5:9], visits[-1]]
+    first, *near = (
+        VisitMatch(k, 5 - k, closure.match)
+        for k, closure in enumerate(reversed(closures(visits, 0.4, {0: np.array([0.0, 6.0])})[-3:]))
+    )
+    assert agreeing(track, far, [*near, first]) == near
 
 
 def test_closures_across_a_cut_are_not_compared() -> None:

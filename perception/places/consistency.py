@@ -1,82 +1,163 @@
-"""Drops closures that contradict other closures of the same drive.
+"""Drops closures that contradict the other closures and the track of a drive.
 
 Rooms look alike, and the track is uncertain after a long way. So a closure may pass the test of the
-track although it is false. Two closures between nearby visits make a loop: along one closure, along
-the track, back along the other closure, and back along the track. The loop ends where it began if
-both closures are right.
+track although it is false. It then pulls the track away from where the other closures put it. All
+closures are fitted to the track together. A closure is dropped if the fit is much better without
+it.
 
 Reference:
-    Mangelson et al. 2018, "Pairwise consistent measurement set maximization for robust multi-robot
-    map merging". Here the closure with the most contradictions is dropped first.
+    Latif et al. 2013, "Robust loop closing over time for pose graph SLAM" (closures that do not fit
+    are found by a fit of the pose graph). Here the leave-one-out chi-square finds them.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import splu
 
-from perception.places.closures import GATE, INFLATED, NOISE, VisitMatch, at_end, uncertainty
-from perception.places.track import Array, Track, covariance_turned, points_turned, wrapped
+from perception.places.closures import BEND, BENDS, GATE, INFLATED, NOISE, VisitMatch, uncertainty
+from perception.places.track import Array, Track
 from perception.places.visits import Visit
 
-# Two closures are compared if their loop has less than this many metres of the track.
-LOOP = 30.0
+# Of closures that fit nearly as badly as the worst one, the one with the lowest score is dropped.
+# Nearly is this share of the chi-square of the worst one.
+NEARLY = 0.9
+# After a closure is dropped, only closures above this share of GATE are judged again.
+DOUBTFUL = 0.2
+# The fit ends after ROUNDS steps, or if a step lowers the chi-square by less than the share STILL.
+# A step that raises the chi-square is halved, at most HALVINGS times.
+ROUNDS, STILL, HALVINGS = 50, 1e-4, 8
+# The inverse of the standard deviation of the drift. Its largest value, where closures are found,
+# is two standard deviations.
+SURE = 2 / (BENDS * BEND)
+# The least variance of a motion, and a small number that makes the normal equations regular.
+LEAST, REGULAR = 1e-8, 1e-9
+# The gains of this many closures are computed at once.
+TOGETHER = 256
 
 
 def agreeing(
     track: Track, visits: Sequence[Visit], found: Sequence[VisitMatch]
 ) -> list[VisitMatch]:
-    """Drop closures until no two contradict each other.
+    """Drop closures, the worst first, until each one agrees with the track and the others.
 
-    The closure that is dropped first contradicts most others, less those that it agrees with. Of
-    equals it is the one with the lowest score. `found` is sorted by later visits.
+    A closure agrees if the chi-square of the best fit is at most GATE lower without it. The
+    covariances of the track are multiplied by INFLATED, and the heading may drift steadily.
     """
-    loops = _ClosureLoops(track, visits)
-    votes = np.zeros((len(found), len(found)), np.int8)  # small, as it grows with the square
-    ends = [float(track.way[visits[closure.last].scan]) for closure in found]
-    for i, one in enumerate(found):
-        for k in range(bisect_left(ends, ends[i] - LOOP), i):
-            other = found[k]
-            if loops.way(other.first, one.first) + loops.way(other.last, one.last) < LOOP:
-                votes[i, k] = votes[k, i] = 1 if loops.square(one, other) < GATE else -1
+    graph, kept = _ClosureGraph(track, visits, found), np.ones(len(found), bool)
     scores = np.array([closure.match.score for closure in found])
-    kept = np.ones(len(found), bool)
-    while (contradicted := np.flatnonzero(kept & (votes[:, kept] < 0).any(axis=1))).size:
-        order = np.lexsort((scores[contradicted], votes[contradicted][:, kept].sum(axis=1)))
-        kept[contradicted[order[0]]] = False
+    doubtful = np.arange(len(found))  # a closure that fits well still does so without others
+    while len(doubtful) and (gains := graph.gains(kept, doubtful)).max() > GATE:
+        bad = doubtful[gains >= max(NEARLY * gains.max(), GATE)]
+        kept[bad[np.argmin(scores[bad])]] = False
+        doubtful = doubtful[(gains > DOUBTFUL * GATE) & kept[doubtful]]
     return [closure for closure, keep in zip(found, kept, strict=True) if keep]
 
 
-class _ClosureLoops:
-    """Judges loops of two closures and the two stretches of the track between their visits."""
+class _ClosureGraph:
+    """Least squares over the poses of the visits of a drive and the drift of its heading.
 
-    def __init__(self, track: Track, visits: Sequence[Visit]) -> None:
-        self._track = track
-        self._scans = [visit.scan for visit in visits]
-        self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
+    The pose of a visit is the middle of its place, in metres, and by how many radians the track is
+    turned there. Edges are the motions between successive visits, and the closures.
+    """
 
-    def way(self, first: int, last: int) -> float:
-        """Return how many metres the robot drove between two visits; inf if the track is cut."""
-        i, j = sorted((self._scans[first], self._scans[last]))
-        cut = self._track.cuts_between(i, j)
-        return math.inf if cut else float(self._track.way[j] - self._track.way[i])
+    def __init__(self, track: Track, visits: Sequence[Visit], found: Sequence[VisitMatch]) -> None:
+        middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
+        scans = [visit.scan for visit in visits]
+        moves = [
+            k
+            for k in range(1, len(visits))
+            if not track.cuts_between(*sorted(scans[k - 1 : k + 1]))
+        ]
+        self._first = np.array([*(k - 1 for k in moves), *(c.first for c in found)], int)
+        self._last = np.array([*moves, *(c.last for c in found)], int)
+        onward = [np.array([*(middles[k] - middles[k - 1]), 0.0]) for k in moves]
+        self._measured = np.array([*onward, *((*c.match.shift, c.match.turn) for c in found)])
+        spreads = [
+            INFLATED * uncertainty(track, scans[k - 1], scans[k], middles[k]) + LEAST * np.eye(3)
+            for k in moves
+        ]
+        noise = np.array([*spreads, *[np.diag(NOISE) ** 2] * len(found)]).reshape(-1, 3, 3)
+        self._whitening = np.linalg.inv(np.linalg.cholesky(noise))
+        # Closures have no way, as no drift turns a match.
+        way = np.abs(np.diff(track.way[scans])) if len(visits) > 1 else np.zeros(0)
+        self._way = np.array([*(way[k - 1] for k in moves), *[0.0] * len(found)])
+        self._moves = len(moves)
+        self._unknown = np.append(np.column_stack([middles, np.zeros(len(visits))]).ravel(), 0.0)
 
-    def square(self, one: VisitMatch, other: VisitMatch) -> float:
-        """Compute the chi-square of a loop, with INFLATED times the covariance of the track."""
-        at, turn = self._middles, one.match.turn
-        here = at[one.first] - at[other.first] + one.match.shift
-        onward = points_turned(turn, at[other.last] - at[one.last])
-        off = np.array([*(here + onward - other.match.shift), wrapped(turn - other.match.turn)])
-        first = self._spread(other.first, one.first, at[other.first] + here + onward)
-        last = self._spread(one.last, other.last, at[other.last])
-        # The error of the rotation of the first match moves the end of the second stretch.
-        noise = np.diag(NOISE) ** 2
-        spread = first + covariance_turned(turn, last) + noise + at_end(onward, noise)
-        return float(off @ np.linalg.solve(spread, off))
+    def gains(self, kept: NDArray[np.bool_], asked: NDArray[np.int_]) -> Array:
+        """Fit the poses to the closures kept. Return how much the chi-square falls without some.
 
-    def _spread(self, first: int, last: int, end: Array) -> Array:
-        """Compute the covariance of a point near one visit relative to another: (3, 3)."""
-        return INFLATED * uncertainty(self._track, self._scans[first], self._scans[last], end)
+        The fit begins with the result of the last one. `asked` has the closures to leave out, each
+        by itself.
+        """
+        some = np.append(np.ones(self._moves, bool), kept)
+        squares = self._squares(some, self._unknown)
+        for _ in range(ROUNDS):
+            off, jacobian = self._linear(some, self._unknown)
+            normal = (jacobian.T @ jacobian).tocsc()
+            normal.setdiag(normal.diagonal() + REGULAR)
+            normal[-1, -1] += SURE**2
+            solver = splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+            pull = jacobian.T @ off.ravel()
+            pull[-1] += SURE**2 * self._unknown[-1]
+            step = solver.solve(-pull)
+            # Far from the best fit, a whole step may go too far.
+            tried = [(self._squares(some, better := self._unknown + step), better)]
+            while tried[-1][0] > squares and len(tried) < HALVINGS:
+                step /= 2
+                tried.append((self._squares(some, better := self._unknown + step), better))
+            if tried[-1][0] >= squares * (1 - STILL):
+                break
+            squares, self._unknown = tried[-1]
+        rows = self._moves + np.searchsorted(np.flatnonzero(kept), asked)
+        return np.concatenate([*self._gains(off[rows], jacobian, rows, solver)])
+
+    def _gains(
+        self, off: Array, jacobian: Any, rows: NDArray[np.int_], solver: Any
+    ) -> Iterator[Array]:
+        """Compute the leave-one-out chi-square of some edges, TOGETHER of them at a time."""
+        for begin in range(0, len(off), TOGETHER):
+            some = off[begin : begin + TOGETHER]
+            own = (3 * rows[begin : begin + TOGETHER, None] + np.arange(3)).ravel()
+            dense = jacobian[own].toarray()
+            found = solver.solve(dense.T).T.reshape(len(some), 3, -1)
+            # How much of its own error each edge takes away by moving the poses.
+            taken = dense.reshape(len(some), 3, -1) @ found.transpose(0, 2, 1)
+            left = (1 + REGULAR) * np.eye(3) - taken
+            yield np.einsum("ki,ki->k", some, np.linalg.solve(left, some[..., None])[..., 0])
+
+    def _squares(self, some: NDArray[np.bool_], unknown: Array) -> float:
+        """Compute the chi-square of some edges and of the drift."""
+        return float((self._linear(some, unknown)[0] ** 2).sum() + (SURE * unknown[-1]) ** 2)
+
+    def _linear(self, some: NDArray[np.bool_], unknown: Array) -> tuple[Array, Any]:
+        """Compute the errors of edges in standard deviations, (k, 3), and their derivative."""
+        first, last, way = self._first[some], self._last[some], self._way[some]
+        poses, drift = unknown[:-1].reshape(-1, 3), unknown[-1]
+        facing = poses[first, 2] + drift * way / 2
+        cos, sin, zero, one = np.cos(facing), np.sin(facing), 0 * facing, 1 + 0 * facing
+        x, y, turned = (poses[last] - poses[first]).T
+        ahead, left = cos * x + sin * y, cos * y - sin * x
+        off = np.stack([ahead, left, turned - drift * way], axis=1) - self._measured[some]
+        off[:, 2] = (off[:, 2] + math.pi) % math.tau - math.pi
+        by_last = np.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], axis=1)
+        by_first = np.stack([-cos, -sin, left, sin, -cos, -ahead, zero, zero, -one], axis=1)
+        by_drift = np.stack([left * way / 2, -ahead * way / 2, -way], axis=1)
+        derivative = np.concatenate(
+            [by_first.reshape(-1, 3, 3), by_last.reshape(-1, 3, 3), by_drift[..., None]], axis=2
+        )
+        whitening = self._whitening[some]
+        own = np.stack([3 * node + k for node in (first, last) for k in range(3)], axis=1)
+        columns = np.column_stack([own, np.full(len(first), len(unknown) - 1)])
+        rows = np.arange(3 * len(first)).reshape(-1, 3, 1)
+        entries = np.broadcast_arrays(whitening @ derivative, rows, columns[:, None])
+        values, of, by = (entry.ravel() for entry in entries)
+        jacobian = coo_array((values, (of, by)), shape=(3 * len(first), len(unknown))).tocsr()
+        return (whitening @ off[..., None])[..., 0], jacobian
