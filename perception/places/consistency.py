@@ -29,7 +29,7 @@ from perception.places.visits import Visit
 # Nearly is this share of the chi-square of the worst one.
 NEARLY = 0.9
 # After a closure is dropped, only closures above this share of GATE are judged again.
-DOUBTFUL = 0.2
+DOUBTFUL = 0.5
 # The fit ends after ROUNDS steps, or if a step lowers the chi-square by less than the share STILL.
 # A step that raises the chi-square is halved, at most HALVINGS times.
 ROUNDS, STILL, HALVINGS = 50, 1e-4, 8

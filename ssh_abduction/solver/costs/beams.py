@@ -1,5 +1,9 @@
 """Guess maps of little cost by beams of hypotheses, narrow beams first (`guesses/beam.py`).
 
+Before that, the places of a single drive are merged at poses that fit all closures
+(`guesses/smoothed.py`). After a long way this is better than a beam, which goes through the trace
+once.
+
 If there is a time limit, wider beams follow while they find better maps.
 """
 
@@ -28,8 +32,8 @@ JUMPED = 0.4
 # With a time limit, beams that are WIDER times as wide as the last one follow while they find
 # better maps. They end at the share WIDENING, as bounds need most of a short time.
 WIDER, WIDENING = 2, 0.3
-# Joining the maps of drives ends after the share JOINING.
-JOINING = 0.5
+# Joining the maps of drives ends after the share JOINING, and smoothing after the share SMOOTHING.
+JOINING, SMOOTHING = 0.5, 0.3
 # A beam of this width or more nearly always ends with the map of least cost.
 BROAD = 4
 
@@ -114,6 +118,11 @@ class Beams:
                 self._take(nats, -math.inf, joining.broken)
             self._keep_best()
             parts.report()
+        with suppress(StageTimeError), watch.stage(time.end(SMOOTHING)):
+            if (smoothed := parts.candidates.smoothed(self._misfit.visit)) is not None:
+                nats = self._add(smoothed)
+                self._take(nats, nats, -math.inf)
+        self._keep_best()
         for width in widths:
             began = watch.elapsed()
             # A beam of width n takes about n times as long as the first one.
@@ -148,7 +157,8 @@ class Beams:
 
     def _search_without_axioms(self, time: _Time) -> None:
         """If `broken` is unknown, find it with the widest beam that ended."""
-        is_open = self._best[1] < math.inf and math.isinf(self.broken)
+        has_ended = self._ended >= BROAD
+        is_open = has_ended and self._best[1] < math.inf and math.isinf(self.broken)
         with suppress(StageTimeError), self._parts.watch.stage(time.end(BREAKING)):
             if is_open and (beam := self._parts.candidates.beam(self._ended)):
                 self.broken = self._best[1] - beam.nats_without_axioms()
@@ -175,6 +185,8 @@ class Beams:
         return True
 
     def _take(self, nats: float, estimate: float, broken: float) -> None:
-        """Keep what a broad beam, or joining the maps of drives, says about its best map."""
+        """Keep what a broad beam, or another guess, says about its best map."""
         if (nats, estimate) <= self._best:
             self._best, self.broken = (nats, estimate), broken
+        elif broken == 0.0 and math.isinf(self.broken):  # the axioms do not hinder the beam
+            self.broken = self._best[1] - estimate

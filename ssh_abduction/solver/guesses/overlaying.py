@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.guesses.kept_apart import KeptApart, denied_pairs
 from ssh_abduction.solver.guesses.pieces import poses_turned
@@ -190,9 +191,12 @@ class _ClashError(Exception):
 class Overlay:
     """Merges the dstates and places of two maps, such as an old map and the map of a drive."""
 
-    def __init__(self, standing: Part, drive: Part, problem: Problem, sights: Sights) -> None:
+    def __init__(
+        self, standing: Part, drive: Part | None, problem: Problem, sights: Sights
+    ) -> None:
+        """Prepare the merges. Without a second map, the first one is merged with itself."""
         self._theory = theory = problem.theory
-        both = standing.beside(drive)
+        both = standing if drive is None else standing.beside(drive)
         self._both, self._sights, self._overlap = both, sights, problem.overlap
         self._old = len(standing.places), len(standing.sights)
         self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
@@ -208,7 +212,7 @@ class Overlay:
             links,
             both.mean,
             both.covariance,
-            both.nats + problem.overlap.between(standing.labels, drive.labels),
+            both.nats + (problem.overlap.between(standing.labels, drive.labels) if drive else 0.0),
         )
         at = {t: both.places[s] for t, s in both.labels.items()}
         self._dstates_apart = KeptApart.of_dstates(problem, both.labels, both.kept)
@@ -218,8 +222,9 @@ class Overlay:
         self._costs = np.full(2 * (len(both.sights),), math.inf)
         for (p, seen), (q, others) in combinations(enumerate(both.sights), 2):
             self._costs[p, q] = sights.merged(seen, others)
-        old = len(standing.places)
-        self._denied = {(s, old + x) for s, x in denied_pairs(theory, standing, drive)}
+        old = len(standing.places) if drive else 0
+        denied = denied_pairs(theory, standing, drive or standing)
+        self._denied = {(s, old + x) for s, x in denied}
         self._ties = ties_between(problem.trace, both, len(standing.places))
         # These change while the two maps are merged.
         self._state, self._changes = self._apart, self._costs
@@ -243,7 +248,7 @@ class Overlay:
         self._lay(new, at, equal if turn is None else turn, is_turn_known=turn is not None)
         if not (self._tried([(old, new)]) if turn is None else self._tried([], places)):
             return False
-        self._merge_all()
+        self.merge_all()
         return True
 
     def merge_by_closures(self) -> bool:
@@ -255,19 +260,21 @@ class Overlay:
         self._lay(*relation_of(self._both, self._ties))
         mean, covariance = tied(self._both, self._ties, self._state.mean, self._state.covariance)
         self._state = replace(self._state, mean=mean, covariance=covariance)
-        return self._merge_all()
+        return self.merge_all()
 
-    def _merge_all(self) -> bool:
+    def merge_all(self) -> bool:
         """Merge all places that coincide. Return whether there was one."""
         first = self._state
         merged = True
         while merged:  # what was refused may fit now
             merged, self._changes = False, self._costs.copy()
             while pair := self._surest():
+                look_at_clock()
                 if self._tried([], pair):
                     merged = True
                 else:
                     self._changes[pair] = math.inf
+        self._merge_coinciding(set(self._state.place))
         return self._state is not first
 
     def part(self) -> Part:

@@ -1,0 +1,95 @@
+"""Guessing a map at poses that fit all closures at once."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import replace
+from itertools import combinations, pairwise
+
+import pytest
+
+from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction.data import Closure, Odometry
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
+from ssh_abduction.solver.guesses.smoothed import smoothed_map
+from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import settle
+
+ODOMETRY = Odometry(
+    along=0.02, across=0.02, heading=0.003, turning=0.03, position=0.1, angle=0.03, scale=0.01,
+    bend=0.0005,
+)  # fmt: skip
+TIGHT = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.0003))
+BARE = Theory(star="none", boundary="none")
+
+
+def rounds(columns: int, rows: int, seed: int) -> tuple[Trace, list[tuple[int, int]]]:
+    """Two rounds through a grid of places that look the same, and the place of each step.
+
+    The cells are 10 m wide. Turns are off by 0.03 radians. Closures begin in the second third of
+    the second round. Until then, the robot may be at several places.
+    """
+    tour = [
+        (column, row)
+        for column in range(columns)
+        for row in (range(1, rows) if column % 2 == 0 else range(rows - 1, 0, -1))
+    ]
+    tour += [(column, 0) for column in reversed(range(columns))]
+    way, chance = [*tour, *tour, tour[0]], random.Random(seed)
+    heading = [math.atan2(q[1] - p[1], q[0] - p[0]) for p, q in pairwise(way)]
+    pose: Pose = (10.0 * way[0][0], 10.0 * way[0][1], heading[0])
+    poses, at, actions, displacements = [pose], [0], list[str](), list[Pose]()
+    for i, facing in enumerate(heading):
+        turn = math.remainder(facing - pose[2], math.tau)
+        for action in (["left" if turn > 0 else "right"] if abs(turn) > 0.1 else []) + ["travel"]:
+            onward = (10.0, 0.0, 0.0) if action == "travel" else (0.0, 0.0, turn)
+            off = (0.1, 0.1, 0.03) if action == "travel" else (0.0, 0.0, 0.03)
+            x, y, angle = (a + chance.gauss(0, sigma) for a, sigma in zip(onward, off, strict=True))
+            displacements.append((x, y, angle))
+            pose = moved(pose, onward)
+            poses.append(pose)
+            actions.append(action)
+            at.append(i + (action == "travel"))
+    first = dict[tuple[int, int], int]()
+    closures = []
+    for t, i in enumerate(at):
+        if i < len(tour):
+            first.setdefault(way[i], t)
+        elif i >= len(tour) * 4 // 3:
+            onward = displacement_between(poses[first[way[i]]], poses[t])
+            closures.append(Closure(first[way[i]], t, onward, TIGHT))
+    trace = Trace.from_steps(
+        ["v"] * len(at), actions, displacements=displacements, odometry=ODOMETRY
+    )
+    return replace(trace, closures=tuple(closures)), [way[i] for i in at]
+
+
+def is_true(ssh_map: SSHMap, places: list[tuple[int, int]]) -> bool:
+    found = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
+    return all(
+        (found[i] == found[j]) == (places[i] == places[j])
+        for i, j in combinations(range(len(places)), 2)
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_late_closures_correct_the_poses_of_earlier_steps(seed: int) -> None:
+    trace, places = rounds(6, 4, seed)
+    problem = settle(trace, BARE)
+    ssh_map = smoothed_map(problem, Log(trace, problem.theory, problem.pairs), visits_of(trace))
+    assert ssh_map is not None
+    assert is_true(ssh_map, places)
+
+
+def test_search_takes_the_smoothed_map() -> None:
+    trace, places = rounds(6, 4, 0)
+    assert is_true(solve(trace, BARE, time_limit=1.0).maps[0], places)
+
+
+def visits_of(trace: Trace) -> list[int]:
+    """The number of the visit of each step: a turn stays at a place."""
+    visits = [0]
+    for action in trace.actions:
+        visits.append(visits[-1] + (action.kind != "turn"))
+    return visits
