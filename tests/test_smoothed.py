@@ -6,12 +6,15 @@ import math
 import random
 from dataclasses import replace
 from itertools import combinations, pairwise
+from unittest.mock import patch
 
 import pytest
 
-from ssh_abduction import SSHMap, Theory, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace
 from ssh_abduction.data import Closure, Odometry
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
+from ssh_abduction.solver import Search
+from ssh_abduction.solver.costs import beams
 from ssh_abduction.solver.guesses.smoothed import smoothed_map
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
@@ -77,19 +80,16 @@ def is_true(ssh_map: SSHMap, places: list[tuple[int, int]]) -> bool:
 def test_late_closures_correct_the_poses_of_earlier_steps(seed: int) -> None:
     trace, places = rounds(6, 4, seed)
     problem = settle(trace, BARE)
-    ssh_map = smoothed_map(problem, Log(trace, problem.theory, problem.pairs), visits_of(trace))
+    ssh_map = smoothed_map(problem, Log(trace, problem.theory, problem.pairs))
     assert ssh_map is not None
     assert is_true(ssh_map, places)
 
 
 def test_search_takes_the_smoothed_map() -> None:
     trace, places = rounds(6, 4, 0)
-    assert is_true(solve(trace, BARE, time_limit=1.0).maps[0], places)
-
-
-def visits_of(trace: Trace) -> list[int]:
-    """The number of the visit of each step: a turn stays at a place."""
-    visits = [0]
-    for action in trace.actions:
-        visits.append(visits[-1] + (action.kind != "turn"))
-    return visits
+    weighing = Search(trace, BARE)._weighing
+    assert weighing is not None
+    with patch.object(beams, "WIDTHS", {}):
+        assert weighing.guess(lambda: False)
+    assert weighing.best is not None
+    assert is_true(weighing.best.map, places)

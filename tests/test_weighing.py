@@ -438,7 +438,7 @@ def test_wider_beams_follow_while_they_find_better_maps(
     clock = [0.0]
     watch = Watch(seconds, clock=lambda: clock[0])
     watch.start()
-    candidates = SimpleNamespace(sketch=Mock(), beam=beam, maps_of=maps_of, smoothed=lambda _: None)
+    candidates = SimpleNamespace(sketch=Mock(), beam=beam, maps_of=maps_of, smoothed=lambda: None)
     task = SimpleNamespace(theory=Theory())
     parts = Mock(watch=watch, candidates=candidates, task=task)
     found = beams.Beams(parts, Mock(), {1: 5.0, 4: 5.0, **costs}.__getitem__, Mock())

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import threading
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -135,11 +135,10 @@ class Candidates:
 
         return Joining(self._task.problem, self._task.log)
 
-    def smoothed(self, visits: Sequence[int]) -> SSHMap | None:
+    def smoothed(self) -> SSHMap | None:
         """Merge visits at poses that fit all closures. None if the checker refuses the map.
 
-        Also None where there are no beams, or with several drives, lifts, or faults. `visits` has
-        the number of the visit of each step.
+        Also None where there are no beams, or with several drives, lifts, or faults.
         """
         theory = self._task.theory
         has_one_frame = not (theory.several_drives or theory.lifts or theory.has_faults)
@@ -147,7 +146,7 @@ class Candidates:
             return None
         from ssh_abduction.solver.guesses.smoothed import smoothed_map  # loads numpy
 
-        found = smoothed_map(self._task.problem, self._task.log, visits)
+        found = smoothed_map(self._task.problem, self._task.log)
         whole = None if found is None else self._with_unknown_views(found)
         return whole if whole is not None and self._judging.accepts(whole) else None
 

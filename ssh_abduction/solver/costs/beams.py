@@ -119,7 +119,7 @@ class Beams:
             self._keep_best()
             parts.report()
         with suppress(StageTimeError), watch.stage(time.end(SMOOTHING)):
-            if (smoothed := parts.candidates.smoothed(self._misfit.visit)) is not None:
+            if (smoothed := parts.candidates.smoothed()) is not None:
                 nats = self._add(smoothed)
                 self._take(nats, nats, -math.inf)
         self._keep_best()

@@ -23,7 +23,7 @@ from typing import TypeAlias
 
 from ssh_abduction.data.groups import NodeClasses, minimal_part, numbered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.geometry.equations import Equations
+from ssh_abduction.solver.geometry.equations import Equations, visits_by_turns
 from ssh_abduction.solver.geometry.fit import Array, Poses
 from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.theory.evidence import Equality
@@ -45,11 +45,8 @@ class Misfit:
     def __init__(self, problem: Problem) -> None:
         """Find the visits of the trace. No misfit is computed yet."""
         self.trace, self._overlap = problem.trace, problem.overlap
-        theory = self._theory = problem.theory
-        stays = theory.level == "topological" and "turn_stays" in theory.hard and not theory.jumped
-        self.visit = [0]
-        for t, action in enumerate(self.trace.actions, 1):
-            self.visit.append(self.visit[-1] if stays and action.kind == "turn" else t)
+        self._theory = problem.theory
+        self.visit = visits_by_turns(self.trace, self._theory)
         self._equations = Equations.of(self.trace)
         self._known: dict[_Groups, tuple[float, Array]] = {}
 

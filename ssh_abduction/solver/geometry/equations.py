@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -118,3 +119,15 @@ def spreads_of(trace: Trace) -> Array:
         spreads[:, :2] = (steps * max(odometry.offset, LEAST) ** 2)[:, None]
         spreads[:, 2] = max(odometry.facing, LEAST) ** 2
     return spreads
+
+
+def visits_by_turns(trace: Trace, theory: Theory) -> list[int]:
+    """Return, for each step, the first step of its visit: where the robot turns, it stays.
+
+    Without places, each step is a visit. So it is if displacements may be wrong.
+    """
+    stays = theory.level == "topological" and "turn_stays" in theory.hard and not theory.jumped
+    visits = [0]
+    for t, action in enumerate(trace.actions, 1):
+        visits.append(visits[-1] if stays and action.kind == "turn" else t)
+    return visits

@@ -8,10 +8,10 @@ it merges the two places that most surely coincide, conditions the poses on this
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
+from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver.geometry.equations import visits_by_turns
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.completing import valid_map
 from ssh_abduction.solver.guesses.overlaying import Overlay, Part
@@ -20,24 +20,31 @@ from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
 
 
-def smoothed_map(problem: Problem, log: Log, visits: Sequence[int]) -> SSHMap | None:
-    """Make the map of a drive by merging visits; None if it breaks an axiom.
+def smoothed_map(problem: Problem, log: Log) -> SSHMap | None:
+    """Make the map of a trace of one drive by merging visits; None if it breaks an axiom."""
+    trace = problem.trace
+    bare = problem.theory.replace(displacement="none", weigh="count")
+    sights = Sights(trace, bare, log, misreads=False)
+    part = smoothed_part(problem, Drive("", 0, len(trace)), log, sights)
+    found = [part.labels[t] for t in range(len(trace))]
+    order = list(dict.fromkeys(found))  # of first visits
+    places, facing = numbered(part.places[s] for s in order), part.poses[1][order].tolist()
+    return valid_map(trace, bare, numbered(found), places, facing)
 
-    `visits` has the number of the visit of each step: where the robot only turns, it stays.
+
+def smoothed_part(problem: Problem, drive: Drive, log: Log, sights: Sights) -> Part:
+    """Make the map of one drive of a trace by merging visits. It is not checked.
+
+    `log` and `sights` are those of the whole trace.
     """
-    trace, theory = problem.trace, problem.theory
-    bare = theory.replace(displacement="none", weigh="count")
-    steps, places = range(len(trace)), numbered(visits)
+    trace, theory = problem.trace[drive.first : drive.stop], problem.theory
+    steps, places = range(len(trace)), numbered(visits_by_turns(trace, theory))
     poses = Poses(trace, steps, places)
     nats = poses.misfit() / 2 + theory.prices[0] * len(trace)
     if theory.level == "topological":
         nats += theory.prices[1] * len({*places})
-    sights, labels = Sights(trace, bare, log, misreads=False), dict(enumerate(steps))
+    labels = {drive.first + t: t for t in steps}
     apart = Part.of_steps(labels, places, poses.gaussian()[1:], nats, log, sights)
     overlay = Overlay(apart, None, problem, sights)
     overlay.merge_all()
-    part = overlay.part()
-    found = [part.labels[t] for t in steps]
-    order = list(dict.fromkeys(found))  # of first visits
-    places, facing = numbered(part.places[s] for s in order), part.poses[1][order].tolist()
-    return valid_map(trace, bare, numbered(found), places, facing)
+    return overlay.part()
