@@ -72,7 +72,7 @@ class Beams:
         `keep_best` makes the cheapest known map the best map of the search.
         """
         self._parts, self._misfit, self._add, self._keep_best = parts, misfit, add, keep_best
-        # The cost of the best map of a broad beam, and the estimate of it by this beam.
+        # The cost of the best map of smoothing or a broad beam, and the estimate of it by a beam.
         self._best = math.inf, math.inf
         self.broken = -math.inf
         self._ended = 0  # the width of the widest beam that ended
@@ -120,8 +120,7 @@ class Beams:
             parts.report()
         with suppress(StageTimeError), watch.stage(time.end(SMOOTHING)):
             if (smoothed := parts.candidates.smoothed()) is not None:
-                nats = self._add(smoothed)
-                self._take(nats, nats, -math.inf)
+                self._best = self._add(smoothed), math.inf
         self._keep_best()
         for width in widths:
             began = watch.elapsed()
@@ -157,8 +156,7 @@ class Beams:
 
     def _search_without_axioms(self, time: _Time) -> None:
         """If `broken` is unknown, find it with the widest beam that ended."""
-        has_ended = self._ended >= BROAD
-        is_open = has_ended and self._best[1] < math.inf and math.isinf(self.broken)
+        is_open = self._best[1] < math.inf and math.isinf(self.broken)
         with suppress(StageTimeError), self._parts.watch.stage(time.end(BREAKING)):
             if is_open and (beam := self._parts.candidates.beam(self._ended)):
                 self.broken = self._best[1] - beam.nats_without_axioms()
@@ -185,8 +183,9 @@ class Beams:
         return True
 
     def _take(self, nats: float, estimate: float, broken: float) -> None:
-        """Keep what a broad beam, or another guess, says about its best map."""
+        """Keep what a broad beam, or joining the maps of drives, says about its best map."""
         if (nats, estimate) <= self._best:
             self._best, self.broken = (nats, estimate), broken
-        elif broken == 0.0 and math.isinf(self.broken):  # the axioms do not hinder the beam
-            self.broken = self._best[1] - estimate
+        elif nats < math.inf == self._best[1]:  # the smoothed map costs less
+            saved = nats - self._best[0]
+            self._best, self.broken = (self._best[0], estimate - saved), broken
