@@ -85,6 +85,13 @@ def test_late_closures_correct_the_poses_of_earlier_steps(seed: int) -> None:
     assert is_true(ssh_map, places)
 
 
+def test_smoothing_needs_displacements_that_connect_all_steps() -> None:
+    trace, _ = rounds(6, 4, 0)
+    cut = replace(trace.without_displacements_at([40]), closures=())
+    problem = settle(cut, BARE)
+    assert smoothed_map(problem, Log(cut, problem.theory, problem.pairs)) is None
+
+
 def test_search_takes_the_smoothed_map() -> None:
     trace, places = rounds(6, 4, 0)
     weighing = Search(trace, BARE)._weighing

@@ -8,7 +8,6 @@ it merges the two places that most surely coincide, conditions the poses on this
 
 from __future__ import annotations
 
-from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.geometry.equations import visits_by_turns
@@ -21,30 +20,27 @@ from ssh_abduction.theory.settle import Problem
 
 
 def smoothed_map(problem: Problem, log: Log) -> SSHMap | None:
-    """Make the map of a trace of one drive by merging visits; None if it breaks an axiom."""
-    trace = problem.trace
-    bare = problem.theory.replace(displacement="none", weigh="count")
-    sights = Sights(trace, bare, log, misreads=False)
-    part = smoothed_part(problem, Drive("", 0, len(trace)), log, sights)
-    found = [part.labels[t] for t in range(len(trace))]
-    order = list(dict.fromkeys(found))  # of first visits
-    places, facing = numbered(part.places[s] for s in order), part.poses[1][order].tolist()
-    return valid_map(trace, bare, numbered(found), places, facing)
+    """Make the map of a trace of one drive by merging visits.
 
-
-def smoothed_part(problem: Problem, drive: Drive, log: Log, sights: Sights) -> Part:
-    """Make the map of one drive of a trace by merging visits. It is not checked.
-
-    `log` and `sights` are those of the whole trace.
+    None if it breaks an axiom, or if displacements and closures do not connect all visits.
     """
-    trace, theory = problem.trace[drive.first : drive.stop], problem.theory
-    steps, places = range(len(trace)), numbered(visits_by_turns(trace, theory))
+    trace, theory = problem.trace, problem.theory
+    bare = theory.replace(displacement="none", weigh="count")
+    sights, steps = Sights(trace, bare, log, misreads=False), range(len(trace))
+    places = numbered(visits_by_turns(trace, theory))
     poses = Poses(trace, steps, places)
+    part, mean, covariance = poses.gaussian()
+    if any(part):
+        return None
     nats = poses.misfit() / 2 + theory.prices[0] * len(trace)
     if theory.level == "topological":
         nats += theory.prices[1] * len({*places})
-    labels = {drive.first + t: t for t in steps}
-    apart = Part.of_steps(labels, places, poses.gaussian()[1:], nats, log, sights)
+    labels = dict(enumerate(steps))
+    apart = Part.of_steps(labels, places, (mean, covariance), nats, log, sights)
     overlay = Overlay(apart, None, problem, sights)
     overlay.merge_all()
-    return overlay.part()
+    merged = overlay.part()
+    found = [merged.labels[t] for t in steps]
+    order = list(dict.fromkeys(found))  # of first visits
+    places, facing = numbered(merged.places[s] for s in order), merged.poses[1][order].tolist()
+    return valid_map(trace, bare, numbered(found), places, facing)
