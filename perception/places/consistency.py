@@ -12,7 +12,6 @@ Reference:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -21,7 +20,17 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
-from perception.places.closures import BEND, BENDS, GATE, INFLATED, NOISE, VisitMatch, uncertainty
+from perception.places.closures import (
+    BEND,
+    BENDS,
+    GATE,
+    INFLATED,
+    NOISE,
+    VisitMatch,
+    errors_of,
+    seen_from,
+    uncertainty,
+)
 from perception.places.track import Array, Track
 from perception.places.visits import Visit
 
@@ -141,12 +150,12 @@ class _ClosureGraph:
         """Compute the errors of edges in standard deviations, (k, 3), and their derivative."""
         first, last, way = self._first[some], self._last[some], self._way[some]
         poses, drift = unknown[:-1].reshape(-1, 3), unknown[-1]
-        facing = poses[first, 2] + drift * way / 2
-        cos, sin, zero, one = np.cos(facing), np.sin(facing), 0 * facing, 1 + 0 * facing
-        x, y, turned = (poses[last] - poses[first]).T
-        ahead, left = cos * x + sin * y, cos * y - sin * x
-        off = np.stack([ahead, left, turned - drift * way], axis=1) - self._measured[some]
-        off[:, 2] = (off[:, 2] + math.pi) % math.tau - math.pi
+        bent = np.column_stack([0 * way, 0 * way, drift * way / 2])
+        facing = poses[first] + bent  # halfway along each motion
+        seen = seen_from(facing, poses[last]) - bent
+        off, (ahead, left, _) = errors_of(seen, self._measured[some]), seen.T
+        cos, sin = np.cos(facing[:, 2]), np.sin(facing[:, 2])
+        zero, one = 0 * way, 1 + 0 * way
         by_last = np.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], axis=1)
         by_first = np.stack([-cos, -sin, left, sin, -cos, -ahead, zero, zero, -one], axis=1)
         by_drift = np.stack([left * way / 2, -ahead * way / 2, -way], axis=1)

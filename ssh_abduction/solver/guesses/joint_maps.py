@@ -31,12 +31,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.drives import Drive, drives_of
-from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.beam import Beam
-from ssh_abduction.solver.guesses.completing import valid_map
+from ssh_abduction.solver.guesses.completing import map_of_part
 from ssh_abduction.solver.guesses.kept_apart import denied_pairs
 from ssh_abduction.solver.guesses.overlaying import Overlay, Part
 from ssh_abduction.solver.guesses.sights import Sights
@@ -301,13 +300,10 @@ class Joining:
     def _map(self, part: Part) -> SSHMap | None:
         """Make the map of a part; None if it breaks an axiom."""
         look_at_clock()
-        trace, labels = self._of(part)
-        order = list(dict.fromkeys(labels))  # of first visits
-        places, facing = numbered(part.places[s] for s in order), part.poses[1][order].tolist()
-        return valid_map(trace, self._bare, numbered(labels), places, facing)
+        return map_of_part(self._trace_of(part), self._bare, part)
 
-    def _of(self, part: Part) -> tuple[Trace, list[int]]:
-        """Return the trace of the drives of a part, and the labels of its steps."""
+    def _trace_of(self, part: Part) -> Trace:
+        """Return the trace of the drives of a part."""
         trace, steps = self._problem.trace, sorted(part.labels)
         if len(steps) < len(trace):
             kept = [trace.steps[t] for t in steps]
@@ -316,7 +312,7 @@ class Joining:
                     kept[i] = replace(kept[i], action=trace.steps[u - 1].action)
             kept[-1] = replace(kept[-1], action=None)
             trace = replace(trace, steps=tuple(kept), closures=())
-        return trace, [part.labels[t] for t in steps]
+        return trace
 
 
 def _laid(overlay: Overlay, way: _Anchor) -> Part | None:

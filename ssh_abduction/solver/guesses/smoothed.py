@@ -12,7 +12,7 @@ from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.geometry.equations import visits_by_turns
 from ssh_abduction.solver.geometry.fit import Poses
-from ssh_abduction.solver.guesses.completing import valid_map
+from ssh_abduction.solver.guesses.completing import map_of_part
 from ssh_abduction.solver.guesses.overlaying import Overlay, Part
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.steps.log import Log
@@ -39,8 +39,4 @@ def smoothed_map(problem: Problem, log: Log) -> SSHMap | None:
     apart = Part.of_steps(labels, places, (mean, covariance), nats, log, sights)
     overlay = Overlay(apart, None, problem, sights)
     overlay.merge_all()
-    merged = overlay.part()
-    found = [merged.labels[t] for t in steps]
-    order = list(dict.fromkeys(found))  # of first visits
-    places, facing = numbered(merged.places[s] for s in order), merged.poses[1][order].tolist()
-    return valid_map(trace, bare, numbered(found), places, facing)
+    return map_of_part(trace, bare, overlay.part())
