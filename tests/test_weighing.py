@@ -658,18 +658,22 @@ def test_maps_of_least_cost_are_listed_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("laps", "measured", "confirmed"), [(2, {*range(1, 17)} - {5}, True), (1, {7, 8}, False)]
+    ("views", "missing", "confirmed"),
+    [
+        ("abcdefgh" * 2 + "a", {5}, True),
+        ("ababababa", {*range(1, 7)}, False),
+        ("abcdefghab", {8}, False),
+    ],
 )
-def test_join_across_missing_displacements_needs_another_join(
-    laps: int, measured: set[int], confirmed: bool
+def test_joins_across_missing_displacements_need_others(
+    views: str, missing: set[int], confirmed: bool
 ) -> None:
-    """If nothing but one join connects two parts of a trace, no loop of displacements tests it."""
-    moved = [(10.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2)] * 4 * laps
-    said = [move if t in measured else None for t, move in enumerate(moved, 1)]
-    views = "abcdefgh" * laps + "a" if confirmed else "ababababa"
-    weighed = solve(
-        Trace.from_steps(views, ["travel", "left"] * 4 * laps, displacements=said), Theory.causal()
-    ).weighed
+    """One or two joins between two parts of a trace are too few, as no or one loop tests them."""
+    moved = ([(10.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2)] * len(views))[: len(views) - 1]
+    said = [None if t in missing else move for t, move in enumerate(moved, 1)]
+    actions = (["travel", "left"] * len(views))[: len(moved)]
+    trace = Trace.from_steps(views, actions, displacements=said)
+    weighed = solve(trace, Theory.causal()).weighed
     assert weighed is not None
     assert weighed.proven
     assert (weighed.confidence > 0.95) is confirmed

@@ -52,7 +52,7 @@ class Overlap:
         starts = starts_of(trace)
         self.crowded_price = theory.price_of_laying
         drives = (trace.views[drive.first : drive.stop] for drive in drives_of(trace))
-        self.price = self.crowded_price * (_ambiguity(drives) if theory.star == "none" else 1.0)
+        self.price = price_of_laying(theory, drives)
         self._drive = [bisect_right(starts, t) for t in range(len(trace))]
         closures = ((self._drive[c.first], self._drive[c.last]) for c in trace.closures)
         self._tied = _joined(range(len(starts) + 1), closures)  # a group for each drive
@@ -170,10 +170,16 @@ class Overlap:
         return 0.0 if groups[0] & groups[1] else self.price
 
 
-def _ambiguity(drives: Iterable[Sequence[Hashable]]) -> float:
-    """Return how many times as much laying drives on each other costs, by their views."""
-    pairs, alike = pairs_of_parts(drives)
-    return max(TOLD / math.log((pairs + UNLIKE) / max(alike, 1)), 1.0)
+def price_of_laying(theory: Theory, parts: Iterable[Iterable[Hashable]]) -> float:
+    """Return the price of the claim that parts of a trace share places.
+
+    Each part is given by the views of its steps. Without stars, the price is higher if they look
+    alike.
+    """
+    if theory.star != "none":
+        return theory.price_of_laying
+    pairs, alike = pairs_of_parts(parts)
+    return theory.price_of_laying * max(TOLD / math.log((pairs + UNLIKE) / max(alike, 1)), 1.0)
 
 
 def pairs_of_parts(parts: Iterable[Iterable[Hashable]]) -> tuple[int, int]:

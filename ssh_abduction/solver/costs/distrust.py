@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 from ssh_abduction.data.drives import drives_of, starts_of, step_name
 from ssh_abduction.data.groups import NodeClasses, gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.theory.evidence.displacement import jumped
-from ssh_abduction.theory.overlap import pairs_of_parts
+from ssh_abduction.theory.overlap import pairs_of_parts, price_of_laying
 from ssh_abduction.theory.settle import Problem
 
 # The views do not say where the robot is if more than this share of the pairs of steps look alike.
@@ -22,8 +24,8 @@ def doubt_of(problem: Problem, best: SSHMap) -> str | None:
 
     Two places cannot be at one position. If two drives have such places, they overlap by chance. If
     views look alike nearly everywhere, drives that stay apart may share places all the same, and
-    after a missing displacement the robot may be at many places. The first join across a missing
-    displacement is not tested by any loop.
+    after a missing displacement the robot may be at many places. A few joins across a missing
+    displacement may be false together.
     """
     overlap = problem.overlap
     if overlap.is_ambiguous and overlap.keeps_apart(best):
@@ -81,33 +83,43 @@ def _unknown_step(problem: Problem) -> int | None:
 
 
 def _unconfirmed_join(problem: Problem, best: SSHMap) -> str | None:
-    """Name two steps that the best map joins, and that nothing but one such join connects.
+    """Name two steps that the best map joins across a missing displacement for too little reason.
 
-    *Parts* of the trace are steps that displacements connect. In the graph of parts and places, a
-    bridge is a join that no loop tests.
+    *Parts* of the trace are steps that measurements connect. A missing displacement frees the frame
+    of a part, as the start of a drive does. So one common place, or less than laying a drive costs,
+    may be common by chance. Without stars, only common dstates show that two places are one.
     """
-    trace = problem.trace
-    part = _parts(problem, best)
-    if len({part.of(t) for t in range(len(trace))}) == 1:
-        return None
-    import networkx as nx
-
+    trace, theory, part = problem.trace, problem.theory, _parts(problem, best)
     at = [best.place_of(t) for t in range(len(trace))]
     at = list(best.dstate_at) if None in at else at
-    visits = gathered((place, t) for t, place in enumerate(at))
-    graph = nx.Graph()
-    for place, steps in visits.items():
-        parts = {part.of(t) for t in steps}
-        graph.add_edges_from((t, ("at", place)) for t in parts if len(parts) > 1)
-    for edge in nx.bridges(graph):
-        (_, place), of = sorted(edge, key=lambda node: isinstance(node, int))
-        steps = visits[place]
-        here = next(t for t in steps if part.of(t) == of)
-        there = next(t for t in steps if part.of(t) != of)
-        return (
-            f"the best map joins steps {min(here, there)} and {max(here, there)} across a missing "
-            "displacement, and no other join confirms this"
-        )
+    views = gathered((part.of(t), view) for t, view in enumerate(trace.views)).values()
+    price = price_of_laying(theory, views)
+    of_dstate, of_place = theory.prices[0], theory.prices[1] * (theory.level == "topological")
+
+    def in_common(names: Sequence[Hashable]) -> list[tuple[tuple[int, int], Hashable]]:
+        """List the pairs of parts that share a name of a dstate or place, each with the place."""
+        steps_of = gathered((name, t) for t, name in enumerate(names)).values()
+        parts_at = ((sorted({part.of(t) for t in steps}), at[steps[0]]) for steps in steps_of)
+        return [(pair, place) for parts, place in parts_at for pair in combinations(parts, 2)]
+
+    while joined := dict(in_common(at)):
+        dstates = in_common(best.dstate_at)
+        shown = {*(dstates if theory.star == "none" else in_common(at))}
+        places = Counter(pair for pair, _ in shown)
+        nats = {pair: of_place * places[pair] for pair in joined}
+        for pair, _ in dstates:
+            nats[pair] += of_dstate
+        # Merge the best confirmed pair of parts, and look at what the merged part shares.
+        known = [pair for pair in joined if places[pair] > 1 and nats[pair] > price]
+        if not known:
+            weakest = max(joined, key=lambda pair: nats[pair])
+            visits = [t for t, name in enumerate(at) if name == joined[weakest]]
+            here, there = sorted(next(t for t in visits if part.of(t) == of) for of in weakest)
+            return (
+                f"the best map joins steps {here} and {there} across a missing displacement, and "
+                "too few other joins confirm this"
+            )
+        part.merge(*max(known, key=lambda pair: nats[pair]))
     return None
 
 
