@@ -98,9 +98,9 @@ def test_joined_map_costs_at_most_as_much_as_the_true_one(known: truth.Known, st
         counts = len(set(dstates)) + len(set(places))
         return 8 * counts + misfit.of_course(dstates, places) / 2
 
-    apart, best = joined(problem)
+    apart, *others, best = joined(problem)
     assert len(apart.pieces) == 3
-    for ssh_map in (apart, best):
+    for ssh_map in (apart, *others, best):
         assert not [*violations(problem.trace, ssh_map, problem.theory)]
     places = [best.dstates[label].place for label in best.dstate_at]
     found = nats(best.dstate_at, truth.partition(places))
@@ -363,6 +363,19 @@ def test_joined_map_has_a_probability_without_a_broad_beam(seed: int) -> None:
     groups = {groups_of_drives(rival.places, weighed.drives) for rival in weighed.rivals}
     assert groups == {1, 2}
     assert 0 < weighed.confidence < 1
+
+
+def test_all_ways_to_join_drives_are_rivals() -> None:
+    """A short drive may be along the first or the second half of a corridor."""
+    drives = [
+        Trace.from_steps(
+            views, ["travel"] * (len(views) - 1), displacements=[(5.0, 0, 0)] * (len(views) - 1)
+        )
+        for views in ("abcdxabcd", "abcd")
+    ]
+    problem = settle(together(drives), Theory.topological())
+    _, *found = [ssh_map.dstate_at for ssh_map in joined(problem)]
+    assert sorted(labels[9] for labels in found) == [0, 5]
 
 
 @pytest.mark.slow

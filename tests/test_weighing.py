@@ -585,13 +585,13 @@ def test_doubted_costs_give_no_confidence() -> None:
 
 
 def test_drives_that_share_one_place_are_not_sure() -> None:
-    """A rival that lays fewer drives on each other is less improbable than its cost says."""
+    """A rival that lays drives otherwise, or lays fewer, is less improbable than its cost says."""
     drives = (Drive("monday", 0, 2), Drive("tuesday", 2, 4))
-    joined, other, apart = (0, 1, 0, 1), (0, 1, 1, 2), (0, 1, 2, 3)
-    for rival, most in ((other, 0.95), (apart, 0.75)):
+    joined, alike, otherwise, apart = (0, 1, 0, 1), (0, 1, 0, 2), (0, 1, 1, 2), (0, 1, 2, 3)
+    for rival in (alike, otherwise, apart):
         rivals = (Rival(50.0, joined, joined), Rival(58.0, rival, rival, estimated=True))
         sure = Weighed(50.0, 0.0, rivals, True, drives=drives)
-        assert (sure.confidence > most) == (rival == other)
+        assert (sure.confidence > 0.95) == (rival == alike)
     assert sure.confidence == pytest.approx(1 / (1 + math.exp(-0.8)))
     assert sure.probability(0, 2) == sure.confidence
 

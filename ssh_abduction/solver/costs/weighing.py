@@ -26,7 +26,7 @@ poses of its dstates, as in logs, `scatter.py` gives one, too.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Hashable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -34,7 +34,7 @@ from typing import TypeAlias
 
 from scipy.special import gammaincc
 
-from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.drives import drive_of_steps, drives_of
 from ssh_abduction.data.groups import first_index_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -72,7 +72,6 @@ from ssh_abduction.solver.solution.weighed import (
     IMPROBABLE,
     Rival,
     Weighed,
-    groups_of_drives,
 )
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Status
@@ -136,7 +135,7 @@ class Weighing:
         self._of_labels: OfLabels | None = None
         self._beams = Beams(parts, self._misfit, self.add, self.keep_best)
         # For each number of groups of drives that share dstates, the cheapest map.
-        self._of_groups: dict[int, Candidate] = {}
+        self._of_laying: dict[Hashable, Candidate] = {}
         self._improved = 0.0  # the seconds on the clock when the best map was found
 
     @property
@@ -298,7 +297,7 @@ class Weighing:
         if self.candidates and nats < self.candidates[0].nats - EQUAL:
             self._improved = self._parts.watch.elapsed()
         if self._parts.task.theory.several_drives:
-            self._keep_for_groups(Candidate(ssh_map, nats))
+            self._keep_for_laying(Candidate(ssh_map, nats))
         if all(known.map != ssh_map for known in self.candidates):
             self.candidates.append(Candidate(ssh_map, nats))
             self.candidates.sort(key=lambda candidate: candidate.nats)
@@ -309,14 +308,20 @@ class Weighing:
             self.candidates = [c for c in self.candidates if c.nats < most][:RIVALS]
         return nats
 
-    def _keep_for_groups(self, candidate: Candidate) -> None:
-        """Keep a map if no known map costs less that has as many groups of drives.
+    def _keep_for_laying(self, candidate: Candidate) -> None:
+        """Keep a map if no known map costs less that lays drives on each other in the same way.
 
-        Drives in a group share dstates.
+        The first dstate that a drive shares with drives before it says how it lies.
         """
-        groups = groups_of_drives(candidate.map.dstate_at, drives_of(self._parts.task.trace))
-        if groups not in self._of_groups or candidate.nats < self._of_groups[groups].nats:
-            self._of_groups[groups] = candidate
+        drive = drive_of_steps(drives_of(self._parts.task.trace))
+        first: dict[int, int] = {}
+        lies: dict[int, tuple[int, int]] = {}
+        for t, label in enumerate(candidate.map.dstate_at):
+            if drive[first.setdefault(label, t)] != drive[t]:
+                lies.setdefault(drive[t], (first[label], t))
+        laying = tuple(lies.items())
+        if laying not in self._of_laying or candidate.nats < self._of_laying[laying].nats:
+            self._of_laying[laying] = candidate
 
     def too_expensive(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
         """Add a map. Return equalities that exclude it; None if no map left is worth finding.
@@ -375,8 +380,8 @@ class Weighing:
             return None
         rivals: dict[Course, Rival] = {}
         most = self.candidates[0].nats + CHANCE * CERTAIN
-        groups = sorted(self._of_groups.values(), key=lambda candidate: candidate.nats)
-        for candidate in (*self.candidates, *(c for c in groups if c.nats < most)):
+        layings = sorted(self._of_laying.values(), key=lambda candidate: candidate.nats)[:RIVALS]
+        for candidate in (*self.candidates, *(c for c in layings if c.nats < most)):
             rival = rival_of(candidate.map, candidate.nats)
             rivals.setdefault((rival.dstates, rival.places), rival)
         found, excess = list(rivals.values()), self._excess()

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.drives import Drive, drives_of
+from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
@@ -72,7 +73,7 @@ _Anchors: TypeAlias = dict[_Pair, list[_Anchor]]
 
 # The width of the beam that maps each drive alone.
 ALONE = 4
-# If a drive stays apart, try this many other maps of it.
+# If a drive stays apart, try this many other maps of it. List this many other ways to join drives.
 OTHERS = 2
 # Two dstates may coincide if their headings differ by less than this many radians, and their
 # positions by less than this share of a usual travel.
@@ -107,6 +108,7 @@ class Joining:
         """Yield a map in which no drives are joined, and last the cheapest map found.
 
         If the cheapest map has pieces, also yield the cheapest map in which two of them are joined.
+        Also yield maps like the cheapest one in which drives lie otherwise on others.
         The caller has to check all maps. If `standing` is not empty, it has the pieces of a map of
         the first drives. Each piece must be kept.
         """
@@ -135,6 +137,10 @@ class Joining:
                 dearer.append([*(part for part in best if part not in pair), both])
         if dearer:
             yield from self._beside(min(dearer, key=self._nats_of))
+        for part in best:
+            rest = [other for other in best if other is not part]
+            for otherwise in self._otherwise(part):
+                yield from self._beside([*rest, otherwise])
         yield from self._beside(best)
 
     def _all_joined(self, parts: list[Part], anchors: _Anchors, start: _Pair) -> list[Part]:
@@ -281,6 +287,23 @@ class Joining:
         joined = (_laid(overlay, way) for way in cheap)
         return next((part for part in joined if part and self._map(part)), None)
 
+    def _otherwise(self, part: Part) -> Iterator[Part]:
+        """Yield the cheapest other ways to join the drives of a part, without closures."""
+        ways = [
+            (nats, pair, way)
+            for pair, found in self._laid.items()
+            for nats, way in found
+            if {*pair[0].labels, *pair[1].labels} == {*part.labels} and not way.ties
+        ]
+        known = [_dstates(part)]
+        for _, pair, way in sorted(ways, key=lambda told: told[0]):
+            other = _laid(Overlay(*pair, self._problem, self.sights), way)
+            if other and (dstates := _dstates(other)) not in known and self._map(other):
+                yield other
+                known.append(dstates)
+                if len(known) > OTHERS:
+                    break
+
     def _fitting(
         self, overlay: Overlay, ways: Sequence[_Anchor], suits: Callable[[Part], object] = bool
     ) -> list[tuple[float, _Anchor]]:
@@ -313,6 +336,11 @@ class Joining:
             kept[-1] = replace(kept[-1], action=None)
             trace = replace(trace, steps=tuple(kept), closures=())
         return trace
+
+
+def _dstates(part: Part) -> list[int]:
+    """Return the dstate of each step of a part, numbered by first visit."""
+    return numbered(part.labels[t] for t in sorted(part.labels))
 
 
 def _laid(overlay: Overlay, way: _Anchor) -> Part | None:

@@ -8,7 +8,7 @@ one that costs 3 nats more is exp(3) = 20 times less probable.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -104,19 +104,30 @@ class Weighed:
     def weights(self) -> tuple[float, ...]:
         """The probability of each rival, assuming that there are no other maps.
 
-        Drives that share places form groups. If the groups of a rival differ from those of the best
-        map, the difference of the two costs is divided by CHANCE. Else an estimated causal rival
-        costs FITTED nats more.
+        If a rival lays drives on each other in another way than the best map, the difference of the
+        two costs is divided by CHANCE. Else an estimated causal rival costs FITTED nats more.
         """
-        ways = [groups_of_drives(r.places or r.dstates, self.drives) for r in self.rivals]
         less = [
-            (self.nats - rival.nats) / CHANCE
-            if way != ways[0]
-            else self.nats - rival.nats - FITTED * (rival.estimated and not rival.places)
-            for rival, way in zip(self.rivals, ways, strict=True)
+            self.nats - rival.nats - FITTED * (rival.estimated and not rival.places)
+            if self._lies_alike(rival)
+            else (self.nats - rival.nats) / CHANCE
+            for rival in self.rivals
         ]
         likely = [math.exp(min(nats / self.excess, MOST)) for nats in less]
         return tuple(weight / sum(likely) for weight in likely)
+
+    def _lies_alike(self, rival: Rival) -> bool:
+        """Whether a rival lays drives on each other as the best map does.
+
+        Drives that share places form groups. The groups are the same, and dstates that both maps
+        have in common connect as many drives as those of the best map do.
+        """
+        best, drives = self.rivals[0], self.drives
+        groups, of_best = (groups_of_drives(r.places or r.dstates, drives) for r in (rival, best))
+        both = [*zip(best.dstates, rival.dstates, strict=True)]
+        return groups == of_best and groups_of_drives(both, drives) == groups_of_drives(
+            best.dstates, drives
+        )
 
     @property
     def proven(self) -> bool:
@@ -311,7 +322,7 @@ def probability_in_words(probability: float) -> str:
     return "above 0.99" if probability >= 0.995 else f"{probability:.2f}"
 
 
-def groups_of_drives(at: Sequence[int], drives: Sequence[Drive]) -> int:
+def groups_of_drives(at: Sequence[Hashable], drives: Sequence[Drive]) -> int:
     """Count the groups of drives that share no dstate or place; `at` has that of each step."""
     drive = drive_of_steps(drives)
     return groups_of(at, drive, range(len(drives)))
