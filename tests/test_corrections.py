@@ -154,6 +154,8 @@ def test_corrections_of_another_map_are_refused(
         MapError, match="got other steps of monday; the file belongs to another map"
     ):
         solve(replace(TUESDAY, name="monday"), corrections=said)
+    with pytest.raises(MapError, match="got friday; friday has the steps of 'monday': give"):
+        solve(replace(MONDAY, name="friday"), corrections=said)
     save_corrections(said, folder / "building")
     assert main(solving(folder, "round")) == 1
     assert "the file belongs to another map" in capsys.readouterr().err

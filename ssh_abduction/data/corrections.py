@@ -244,11 +244,17 @@ class Corrections:
         other = [d for d in other if known[d] is not None]
         if other or (self.drives and not set(self.drives) & set(known)):
             found = f"other steps of {other[0]}" if other else f"{', '.join(known)}"
+            marks = {mark: name for name, mark in self.drives.items()}
+            renamed = next((name for name, mark in known.items() if mark in marks), None)
+            mend = (
+                "the file belongs to another map: name another file, or remove this one"
+                if other or renamed is None
+                else f"{renamed} has the steps of {brief(marks[known[renamed] or ''])}: give the "
+                "trace or its file this name again, or change it in the file of corrections"
+            )
             raise MapError(
                 f"{where}: drives: expected the drives that it was written for, "
-                f"{', '.join(map(brief, self.drives))}, got {found}; the file belongs to another "
-                "map: "
-                "name another file, or remove this one"
+                f"{', '.join(map(brief, self.drives))}, got {found}; {mend}"
             )
 
     def known_in(self, drives: Sequence[Drive]) -> Corrections:
