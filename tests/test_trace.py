@@ -202,6 +202,14 @@ BAD: dict[str, tuple[list[str], str]] = {
         [HEADER, '{"view": "a", "covariance": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}'],
         "2: covariance: expected a displacement",
     ),
+    "covariance too small": (
+        [
+            HEADER,
+            '{"view": "a", "displacement": [1, 0, 0], "covariance": '
+            "[[1e-300, 0, 0], [0, 1, 0], [0, 0, 1]]}",
+        ],
+        "2: covariance: expected variances from 1e-16 to 1e+16",
+    ),
     "covariance not positive": (
         [
             HEADER,

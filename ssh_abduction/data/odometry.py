@@ -29,6 +29,9 @@ Covariance: TypeAlias = tuple[Displacement, Displacement, Displacement]
 FARTHEST, MOST_TURNED = 1000.0, 4 * math.pi
 # The least standard deviation of a step, in metres and in radians, because logs round numbers.
 ROUNDED = 1e-3
+# The smallest and the largest variance, in square metres or square radians. Beyond these, rounding
+# makes costs wrong.
+LEAST_VARIANCE, MOST_VARIANCE = 1e-16, 1e16
 # How much symmetric entries of a covariance may differ, as a share of its largest entry. Logs round
 # these numbers, too.
 SYMMETRIC = 1e-6
@@ -161,6 +164,11 @@ def checked_covariance(value: Any) -> Covariance:
         raise TraceError(
             f"covariance: expected a symmetric matrix, got {brief(value)}; "
             f"mend the entries that differ"
+        )
+    if any(0 < x < LEAST_VARIANCE or x > MOST_VARIANCE for x in (a, e, k)):
+        raise TraceError(
+            f"covariance: expected variances from {LEAST_VARIANCE:g} to {MOST_VARIANCE:g}, got "
+            f"{brief(value)}; give them in square metres and square radians"
         )
     # A matrix is positive definite if its leading minors are positive.
     minors = a, a * e - b * b, a * (e * k - f * f) - b * (b * k - f * c) + c * (b * f - e * c)
