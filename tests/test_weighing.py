@@ -592,6 +592,10 @@ def test_drives_that_share_one_place_are_not_sure() -> None:
         rivals = (Rival(50.0, joined, joined), Rival(58.0, rival, rival, estimated=True))
         sure = Weighed(50.0, 0.0, rivals, True, drives=drives)
         assert (sure.confidence > 0.95) == (rival == alike)
+        # A missing displacement frees the part after it, as the start of a drive does.
+        alone = Weighed(50.0, 0.0, rivals, True, gaps=(2,))
+        assert alone.weights == sure.weights
+        assert Weighed.from_dict(FieldReader("here"), alone.to_dict(), 4) == alone
     assert sure.confidence == pytest.approx(1 / (1 + math.exp(-0.8)))
     assert sure.probability(0, 2) == sure.confidence
 

@@ -63,18 +63,19 @@ def misfit_of(problem: Problem, best: SSHMap) -> str | None:
     return "the best map does not fit the displacements"
 
 
+def gaps_of(problem: Problem) -> tuple[int, ...]:
+    """List the steps within drives that no measurement connects to the step before."""
+    part, starts = _measured_parts(problem), starts_of(problem.trace)
+    steps = range(1, len(problem.trace))
+    return tuple(t for t in steps if t not in starts and not part.are_one(t - 1, t))
+
+
 def _unknown_step(problem: Problem) -> int | None:
     """Return the first step whose displacement is missing, if only views say where it is.
 
     If most views look alike, there are many places where they fit. Closures or stars help.
     """
-    trace = problem.trace
-    part = _measured_parts(problem)
-    gaps = [
-        t
-        for t in sorted({*range(1, len(trace))} - {*starts_of(trace)})
-        if trace.steps[t].displacement is None and not part.are_one(t - 1, t)
-    ]
+    trace, part, gaps = problem.trace, _measured_parts(problem), gaps_of(problem)
     if not gaps or problem.theory.star != "none":
         return None
     views = gathered((part.of(t), view) for t, view in enumerate(trace.views))

@@ -44,7 +44,7 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.costs import repeats
 from ssh_abduction.solver.costs.beams import Beams
-from ssh_abduction.solver.costs.distrust import doubt_of, misfit_of
+from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of, misfit_of
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
     ESTIMATING,
@@ -398,6 +398,7 @@ class Weighing:
             broken=self._beams.broken,
             excess=excess if excess < math.inf else 1.0,
             doubt=doubt,
+            gaps=gaps_of(problem),
             drives=drives_of(problem.trace),
         )
 

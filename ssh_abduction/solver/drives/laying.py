@@ -17,7 +17,7 @@ from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.costs.distrust import doubt_of
+from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of
 from ssh_abduction.solver.costs.estimating import (
     ESTIMATING,
     may_join_more,
@@ -83,6 +83,7 @@ def laid(
         searched=best.fit.p >= IMPROBABLE and not may_join_more(problem, known),
         broken=existing.broken,
         doubt=doubt_of(problem, best),
+        gaps=gaps_of(problem),
         drives=drives_of(joint),
     )
     return unproven(best, ssh_map, old, problem, watch, "no proof", weighed)

@@ -8,7 +8,8 @@ one that costs 3 nats more is exp(3) = 20 times less probable.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterator, Sequence
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -83,6 +84,8 @@ class Weighed:
         excess: The misfit of the best map, divided by the misfit that the standard deviations
             predict. Costs are divided by it before they become probabilities.
         doubt: Why the costs cannot be trusted, such as "the track is unreliable"; None if they can.
+        gaps: The steps to which no displacement leads. The part of a drive after each may lie
+            anywhere, as a drive may.
         drives: The drives of the trace, to call a step "monday:12"; empty if they are unknown.
     """
 
@@ -93,6 +96,7 @@ class Weighed:
     broken: float = -math.inf
     excess: float = 1.0
     doubt: str | None = None
+    gaps: tuple[int, ...] = ()
     drives: tuple[Drive, ...] = field(default=(), compare=False, repr=False)
 
     @property
@@ -117,17 +121,24 @@ class Weighed:
         return tuple(weight / sum(likely) for weight in likely)
 
     def _lies_alike(self, rival: Rival) -> bool:
-        """Whether a rival lays drives on each other as the best map does.
+        """Whether a rival lays drives, and parts between gaps, on each other as the best map does.
 
-        Drives that share places form groups. The groups are the same, and dstates that both maps
-        have in common connect as many drives as those of the best map do.
+        Parts that share places form groups. The groups are the same, and dstates that both maps
+        have in common connect as many parts as those of the best map do.
         """
-        best, drives = self.rivals[0], self.drives
-        groups, of_best = (groups_of_drives(r.places or r.dstates, drives) for r in (rival, best))
+        best, starts = self.rivals[0], sorted({*self.gaps, *(d.first for d in self.drives)})
+        part = [bisect_right(starts, t) for t in range(len(best.dstates))]
         both = [*zip(best.dstates, rival.dstates, strict=True)]
-        return groups == of_best and groups_of_drives(both, drives) == groups_of_drives(
-            best.dstates, drives
+        groups, of_best, common, dstates = (
+            groups_of(at, part, range(len(starts) + 1))
+            for at in (
+                rival.places or rival.dstates,
+                best.places or best.dstates,
+                both,
+                best.dstates,
+            )
         )
+        return groups == of_best and common == dstates
 
     @property
     def proven(self) -> bool:
@@ -275,6 +286,7 @@ class Weighed:
             **({"broken": round(self.broken, 6)} if math.isfinite(self.broken) else {}),
             **({"excess": round(self.excess, 6)} if self.excess > 1 else {}),
             **({} if self.doubt is None else {"doubt": self.doubt}),
+            **({"gaps": list(self.gaps)} if self.gaps else {}),
             "confidence": round(self.confidence, 6),
             "rivals": [rival.to_dict() for rival in self.rivals],
         }
@@ -312,7 +324,8 @@ class Weighed:
         if doubt is not None and not isinstance(doubt, str):
             raise read.wrong("weighed.doubt", "a text", doubt)
         searched = record.get("searched") is True
-        return cls(bound, within, rivals, searched, broken, excess, doubt, drives)
+        gaps = read.integers(record.get("gaps", []), "weighed.gaps")
+        return cls(bound, within, rivals, searched, broken, excess, doubt, gaps, drives)
 
 
 def probability_in_words(probability: float) -> str:
@@ -322,7 +335,7 @@ def probability_in_words(probability: float) -> str:
     return "above 0.99" if probability >= 0.995 else f"{probability:.2f}"
 
 
-def groups_of_drives(at: Sequence[Hashable], drives: Sequence[Drive]) -> int:
+def groups_of_drives(at: Sequence[int], drives: Sequence[Drive]) -> int:
     """Count the groups of drives that share no dstate or place; `at` has that of each step."""
     drive = drive_of_steps(drives)
     return groups_of(at, drive, range(len(drives)))
