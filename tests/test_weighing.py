@@ -684,6 +684,19 @@ def test_joins_across_missing_displacements_need_others(
     assert ("across a missing displacement" in weighed.sentence) is not confirmed
 
 
+def test_other_ways_to_lay_parts_between_gaps_are_rivals() -> None:
+    trace = Trace.from_steps(
+        "abcab", ["go"] * 4, displacements=[(9.0, 0, 0), (9.0, 0, 0), None, None]
+    )
+    weighing = Search(trace, Theory.causal())._weighing
+    assert weighing is not None
+    for different in ([], [(0, 3)], [(0, 3), (1, 4)]):
+        weighing.add(solve(trace, Theory.causal().replace(different=different))[0])
+    weighed = weighing.weighed()
+    assert weighed is not None
+    assert {len({*rival.dstates}) for rival in weighed.rivals if not rival.estimated} == {3, 4, 5}
+
+
 @pytest.mark.parametrize(("views", "is_known"), [("abcd", True), ("aaab", False)])
 def test_views_that_are_alike_do_not_replace_a_missing_displacement(
     views: str, is_known: bool

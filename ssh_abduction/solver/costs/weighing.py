@@ -26,6 +26,7 @@ poses of its dstates, as in logs, `scatter.py` gives one, too.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Collection, Generator, Hashable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -34,7 +35,7 @@ from typing import TypeAlias
 
 from scipy.special import gammaincc
 
-from ssh_abduction.data.drives import drive_of_steps, drives_of
+from ssh_abduction.data.drives import drives_of, starts_of
 from ssh_abduction.data.groups import first_index_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -134,8 +135,10 @@ class Weighing:
         self.proven = False
         self._of_labels: OfLabels | None = None
         self._beams = Beams(parts, self._misfit, self.add, self.keep_best)
-        # For each number of groups of drives that share dstates, the cheapest map.
+        # For each way to lay drives, or parts between gaps, on each other: the cheapest map.
         self._of_laying: dict[Hashable, Candidate] = {}
+        problem = parts.task.problem
+        self._starts = sorted({*starts_of(problem.trace), *gaps_of(problem)})
         self._improved = 0.0  # the seconds on the clock when the best map was found
 
     @property
@@ -296,7 +299,7 @@ class Weighing:
         nats = self._misfit.nats_of(ssh_map)
         if self.candidates and nats < self.candidates[0].nats - EQUAL:
             self._improved = self._parts.watch.elapsed()
-        if self._parts.task.theory.several_drives:
+        if self._starts:
             self._keep_for_laying(Candidate(ssh_map, nats))
         if all(known.map != ssh_map for known in self.candidates):
             self.candidates.append(Candidate(ssh_map, nats))
@@ -313,7 +316,7 @@ class Weighing:
 
         The first dstate that a drive shares with drives before it says how it lies.
         """
-        drive = drive_of_steps(drives_of(self._parts.task.trace))
+        drive = [bisect_right(self._starts, t) for t in range(len(candidate.map.dstate_at))]
         first: dict[int, int] = {}
         lies: dict[int, tuple[int, int]] = {}
         for t, label in enumerate(candidate.map.dstate_at):
