@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from perception.places.closures import VisitMatch
-from perception.places.consistency import agreeing
+from perception.places.consistency import agreeing, fitted_poses
 from perception.places.matching import Match
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit
@@ -56,6 +56,16 @@ def test_closure_that_contradicts_most_others_is_dropped(
     assert [closure.first for closure in agreeing(track, visits, found)] == [6, 5, 4, 3, 1, 0]
     right = closures(visits, bent, {})
     assert agreeing(track, visits, right) == right
+
+
+@pytest.mark.parametrize("bent", [0.0, 0.4, -0.4])
+def test_fitted_poses_straighten_a_bent_track(bent: float) -> None:
+    track, visits = drive(5e-4, bent)
+    out, back = np.split(fitted_poses(track, visits, closures(visits, bent, {})), 2)
+    assert back[::-1] == pytest.approx(out - np.array([0.0, 0.0, bent]), abs=0.05)
+    unfitted = fitted_poses(track, visits, [])
+    assert unfitted[:, :2].tolist() == [visit.middle.tolist() for visit in visits]
+    assert not unfitted[:, 2].any()
 
 
 def test_closures_are_kept_if_the_track_is_unsure() -> None:

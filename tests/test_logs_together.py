@@ -169,9 +169,8 @@ def test_closures_between_drives_match_the_truth(
 
 
 def test_relations_of_three_drives_agree() -> None:
-    """Nothing else is needed of drives than the middles of their visits, in one frame."""
-    visits = [SimpleNamespace(middle=np.array([5.0 * (k % 3), 7.0 * (k // 3)])) for k in range(9)]
-    drives: Any = [visits] * 3
+    """Nothing else is needed of drives than the poses of their visits, here in one frame."""
+    drives = [np.array([(5.0 * (k % 3), 7.0 * (k // 3), 0.0) for k in range(9)])] * 3
 
     def matched(off: float, *places: int) -> list[VisitMatch]:
         one: Any = SimpleNamespace(turn=0.0, shift=np.array([off, 0.0]), score=1.0)

@@ -1,4 +1,4 @@
-"""Drops closures that contradict the other closures and the track of a drive.
+"""Fits the poses of the visits of a drive to all its closures, and drops those that contradict it.
 
 Rooms look alike, and the track is uncertain after a long way. So a closure may pass the test of the
 track although it is false. It then pulls the track away from where the other closures put it. All
@@ -69,11 +69,22 @@ def agreeing(
     return [closure for closure, keep in zip(found, kept, strict=True) if keep]
 
 
+def fitted_poses(track: Track, visits: Sequence[Visit], found: Sequence[VisitMatch]) -> Array:
+    """Fit the poses of visits to the track and the closures: (n, 3).
+
+    The pose of a visit is the middle of its place, in metres, and by how many radians the track is
+    turned there.
+    """
+    graph = _ClosureGraph(track, visits, found)
+    if found:
+        graph.fit(np.ones(len(found), bool))
+    return graph.poses
+
+
 class _ClosureGraph:
     """Least squares over the poses of the visits of a drive and the drift of its heading.
 
-    The pose of a visit is the middle of its place, in metres, and by how many radians the track is
-    turned there. Edges are the motions between successive visits, and the closures.
+    Edges are the motions between successive visits, and the closures.
     """
 
     def __init__(self, track: Track, visits: Sequence[Visit], found: Sequence[VisitMatch]) -> None:
@@ -100,11 +111,25 @@ class _ClosureGraph:
         self._moves = len(moves)
         self._unknown = np.append(np.column_stack([middles, np.zeros(len(visits))]).ravel(), 0.0)
 
+    @property
+    def poses(self) -> Array:
+        """The poses of the visits, (n, 3), by the last fit. Without a fit, those of the track."""
+        return self._unknown[:-1].reshape(-1, 3)
+
     def gains(self, kept: NDArray[np.bool_], asked: NDArray[np.int_]) -> Array:
         """Fit the poses to the closures kept. Return how much the chi-square falls without some.
 
-        The fit begins with the result of the last one. `asked` has the closures to leave out, each
-        by itself.
+        `asked` has the closures to leave out, each by itself.
+        """
+        off, jacobian, solver = self.fit(kept)
+        rows = self._moves + np.searchsorted(np.flatnonzero(kept), asked)
+        return np.concatenate([*self._gains(off[rows], jacobian, rows, solver)])
+
+    def fit(self, kept: NDArray[np.bool_]) -> tuple[Array, Any, Any]:
+        """Fit the poses to the closures kept. The fit begins with the result of the last one.
+
+        Returns the errors of the edges in standard deviations, (k, 3), their derivative, and the
+        factors of the normal equations.
         """
         some = np.append(np.ones(self._moves, bool), kept)
         squares = self._squares(some, self._unknown)
@@ -125,8 +150,7 @@ class _ClosureGraph:
             if tried[-1][0] >= squares * (1 - STILL):
                 break
             squares, self._unknown = tried[-1]
-        rows = self._moves + np.searchsorted(np.flatnonzero(kept), asked)
-        return np.concatenate([*self._gains(off[rows], jacobian, rows, solver)])
+        return off, jacobian, solver
 
     def _gains(
         self, off: Array, jacobian: Any, rows: NDArray[np.int_], solver: Any

@@ -17,7 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -35,13 +35,13 @@ from perception.places.closures import (
     uncertainty,
     without_drift,
 )
-from perception.places.consistency import agreeing
+from perception.places.consistency import agreeing, fitted_poses
 from perception.places.distinctive import WIDTH, WINDOW, find_visits
 from perception.places.following import follow, share_failing, turned_wrongly
 from perception.places.live import LiveLog
 from perception.places.partings import with_partings
 from perception.places.tracing import DRIFT, to_trace, with_drives
-from perception.places.track import Track
+from perception.places.track import Array, Track
 from perception.places.units import HOPELESS
 from perception.places.unrelated import closures_across_cuts, parts_of
 from perception.places.visits import Visit, patches_of
@@ -88,6 +88,7 @@ class Imported:
         seconds: Processor time in seconds, by stage: track, places, trace, views.
         notes: Sentences on suspicious features of the odometry and the track.
         starts: Scans, besides the first one, at which a drive starts.
+        poses: The poses of the visits, fitted to the closures, as `fitted_poses` returns them.
     """
 
     trace: Trace
@@ -97,6 +98,7 @@ class Imported:
     seconds: Mapping[str, float]
     notes: tuple[str, ...] = ()
     starts: tuple[int, ...] = ()
+    poses: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 def import_log(
@@ -213,13 +215,14 @@ def _imported(
         closings = agreeing(track, visits, closings)
         track = calibrated(track, visits, closings)
         visits, closings = with_partings(track, visits, closings)
-        across, part = closures_across_cuts(track, visits), parts_of(track, visits)
+        poses = fitted_poses(track, visits, closings)
+        across, part = closures_across_cuts(track, visits, poses), parts_of(track, visits)
         trace = with_drives(to_trace(log, track, visits, [*closings, *across], name), part)
         begun = (part[int(trace.steps[t].extra["visit"])] for t in starts_of(trace))
         starts = tuple(track.cuts[number - 1] for number in begun)
     with _timed(seconds, "views"):
         trace = with_views(trace)
-    return Imported(trace, track, width, visits, seconds, notes, starts)
+    return Imported(trace, track, width, visits, seconds, notes, starts, poses)
 
 
 def stream_visits(

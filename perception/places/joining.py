@@ -61,7 +61,9 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
     arrivals = _arrivals(trace, track, visits)
     found = [
         closure_of(closing, arrivals)
-        for closing in closures_between([part.visits for part in parts])
+        for closing in closures_between(
+            [part.visits for part in parts], [part.poses for part in parts]
+        )
     ]
     seconds = _total([part.seconds for part in parts])
     seconds["drives"] = round(time.process_time() - begin, 3)
@@ -77,6 +79,12 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
             for begin, part in zip(begins, parts, strict=True)
             for start in (0, *part.starts)
         )[1:],
+        np.concatenate(
+            [
+                part.poses + np.array([*shift, 0.0])
+                for part, shift in zip(parts, shifts, strict=True)
+            ]
+        ),
     )
 
 

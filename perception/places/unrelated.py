@@ -1,8 +1,9 @@
 """Finds closures between visits whose frames are unrelated, as those of two drives.
 
 Each pair of visits is matched in all rotations, and each reliable match says how the frames relate.
-Places look alike, so a match counts only if at least VOTES visits of the second drive agree on one
-relation, and no other relation has more than half as many.
+Before that, the poses of the visits of each drive are fitted to its own closures, as a drift bends
+the track. Places look alike, so a match counts only if at least VOTES visits of the second drive
+agree on one relation, and no other relation has more than half as many.
 
 Relations of three drives form a loop. The two relations on which most visits agree say what the
 third one is. If no match of the third relation agrees with them, it is not believed.
@@ -35,13 +36,18 @@ TURNS = [k * TURN for k in range(round(math.tau / TURN))]
 MATCHED = 200
 
 
-def closures_between(drives: Sequence[Sequence[Visit]]) -> Iterator[VisitMatch]:
-    """Yield the closures between drives, with visits numbered over all drives."""
+def closures_between(
+    drives: Sequence[Sequence[Visit]], poses: Sequence[Array]
+) -> Iterator[VisitMatch]:
+    """Yield the closures between drives, with visits numbered over all drives.
+
+    `poses` has, for each drive, the poses of its visits, as `fitted_poses` returns them.
+    """
     scenes = [scenes_of(visits) for visits in drives]
     counts = [0, *accumulate(len(visits) for visits in drives)]
     pairs = [*combinations(range(len(drives)), 2)]
     found = {(a, b): _reliable_matches(scenes[a], scenes[b]) for a, b in pairs}
-    for (a, b), agreed in agreeing_matches(drives, found).items():
+    for (a, b), agreed in agreeing_matches(poses, found).items():
         for closing in _best_of_each_visit(agreed):
             yield replace(closing, first=closing.first + counts[a], last=closing.last + counts[b])
 
@@ -52,15 +58,19 @@ def parts_of(track: Track, visits: Sequence[Visit]) -> list[int]:
     return [int(count) for count in np.searchsorted(track.cuts, scans, "right")]
 
 
-def closures_across_cuts(track: Track, visits: Sequence[Visit]) -> list[VisitMatch]:
-    """Find the closures between visits before and after cuts of the track of one drive."""
+def closures_across_cuts(track: Track, visits: Sequence[Visit], poses: Array) -> list[VisitMatch]:
+    """Find the closures between visits before and after cuts of the track of one drive.
+
+    `poses` has the poses of the visits, as `fitted_poses` returns them.
+    """
     if not track.cuts:
         return []
     some = range(0, len(visits), 1 + len(visits) // MATCHED)
-    parts = gathered(zip(parts_of(track, visits)[:: some.step], visits[:: some.step], strict=True))
+    parts = gathered(zip(parts_of(track, visits)[:: some.step], some, strict=True)).values()
+    drives = [[visits[k] for k in part] for part in parts]
     return [
         replace(closing, first=some[closing.first], last=some[closing.last])
-        for closing in closures_between([*parts.values()])
+        for closing in closures_between(drives, [poses[part] for part in parts])
     ]
 
 
@@ -94,23 +104,25 @@ def _best_of_each_visit(agreed: Sequence[VisitMatch]) -> list[VisitMatch]:
 
 
 def agreeing_matches(
-    parts: Sequence[Sequence[Visit]], found: Mapping[tuple[int, int], Sequence[VisitMatch]]
+    poses: Sequence[Array], found: Mapping[tuple[int, int], Sequence[VisitMatch]]
 ) -> dict[tuple[int, int], list[VisitMatch]]:
     """Return, for each pair of drives, the matches that agree on the relation of their frames.
+
+    `poses` has the poses of the visits of each drive, as `fitted_poses` returns them.
 
     If two better supported relations lead from one drive of a pair over a third drive to the other
     one, some matches must agree with them. Otherwise those that do are kept, if they are enough.
     """
     agreed = {
-        (a, b): _largest(some, _relations(some, parts[a], parts[b]))
+        (a, b): _largest(some, _relations(some, poses[a], poses[b]))
         for (a, b), some in found.items()
     }
     frames: dict[tuple[int, int], _FrameMatches] = {}  # of the relations that are believed
     for a, b in sorted(agreed, key=lambda pair: -_votes(agreed[pair])):
-        here = _relations(found[a, b], parts[a], parts[b])
+        here = _relations(found[a, b], poses[a], poses[b])
         ways = [
             (frames[c, b], frames[a, c])
-            for c in range(len(parts))
+            for c in range(len(poses))
             if (c, b) in frames and (a, c) in frames
         ]
         if ways:
@@ -120,7 +132,7 @@ def agreeing_matches(
             if not any(one in fitting for one in agreed[a, b]):
                 agreed[a, b] = fitting if _votes(fitting) >= VOTES else []
         if agreed[a, b]:
-            frames[a, b] = _relations(agreed[a, b], parts[a], parts[b])
+            frames[a, b] = _relations(agreed[a, b], poses[a], poses[b])
             frames[b, a] = frames[a, b].inverse()
     return agreed
 
@@ -173,17 +185,19 @@ class _FrameMatches:
         return found
 
 
-def _relations(
-    found: Sequence[VisitMatch], first: Sequence[Visit], last: Sequence[Visit]
-) -> _FrameMatches:
-    """Collect what matches between the visits of two drives say about their frames."""
-    here = [first[one.first].middle + one.match.shift for one in found]
-    there = [last[one.last].middle for one in found]
-    return _FrameMatches(
-        np.array([one.match.turn for one in found]),
-        np.array(here).reshape(-1, 2),
-        np.array(there).reshape(-1, 2),
+def _relations(found: Sequence[VisitMatch], first: Array, last: Array) -> _FrameMatches:
+    """Collect what matches between the visits of two drives say about their frames.
+
+    `first` and `last` have the poses of the visits of each drive, (n, 3).
+    """
+    at, there = first[[one.first for one in found]], last[[one.last for one in found]]
+    shifts = np.array([one.match.shift for one in found]).reshape(-1, 2)
+    cos, sin = np.cos(at[:, 2]), np.sin(at[:, 2])
+    onward = np.column_stack(
+        [cos * shifts[:, 0] - sin * shifts[:, 1], sin * shifts[:, 0] + cos * shifts[:, 1]]
     )
+    turns = np.array([one.match.turn for one in found]) + at[:, 2] - there[:, 2]
+    return _FrameMatches(turns, at[:, :2] + onward, there[:, :2])
 
 
 def _largest(found: Sequence[VisitMatch], relations: _FrameMatches) -> list[VisitMatch]:
