@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
 from unittest.mock import patch
@@ -12,9 +13,12 @@ import pytest
 
 from ssh_abduction import SSHMap, Theory, Trace
 from ssh_abduction.data import Closure, Odometry
+from ssh_abduction.data.drives import together
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
+from ssh_abduction.robot_logs import log_maps
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.costs import beams
+from ssh_abduction.solver.guesses.overlaying import Overlay
 from ssh_abduction.solver.guesses.smoothed import smoothed_map
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
@@ -27,26 +31,21 @@ TIGHT = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.0003))
 BARE = Theory(star="none", boundary="none")
 
 
-def rounds(columns: int, rows: int, seed: int) -> tuple[Trace, list[tuple[int, int]]]:
-    """Two rounds through a grid of places that look the same, and the place of each step.
+def driven(
+    way: Sequence[tuple[int, int]], chance: random.Random
+) -> tuple[Trace, list[int], list[Pose]]:
+    """A drive along places on a grid of 10 m that look the same. Turns are off by 0.03 radians.
 
-    The cells are 10 m wide. Turns are off by 0.03 radians. Closures begin in the second third of
-    the second round. Until then, the robot may be at several places.
+    Returns the trace, the number of the place of each step along the way, and the true poses.
     """
-    tour = [
-        (column, row)
-        for column in range(columns)
-        for row in (range(1, rows) if column % 2 == 0 else range(rows - 1, 0, -1))
-    ]
-    tour += [(column, 0) for column in reversed(range(columns))]
-    way, chance = [*tour, *tour, tour[0]], random.Random(seed)
     heading = [math.atan2(q[1] - p[1], q[0] - p[0]) for p, q in pairwise(way)]
     pose: Pose = (10.0 * way[0][0], 10.0 * way[0][1], heading[0])
     poses, at, actions, displacements = [pose], [0], list[str](), list[Pose]()
     for i, facing in enumerate(heading):
         turn = math.remainder(facing - pose[2], math.tau)
         for action in (["left" if turn > 0 else "right"] if abs(turn) > 0.1 else []) + ["travel"]:
-            onward = (10.0, 0.0, 0.0) if action == "travel" else (0.0, 0.0, turn)
+            ahead = 10.0 * math.dist(way[i], way[i + 1])
+            onward = (ahead, 0.0, 0.0) if action == "travel" else (0.0, 0.0, turn)
             off = (0.1, 0.1, 0.03) if action == "travel" else (0.0, 0.0, 0.03)
             x, y, angle = (a + chance.gauss(0, sigma) for a, sigma in zip(onward, off, strict=True))
             displacements.append((x, y, angle))
@@ -54,6 +53,26 @@ def rounds(columns: int, rows: int, seed: int) -> tuple[Trace, list[tuple[int, i
             poses.append(pose)
             actions.append(action)
             at.append(i + (action == "travel"))
+    trace = Trace.from_steps(
+        ["v"] * len(at), actions, displacements=displacements, odometry=ODOMETRY
+    )
+    return trace, at, poses
+
+
+def rounds(columns: int, rows: int, seed: int) -> tuple[Trace, list[tuple[int, int]]]:
+    """Two rounds through a grid of places, and the place of each step.
+
+    Closures begin in the second third of the second round. Until then, the robot may be at several
+    places.
+    """
+    tour = [
+        (column, row)
+        for column in range(columns)
+        for row in (range(1, rows) if column % 2 == 0 else range(rows - 1, 0, -1))
+    ]
+    tour += [(column, 0) for column in reversed(range(columns))]
+    way = [*tour, *tour, tour[0]]
+    trace, at, poses = driven(way, random.Random(seed))
     first = dict[tuple[int, int], int]()
     closures = []
     for t, i in enumerate(at):
@@ -62,9 +81,6 @@ def rounds(columns: int, rows: int, seed: int) -> tuple[Trace, list[tuple[int, i
         elif i >= len(tour) * 4 // 3:
             onward = displacement_between(poses[first[way[i]]], poses[t])
             closures.append(Closure(first[way[i]], t, onward, TIGHT))
-    trace = Trace.from_steps(
-        ["v"] * len(at), actions, displacements=displacements, odometry=ODOMETRY
-    )
     return replace(trace, closures=tuple(closures)), [way[i] for i in at]
 
 
@@ -83,6 +99,38 @@ def test_late_closures_correct_the_poses_of_earlier_steps(seed: int) -> None:
     ssh_map = smoothed_map(problem, Log(trace, problem.theory, problem.pairs))
     assert ssh_map is not None
     assert is_true(ssh_map, places)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_closures_between_two_drives_make_one_map(seed: int) -> None:
+    trace, places = rounds(6, 4, seed)
+    half = next(c.first for c in trace.closures) + len(trace) // 2
+    drives = [replace(part, closures=()) for part in (trace[:half], trace[half:])]
+    both = replace(together(drives), closures=trace.closures)
+    problem = settle(both, BARE)
+    ssh_map = smoothed_map(problem, Log(both, problem.theory, problem.pairs))
+    assert ssh_map is not None
+    assert len(ssh_map.pieces) == 1
+    assert is_true(ssh_map, places)
+
+
+def test_dstates_at_one_place_are_merged_only_if_that_lowers_the_cost() -> None:
+    """In the second of three rounds, the robot sees a place that it passes in the others."""
+    first = [(0, 0), (1, 0), (3, 0), (3, 2), (0, 2)]
+    way = [*first, (0, 0), (1, 0), (2, 0), *first[2:], *first, (0, 0), (1, 0)]
+    trace, _, _ = driven(way, random.Random(1))
+    problem = settle(trace, log_maps.BARE)
+    saved: list[float] = []
+    merge = Overlay._merge_coinciding
+
+    def watched(overlay: Overlay, places: set[int]) -> None:
+        before = overlay._state.nats
+        merge(overlay, places)
+        saved.append(before - overlay._state.nats)
+
+    with patch.object(Overlay, "_merge_coinciding", watched):
+        assert smoothed_map(problem, Log(trace, problem.theory, problem.pairs)) is not None
+    assert min(saved) >= 0 < max(saved)
 
 
 def test_smoothing_needs_displacements_that_connect_all_steps() -> None:

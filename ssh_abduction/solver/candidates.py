@@ -138,11 +138,11 @@ class Candidates:
     def smoothed(self) -> SSHMap | None:
         """Merge visits at poses that fit all closures. None if the checker refuses the map.
 
-        Also None where there are no beams, or with several drives, lifts, or faults.
+        Also None where there are no beams, or with lifts or faults within a drive.
         """
         theory = self._task.theory
-        has_one_frame = not (theory.several_drives or theory.lifts or theory.has_faults)
-        if theory.displacement != "use" or not has_one_frame or self.beam(1) is None:
+        trusts_drives = not (theory.lifts or theory.replace(changed=0.0).has_faults)
+        if theory.displacement != "use" or not trusts_drives or self.beam(1) is None:
             return None
         from ssh_abduction.solver.guesses.smoothed import smoothed_map  # loads numpy
 

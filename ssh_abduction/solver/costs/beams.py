@@ -1,8 +1,7 @@
 """Guess maps of little cost by beams of hypotheses, narrow beams first (`guesses/beam.py`).
 
-Before that, the places of a single drive are merged at poses that fit all closures
-(`guesses/smoothed.py`). After a long way this is better than a beam, which goes through the trace
-once.
+Before that, places are merged at poses that fit all closures (`guesses/smoothed.py`). After a long
+way this is better than a beam, which goes through the trace once.
 
 If there is a time limit, wider beams follow while they find better maps.
 """
@@ -112,16 +111,16 @@ class Beams:
         several = theory.several_drives or theory.lifts
         shares = {w: min(end, JUMPED) if theory.jumped else end for w, end in WIDTHS.items()}
         widths = [width for width in WIDTHS if width <= BROAD or not several]
+        with suppress(StageTimeError), watch.stage(time.end(SMOOTHING)):
+            if (smoothed := parts.candidates.smoothed()) is not None:
+                self._best = self._add(smoothed), math.inf
+        self._keep_best()
         if several and (joining := parts.candidates.joining()) is not None:
             with suppress(StageTimeError), watch.stage(time.end(JOINING)):
                 nats = min(map(self._add, parts.candidates.maps_of(joining)), default=math.inf)
                 self._take(nats, -math.inf, joining.broken)
             self._keep_best()
             parts.report()
-        with suppress(StageTimeError), watch.stage(time.end(SMOOTHING)):
-            if (smoothed := parts.candidates.smoothed()) is not None:
-                self._best = self._add(smoothed), math.inf
-        self._keep_best()
         for width in widths:
             began = watch.elapsed()
             # A beam of width n takes about n times as long as the first one.

@@ -5,8 +5,7 @@ has two parts whose frames are unrelated at first. Merging two dstates fixes the
 other. From then on the two places that most surely coincide are merged first, and the poses are
 conditioned on each merge. Dstates that one action leads to from merged dstates are merged, too. If
 gateways may change between drives, places with different gateways may be merged, at a price for
-each change. Dstates and places of one piece of a map that must be kept are never merged with each
-other.
+each change. Dstates and places of one piece of a map that must be kept are never merged.
 """
 
 from __future__ import annotations
@@ -371,7 +370,11 @@ class Overlay:
         return self._overlap.crowded_price * self._overlap.share(here, there)
 
     def _merge_coinciding(self, places: set[int]) -> None:
-        """Merge the coinciding dstates at some places, unless some of them cannot be one."""
+        """Merge the coinciding dstates at some places, unless some of them cannot be one.
+
+        If no axiom demands it, they are merged only if that lowers the cost.
+        """
+        is_forced = "one_dstate_per_course" not in self._theory.without
         refused: set[tuple[int, int]] = set()
         while pairs := [
             found for p in places for found in self._coinciding(p) if found[1] not in refused
@@ -380,7 +383,10 @@ class Overlay:
             self._state = before.copy()
             try:
                 places = places | self._merge_dstates([nearest])
+                is_wanted = is_forced or self._state.nats < before.nats
             except _ClashError:
+                is_wanted = False
+            if not is_wanted:
                 self._state = before
                 refused.add(nearest)
 

@@ -1,4 +1,4 @@
-"""Guess the map of a drive from the poses that fit all its closures at once.
+"""Guess the map of one or more drives from the poses that fit all its closures at once.
 
 A beam goes through the trace once, so it does not know the closures of later steps. After a long
 way it may join places that only the drift brings together. This guess first fits the poses of all
@@ -20,7 +20,7 @@ from ssh_abduction.theory.settle import Problem
 
 
 def smoothed_map(problem: Problem, log: Log) -> SSHMap | None:
-    """Make the map of a trace of one drive by merging visits.
+    """Make a map of a trace by merging visits.
 
     None if it breaks an axiom, or if displacements and closures do not connect all visits.
     """
