@@ -28,7 +28,7 @@ from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.weighing import Weighing
 from ssh_abduction.solver.guesses.joint_maps import Joining
 from ssh_abduction.solver.guesses.kept_apart import KeptApart
-from ssh_abduction.solver.guesses.overlaying import Part
+from ssh_abduction.solver.guesses.placed_map import Part
 from ssh_abduction.solver.guesses.reckoning import conditioned
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.guesses.ties import relation_of, tied, ties_between

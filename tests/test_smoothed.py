@@ -32,7 +32,7 @@ BARE = Theory(star="none", boundary="none")
 
 
 def driven(
-    way: Sequence[tuple[int, int]], chance: random.Random
+    way: Sequence[tuple[float, float]], chance: random.Random
 ) -> tuple[Trace, list[int], list[Pose]]:
     """A drive along places on a grid of 10 m that look the same. Turns are off by 0.03 radians.
 
@@ -84,7 +84,17 @@ def rounds(columns: int, rows: int, seed: int) -> tuple[Trace, list[tuple[int, i
     return replace(trace, closures=tuple(closures)), [way[i] for i in at]
 
 
-def is_true(ssh_map: SSHMap, places: list[tuple[int, int]]) -> bool:
+def rounds_that_differ(seed: int, more: Sequence[int]) -> tuple[Trace, list[tuple[float, float]]]:
+    """Rounds through places, and the place of each step. Some rounds have one place `more`."""
+    way: list[tuple[float, float]] = []
+    for one in more:
+        way += [(0, 0), (1, 0), *[(2.75, 0)] * one, (3, 0), (3, 2), (0, 2)]
+    way += [(0, 0), (1, 0)]
+    trace, at, _ = driven(way, random.Random(seed))
+    return trace, [way[i] for i in at]
+
+
+def is_true(ssh_map: SSHMap, places: Sequence[object]) -> bool:
     found = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
     return all(
         (found[i] == found[j]) == (places[i] == places[j])
@@ -114,11 +124,18 @@ def test_closures_between_two_drives_make_one_map(seed: int) -> None:
     assert is_true(ssh_map, places)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_places_are_merged_before_dstates(seed: int) -> None:
+    """The same action led to another place in the last round, as the robot saw one more."""
+    trace, places = rounds_that_differ(seed, [0, 0, 1])
+    problem = settle(trace, log_maps.BARE)
+    ssh_map = smoothed_map(problem, Log(trace, problem.theory, problem.pairs))
+    assert ssh_map is not None
+    assert is_true(ssh_map, places)
+
+
 def test_dstates_at_one_place_are_merged_only_if_that_lowers_the_cost() -> None:
-    """In the second of three rounds, the robot sees a place that it passes in the others."""
-    first = [(0, 0), (1, 0), (3, 0), (3, 2), (0, 2)]
-    way = [*first, (0, 0), (1, 0), (2, 0), *first[2:], *first, (0, 0), (1, 0)]
-    trace, _, _ = driven(way, random.Random(1))
+    trace, _ = rounds_that_differ(1, [0, 1, 0])
     problem = settle(trace, log_maps.BARE)
     saved: list[float] = []
     merge = Overlay._merge_coinciding

@@ -35,7 +35,7 @@ from ssh_abduction.solver.steps.faults import with_changes
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.solver.guesses.overlaying import Part
+    from ssh_abduction.solver.guesses.placed_map import Part
 
 # A path and one of its directions, 1 or -1.
 _Course = tuple[int, int]

@@ -21,7 +21,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.joint_maps import Joining
-from ssh_abduction.solver.guesses.overlaying import Part
+from ssh_abduction.solver.guesses.placed_map import Part
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence.loops import vectors_turned

@@ -38,7 +38,8 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import map_of_part
 from ssh_abduction.solver.guesses.kept_apart import denied_pairs
-from ssh_abduction.solver.guesses.overlaying import Overlay, Part
+from ssh_abduction.solver.guesses.overlaying import Overlay
+from ssh_abduction.solver.guesses.placed_map import Part
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence.loops import vectors_turned

@@ -13,7 +13,7 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.solver.guesses.overlaying import Part
+    from ssh_abduction.solver.guesses.placed_map import Part
 
 
 class KeptApart:

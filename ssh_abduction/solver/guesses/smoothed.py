@@ -13,7 +13,8 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.geometry.equations import visits_by_turns
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.completing import map_of_part
-from ssh_abduction.solver.guesses.overlaying import Overlay, Part
+from ssh_abduction.solver.guesses.overlaying import Overlay
+from ssh_abduction.solver.guesses.placed_map import Part
 from ssh_abduction.solver.guesses.sights import Sights
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem

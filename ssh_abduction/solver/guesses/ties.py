@@ -21,7 +21,7 @@ from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.guesses.reckoning import BLUR, closure_equations, updated
 
 if TYPE_CHECKING:
-    from ssh_abduction.solver.guesses.overlaying import Part
+    from ssh_abduction.solver.guesses.placed_map import Part
 
 Array = NDArray[np.float64]
 
