@@ -8,9 +8,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations, pairwise, product
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Literal
-from unittest.mock import Mock, patch
+from unittest.mock import patch
 
 import pytest
 import truth
@@ -28,7 +27,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Closure, MapError, Odometry, SolverError, TheoryError, together
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.json_fields import FieldReader
-from ssh_abduction.solver import Search, Status, Watch
+from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.costs import beams, weighing
 from ssh_abduction.solver.costs.estimating import estimated, rivals_of
@@ -411,41 +410,6 @@ def test_map_and_cost_agree_if_a_limit_ends_the_computation_of_a_cost(
     with over, pytest.raises(LimitError):
         search._weighing.keep_best()
     assert search.best == priced
-
-
-@pytest.mark.parametrize(
-    ("seconds", "costs", "asked"),
-    [
-        (600.0, {16: 3.0, 32: 2.0, 64: 2.0}, [16, 32, 64]),
-        (600.0, {16: 3.0, 32: 4.0}, [16, 32]),
-        (math.inf, {16: 3.0}, [16]),
-        (0.05, {16: 3.0}, [16]),  # the beam of 16 takes 0.02 s, and one of 32 would take 0.04 s
-    ],
-)
-def test_wider_beams_follow_while_they_find_better_maps(
-    seconds: float, costs: dict[int, float], asked: list[int]
-) -> None:
-    widths: list[int] = []
-
-    def beam(width: int) -> SimpleNamespace:
-        widths.append(width)
-        return SimpleNamespace(width=width, hypotheses=[], refuses=False)
-
-    def maps_of(beam: SimpleNamespace) -> list[int]:
-        clock[0] += beam.width / 800
-        return [beam.width]
-
-    clock = [0.0]
-    watch = Watch(seconds, clock=lambda: clock[0])
-    watch.start()
-    candidates = SimpleNamespace(sketch=Mock(), beam=beam, maps_of=maps_of, smoothed=lambda: None)
-    task = SimpleNamespace(theory=Theory())
-    parts = Mock(watch=watch, candidates=candidates, task=task)
-    found = beams.Beams(parts, Mock(), {1: 5.0, 4: 5.0, **costs}.__getitem__, Mock())
-    with patch.object(beams, "with_merged_places", lambda best, *_: best):
-        assert found.search(lambda: False)
-    assert widths == [1, 4, *asked]
-    assert found.found(min(costs.values()))
 
 
 def test_misfit_grows_with_returns_and_cores_are_minimal(route: truth.Known) -> None:

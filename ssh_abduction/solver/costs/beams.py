@@ -2,8 +2,6 @@
 
 Before that, places are merged at poses that fit all closures (`guesses/smoothed.py`). After a long
 way this is better than a beam, which goes through the trace once.
-
-If there is a time limit, wider beams follow while they find better maps.
 """
 
 from __future__ import annotations
@@ -28,9 +26,6 @@ WIDTHS, BREAKING = {1: 0.7, 4: 0.6, 16: 0.7}, 0.8
 # If displacements may be wrong, all beams end at the share JUMPED. Then the best map is often one
 # that they drop, and `wrong_displacements.py` looks for it.
 JUMPED = 0.4
-# With a time limit, beams that are WIDER times as wide as the last one follow while they find
-# better maps. They end at the share WIDENING, as bounds need most of a short time.
-WIDER, WIDENING = 2, 0.3
 # Joining the maps of drives ends after the share JOINING, and smoothing after the share SMOOTHING.
 JOINING, SMOOTHING = 0.5, 0.3
 # A beam of this width or more nearly always ends with the map of least cost.
@@ -75,7 +70,6 @@ class Beams:
         self._best = math.inf, math.inf
         self.broken = -math.inf
         self._ended = 0  # the width of the widest beam that ended
-        self._took: list[float] = []  # the seconds of each beam
 
     def found(self, nats: float) -> bool:
         """Whether a broad beam ended with a map of this cost, and `broken` is known.
@@ -121,10 +115,10 @@ class Beams:
                 self._take(nats, -math.inf, joining.broken)
             self._keep_best()
             parts.report()
+        first = math.inf  # the time of the first beam
         for width in widths:
-            began = watch.elapsed()
+            began, last = watch.elapsed(), widths[-1]
             # A beam of width n takes about n times as long as the first one.
-            last, first = widths[-1], self._took[0] if self._took else math.inf
             slack = time.end(shares[last]) - began - last * first
             if width < last and 0 < slack < width * first:
                 continue  # there is time for the last one, but not for both
@@ -134,24 +128,11 @@ class Beams:
                 parts.candidates.go_on(beam)
             self._keep_best()
             parts.report()
-            if not self._took and parts.known.best is None and clashes():
-                return False
-            self._took.append(watch.elapsed() - began)
-        if time.seconds < math.inf and self._ended == max(WIDTHS):
-            self._widen(time.end(WIDENING))
+            if first == math.inf:
+                if parts.known.best is None and clashes():
+                    return False
+                first = watch.elapsed() - began
         return True
-
-    def _widen(self, end: float) -> None:
-        """Search with ever wider beams while they find better maps, up to `end` on the clock."""
-        parts, watch, nats = self._parts, self._parts.watch, math.inf
-        while self._best[0] < nats - EQUAL and watch.elapsed() + WIDER * self._took[-1] < end:
-            began, nats = watch.elapsed(), self._best[0]
-            beam = parts.candidates.beam(WIDER * self._ended)
-            if beam is None or not self._ends(beam, WIDER * self._ended, end):
-                break
-            self._keep_best()
-            parts.report()
-            self._took.append(watch.elapsed() - began)
 
     def _search_without_axioms(self, time: _Time) -> None:
         """If `broken` is unknown, find it with the widest beam that ended."""
