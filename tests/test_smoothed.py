@@ -17,11 +17,17 @@ from ssh_abduction.data.drives import together
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.robot_logs import log_maps
 from ssh_abduction.solver import Search
+from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.costs import beams
+from ssh_abduction.solver.costs.weighing import Weighing
+from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.guesses.overlaying import Overlay
 from ssh_abduction.solver.guesses.smoothed import smoothed_map
+from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.start import Limits, Start
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.speedups import Speedups
 
 ODOMETRY = Odometry(
     along=0.02, across=0.02, heading=0.003, turning=0.03, position=0.1, angle=0.03, scale=0.01,
@@ -165,3 +171,21 @@ def test_search_takes_the_smoothed_map() -> None:
         assert weighing.guess(lambda: False)
     assert weighing.best is not None
     assert is_true(weighing.best.map, places)
+
+
+def test_places_of_the_best_map_of_a_broad_beam_are_merged() -> None:
+    """A corridor is driven twice, with a stop halfway at the second time."""
+    actions = ["travel", "around", "travel", "around", "travel", "travel"]
+    moves = [(far, 0.0, 0.0 if far else math.pi) for far in (10.0, 0.0, 10.0, 0.0, 5.0, 5.0)]
+    noise = Odometry(offset=0.2, facing=0.1)
+    trace = Trace.from_steps([0] * 7, actions, displacements=moves, odometry=noise)
+    problem = settle(trace, log_maps.BARE)
+    split = completed(trace, problem.theory, range(7), [0, 1, 1, 2, 2, 3, 4], [0.0] * 7)
+    parts = Parts(problem, Limits(), Speedups(), None, Start(), 0.0)
+    weighing, beam = Weighing(parts), parts.candidates.beam(4)
+    assert beam
+    with patch.object(Candidates, "maps_of", return_value=[split]):
+        assert weighing._beams._ends(beam, 4, math.inf)
+    assert weighing.best
+    assert [weighing.best.map.place_of(t) for t in range(7)] == [0, 1, 1, 0, 0, 2, 1]
+    assert weighing._beams.found(weighing.best.nats)

@@ -135,10 +135,11 @@ class Candidates:
 
         return Joining(self._task.problem, self._task.log)
 
-    def smoothed(self) -> SSHMap | None:
-        """Merge visits at poses that fit all closures. None if the checker refuses the map.
+    def smoothed(self, begin: SSHMap | None = None) -> SSHMap | None:
+        """Merge visits, or places of the map `begin`, at poses that fit all closures.
 
-        Also None where there are no beams, or with lifts or faults within a drive.
+        None if the checker refuses the map. Also None where there are no beams, or with lifts or
+        faults within a drive.
         """
         theory = self._task.theory
         trusts_drives = not (theory.lifts or theory.replace(changed=0.0).has_faults)
@@ -146,7 +147,7 @@ class Candidates:
             return None
         from ssh_abduction.solver.guesses.smoothed import smoothed_map  # loads numpy
 
-        found = smoothed_map(self._task.problem, self._task.log)
+        found = smoothed_map(self._task.problem, self._task.log, begin)
         whole = None if found is None else self._with_unknown_views(found)
         return whole if whole is not None and self._judging.accepts(whole) else None
 

@@ -1,7 +1,8 @@
 """Guess maps of little cost by beams of hypotheses, narrow beams first (`guesses/beam.py`).
 
 Before that, places are merged at poses that fit all closures (`guesses/smoothed.py`). After a long
-way this is better than a beam, which goes through the trace once.
+way this is better than a beam, which goes through the trace once. The places of the best map of a
+broad beam are merged in the same way.
 """
 
 from __future__ import annotations
@@ -14,8 +15,6 @@ from dataclasses import dataclass
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.candidates import SKETCH_SHARE
-from ssh_abduction.solver.costs.merging_places import with_merged_places
-from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.solution.weighed import EQUAL
@@ -55,17 +54,15 @@ class Beams:
     def __init__(
         self,
         parts: Parts,
-        misfit: Misfit,
         add: Callable[[SSHMap], float],
         keep_best: Callable[[], None],
     ) -> None:
         """Prepare the beam searches.
 
-        `add` returns the cost of a map in nats, and keeps the map if this cost is small. `misfit`
-        computes the cost of a map without keeping the map.
+        `add` returns the cost of a map in nats, and keeps the map if this cost is small.
         `keep_best` makes the cheapest known map the best map of the search.
         """
-        self._parts, self._misfit, self._add, self._keep_best = parts, misfit, add, keep_best
+        self._parts, self._add, self._keep_best = parts, add, keep_best
         # The cost of the best map of smoothing or a broad beam, and the estimate of it by a beam.
         self._best = math.inf, math.inf
         self.broken = -math.inf
@@ -152,9 +149,8 @@ class Beams:
         self._ended = width
         if width >= BROAD:
             with suppress(StageTimeError), watch.stage(end):
-                if found:
-                    best, accepts = found[min(found)], self._parts.judging.accepts
-                    merged = with_merged_places(best, self._misfit, accepts)
+                best = found[min(found)] if found else None
+                if best and (merged := self._parts.candidates.smoothed(best)) is not None:
                     found[self._add(merged)] = merged
             # A beam without axioms would be the same if the checker refused nothing.
             broken = -math.inf if beam.refuses else 0.0

@@ -134,7 +134,7 @@ class Weighing:
         self.bound = 0.0
         self.proven = False
         self._of_labels: OfLabels | None = None
-        self._beams = Beams(parts, self._misfit, self.add, self.keep_best)
+        self._beams = Beams(parts, self.add, self.keep_best)
         # For each way to lay drives, or parts between gaps, on each other: the cheapest map.
         self._of_laying: dict[Hashable, Candidate] = {}
         problem = parts.task.problem
