@@ -172,7 +172,9 @@ def pairs_row(log: Path, truth: Truth | None, runs: Path) -> dict[str, Any]:
     if truth is None:
         return row
     solution = Solution.load(runs / name_of(log) / "maps.json", trace)
-    row |= {"confidence": solution.confidence, "joins": joins_of(trace, solution)}
+    row["confidence"] = solution.confidence
+    row["place_confidence"] = solution.weighed and solution.weighed.place_confidence
+    row["joins"] = joins_of(trace, solution)
     if truth.doors and ssh_map is not None and (beside := sidecar(log)) is not None:
         row["untold"] = untold(trace, ssh_map, *rooms_and_doors(json.loads(beside.read_text())))
     return row | counts_of(trace, ssh_map, truth.poses)

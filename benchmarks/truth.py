@@ -102,10 +102,14 @@ def partition(names: Sequence[Hashable]) -> tuple[int, ...]:
 
 def is_true(ssh_map: SSHMap, known: Known) -> bool:
     """Check whether the labels of a map and, if it has any, its places are true up to renaming."""
+    dstates = partition(ssh_map.dstate_at) == partition(known.dstates)
+    return dstates and has_true_places(ssh_map, known)
+
+
+def has_true_places(ssh_map: SSHMap, known: Known) -> bool:
+    """Check whether the places of the steps are true up to renaming, if the map has any."""
     places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
-    return partition(ssh_map.dstate_at) == partition(known.dstates) and (
-        not ssh_map.places or partition(places) == partition(known.places)
-    )
+    return not ssh_map.places or partition(places) == partition(known.places)
 
 
 def mazes(cells: int, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
@@ -249,6 +253,8 @@ class Judged:
         right: Whether all maps that the solver calls best are true, and it has proven so.
         best: Whether the first map is true.
         confidence: The probability that the solver gives the first map; None if it counts.
+        places: Whether the places of the first map are true.
+        place_confidence: The probability that the solver gives these places; None if it counts.
         joins: For each join of the first map, its probability, and whether it is true.
         seconds: The time of the solver.
     """
@@ -256,6 +262,8 @@ class Judged:
     right: bool
     best: bool
     confidence: float | None
+    places: bool
+    place_confidence: float | None
     joins: tuple[tuple[float, bool], ...]
     seconds: float
 
@@ -280,7 +288,13 @@ def judged(known: Known, theory: Theory, limit: float) -> tuple[str, Judged]:
         f"| {known.name} | {len(known.trace)} | {truth} | {solution.status.value} | {cost} | "
         f"{listed} | {sure} | {seconds:.2f} |",
         Judged(
-            all_true, bool(true) and true[0], solution.confidence, joins(solution, known), seconds
+            all_true,
+            bool(true) and true[0],
+            solution.confidence,
+            any(has_true_places(ssh_map, known) for ssh_map in solution.maps[:1]),
+            solution.weighed and solution.weighed.place_confidence,
+            joins(solution, known),
+            seconds,
         ),
     )
 
@@ -380,6 +394,11 @@ def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
             "confidence: "
             + diagram([(one.confidence, one.best) for one in found if one.confidence is not None]),
         ]
+        sure = [one for one in found if (one.place_confidence or 0.0) >= SURE]
+        told.append(
+            f"the places are true: {sum(one.places for one in found)} of {count}; sure of the "
+            f"places: {len(sure)}; wrong and sure of them: {sum(not one.places for one in sure)}"
+        )
     all_joins = [join for one in found for join in one.joins]
     if all_joins:
         error, brier = reliability(all_joins)

@@ -321,6 +321,7 @@ def test_check_finds_false_costs(weighed_route: Solution, name: str, said: str) 
     ("claims", "said"),
     [
         ({"confidence": 0.5}, "weighed.confidence: expected"),
+        ({"place_confidence": 0.5}, "weighed.place_confidence: expected"),
         ({"status": "feasible", "complete": False}, "weighed.within: expected 0"),
     ],
 )
@@ -332,7 +333,7 @@ def test_check_finds_a_false_probability(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     data = weighed_route.to_dict()
-    (data["weighed"] if "confidence" in claims else data).update(claims)
+    (data if "status" in claims else data["weighed"]).update(claims)
     assert weighed_route.trace is not None
     files = tmp_path / "maps.json", tmp_path / "trace.jsonl"
     files[0].write_text(json.dumps(data))
@@ -520,6 +521,8 @@ def test_sentence_names_the_most_probable_missed_join() -> None:
     assert turned.sentence.endswith(
         "; steps 0 and 2 are one dstate with probability 0.73, else two dstates of one place"
     )
+    assert turned.sentence.startswith("the best map has probability 0.73, and its places alone ab")
+    assert (turned.place_confidence, weighed.place_confidence) == (1.0, weighed.confidence)
     assert replace(weighed, doubt="the track is unreliable").missed is None
 
 

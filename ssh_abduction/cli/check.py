@@ -204,12 +204,15 @@ def _costs_hold(
 
     weighed = Solution.from_dict(data, where, trace).weighed  # the fields have the right form
     false = list(false_costs(trace, data, maps, theory))
-    claimed = data["weighed"].get("confidence") if weighed else None
-    if weighed and not (is_finite(claimed) and abs(claimed - weighed.confidence) <= ROUNDED):
-        false.append(
-            f"weighed.confidence: expected {weighed.confidence:.6f}, by the costs of the rivals, "
-            f"got {brief(claimed)}"
-        )
+    for name in ("confidence", "place_confidence") if weighed else ():
+        right: float = getattr(weighed, name)
+        # Files of earlier versions have no confidence in places.
+        claimed = data["weighed"].get(name, right if name == "place_confidence" else None)
+        if not (is_finite(claimed) and abs(claimed - right) <= ROUNDED):
+            false.append(
+                f"weighed.{name}: expected {right:.6f}, by the costs of the rivals, "
+                f"got {brief(claimed)}"
+            )
     said += false
     rivals = len(data["weighed"]["rivals"])  # the first one is map 1
     checked = max(count_checked_rivals(len(trace), rivals, theory), 1)

@@ -108,7 +108,8 @@ def _record(
         "faults": [fault.to_dict() for fault in listing.faults],
         "warnings": list(listing.warnings),
     }
-    first = {} if weighed is None else {"confidence": weighed.confidence}
+    names = () if weighed is None else ("confidence", "place_confidence")
+    first = {name: getattr(weighed, name) for name in names}
     return {**first, **{name: value for name, value in record.items() if value}}
 
 

@@ -174,7 +174,8 @@ class Solution(MapSequence):
     def confidence(self) -> float | None:
         """The probability that the best map has the true dstates and places.
 
-        None if maps were counted, as then nothing observed says how probable they are.
+        None if maps were counted, as then nothing observed says how probable they are. See also
+        `weighed.place_confidence`, which is for the places alone.
         """
         return None if self.weighed is None else self.weighed.confidence
 

@@ -154,12 +154,31 @@ class Weighed:
         breaks axioms is counted as a rival at a cost BROKEN nats higher. If there is a `doubt`, the
         confidence is 0.
         """
+        return self._confidence(self.weights[0])
+
+    @property
+    def place_confidence(self) -> float:
+        """The probability that the places of the best map are right, even if its dstates are not.
+
+        It is that of all rivals with the same places, computed as `confidence`. Equal to
+        `confidence` for a causal map.
+        """
+        best = self.rivals[0]
+        alike = (
+            w
+            for w, rival in zip(self.weights, self.rivals, strict=True)
+            if rival is best or (best.places and rival.places == best.places)
+        )
+        return self._confidence(math.fsum(alike))
+
+    def _confidence(self, share: float) -> float:
+        """Return the confidence in maps that have this share of the weights of all rivals."""
         if self.doubt is not None:
             return 0.0
         is_likely = self.proven or self.searched
         unknown = 0.0 if is_likely else math.exp(min(self.nats - self.bound, MOST))
         broken = math.exp(min((self.broken - BROKEN) / self.excess, MOST))
-        return 1 / (1 / self.weights[0] + unknown + broken)
+        return share / (1 + self.weights[0] * (unknown + broken))
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
         """Return the probability, by the known rivals, that two steps are at one dstate or place.
@@ -241,8 +260,9 @@ class Weighed:
         """How probable the best map is, and which of its joins is least sure, in words."""
         if self.doubt is not None:
             return f"no probability is given, as {self.doubt}"
+        whole, at = map(probability_in_words, (self.confidence, self.place_confidence))
         text = (
-            f"the best map has probability {probability_in_words(self.confidence)}"
+            f"the best map has probability {whole}" + f", and its places alone {at}" * (at != whole)
             if self.proven or self.searched
             else f"a map that costs {self.nats - self.bound:.1f} nats less may exist"
         )
@@ -288,6 +308,7 @@ class Weighed:
             **({} if self.doubt is None else {"doubt": self.doubt}),
             **({"gaps": list(self.gaps)} if self.gaps else {}),
             "confidence": round(self.confidence, 6),
+            "place_confidence": round(self.place_confidence, 6),
             "rivals": [rival.to_dict() for rival in self.rivals],
         }
 
