@@ -188,7 +188,7 @@ def _seldom(values: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
     return st.integers(0, 3).flatmap(lambda n: values if n == 3 else st.just(()))
 
 
-def _pairs(steps: int) -> st.SearchStrategy[list[tuple[int, int]]]:
+def step_pairs(steps: int) -> st.SearchStrategy[list[tuple[int, int]]]:
     """Few pairs of steps, mostly none."""
     pairs = [(i, j) for j in range(steps) for i in range(j)]
     return st.just([]) | (st.lists(st.sampled_from(pairs), max_size=2) if pairs else st.just([]))
@@ -230,10 +230,10 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "unknown_views": st.just(False),  # the trace says it
         "several_drives": st.just(False),
         "lifts": st.just(False),
-        "same": _seldom(_pairs(len(trace))),
-        "different": _pairs(len(trace)),
-        "elsewhere": _pairs(len(trace)),
-        "same_place": _seldom(_pairs(len(trace))),
+        "same": _seldom(step_pairs(len(trace))),
+        "different": step_pairs(len(trace)),
+        "elsewhere": step_pairs(len(trace)),
+        "same_place": _seldom(step_pairs(len(trace))),
     }[field]
 
 

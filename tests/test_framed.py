@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import Walk, maze
-from strategies import STARS
+from strategies import STARS, step_pairs
 
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
-from ssh_abduction.data.action import QUARTERS
+from ssh_abduction.data.action import QUARTERS, Action
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Start, Status, choosing
 from ssh_abduction.solver.asp.control import Control
@@ -43,6 +43,7 @@ from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import Speedups, encodings
+from ssh_abduction.theory.fields import Count
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import SPEEDUPS
 
@@ -102,6 +103,8 @@ def test_framed_maps_equal_those_of_the_plain_encoding(
 ) -> None:
     """Prefixes, cores and batches are so small that short traces use them all. Any speed-ups may be
     off."""
+    said = {kind: data.draw(step_pairs(len(trace)), label=kind) for kind in ("same", "same_place")}
+    theory = theory.replace(**said)
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, engine.FIRST_PREFIXES]), label="first prefixes")
     at_a_time = data.draw(st.sampled_from([1, transitive.AT_A_TIME]), label="at a time")
@@ -140,6 +143,25 @@ def test_framed_maps_equal_those_of_the_plain_encoding(
         ]
     for ssh_map in maps[:3]:
         assert check(trace, ssh_map, theory) == ()
+
+
+@pytest.mark.parametrize("prefer", [("dstates",), ("dstates", "paths", "places")])
+@pytest.mark.parametrize("said", [(1, 5), (0, 7)])
+def test_framed_maps_join_places_that_a_person_joins(
+    prefer: tuple[Count, ...], said: tuple[int, int]
+) -> None:
+    """Two drives cross at right angles, or touch. No dstate and no turn shows that."""
+    trace = Trace.from_steps(
+        "abcdefgh",
+        ["travel", "travel", "around", Action("other", "start"), "travel", "travel", "around"],
+        stars=[(1, 1, 1, 1)] * 8,
+    )
+    theory = Theory(star="frame", prefer=prefer, same_place=[said])
+    expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
+    with patch.object(choosing, "FEW_STEPS", 0):
+        search = Search(trace, theory, max_maps=None)
+        assert set(search) == set(expected.maps)
+    assert isinstance(search._parts.prefixes.engine, FramedEngine)
 
 
 @settings(max_examples=5)

@@ -13,18 +13,21 @@ from brute_force import Key, key, minimal_maps
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories
+from test_framed import framed_theories, framed_traces
 from test_together import joint_traces
 from truth import NOISE, Noise, random_walk
 from worlds import TEE, drive
 
 from ssh_abduction import Solution, SSHMap, Theory, Trace, check, solve
 from ssh_abduction.cli import main
-from ssh_abduction.data import Corrections, Odometry, load_corrections
+from ssh_abduction.data import Action, Corrections, Odometry, load_corrections
 from ssh_abduction.data.drives import starts_of, together
 from ssh_abduction.data.errors import SolverError, TraceError
 from ssh_abduction.solver import Status, choosing
 from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.drives import added_drives
 from ssh_abduction.solver.drives.digest import Digest
+from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory import Speedups
 
 
@@ -87,6 +90,54 @@ def test_onto_lists_minimal_maps_that_keep_the_existing_map(data: st.DataObject)
     assert solution.trace.steps == joint.steps
     for ssh_map in solution.maps:
         assert check(joint, ssh_map, theory) == ()
+
+
+@pytest.mark.filterwarnings("ignore:traces 1 and 2 have the same steps")
+@pytest.mark.filterwarnings("ignore:action. traces 1 and 2 .*have different names")
+@pytest.mark.filterwarnings("ignore:views. trace")
+@settings(max_examples=6)
+@given(framed_traces(most_steps=7), framed_traces(most_steps=4), framed_theories(), st.data())
+def test_onto_with_frames_keeps_places_that_only_minimality_joins(
+    old: Trace, new: Trace, theory: Theory, data: st.DataObject
+) -> None:
+    """Long traces are solved once only. Here all traces count as long."""
+    standing = solve(old, theory, max_maps=1)
+    if not standing.maps:
+        return
+    allows, joint = keeps(standing.maps[0]), together([old, new])
+    every = solve(joint, theory.replace(prefer=()), max_maps=None)
+    kept = [ssh_map for ssh_map in every if allows(key(ssh_map))]
+    few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
+    with (
+        patch.object(choosing, "FEW_STEPS", few_steps),
+        patch.object(added_drives, "READABLE", 0),
+    ):
+        if not kept:
+            with pytest.raises(SolverError, match="expected a drive that agrees"):
+                solve(new, theory, onto=standing)
+            return
+        solution = solve(new, theory, onto=standing, max_maps=None)
+    costs = {ssh_map: Cost.of(ssh_map).preferred_by(theory) for ssh_map in kept}
+    least = min(costs.values())
+    assert {key(m) for m in solution} == {key(m) for m, cost in costs.items() if cost == least}
+    assert [check(joint, ssh_map, theory) for ssh_map in solution[:2]] == [()] * len(solution[:2])
+
+
+def test_long_drive_keeps_a_place_that_only_minimality_joined() -> None:
+    """Two ways of Monday seem to be one way there and back. Tuesday sees another view behind."""
+    crossing, end = (1, 1, 1, 1), (0, 0, 1, 0)
+    monday = Trace.from_steps(
+        "abcdef",
+        ["travel", "travel", Action("other", "start"), "travel", "travel"],
+        stars=[(1, 0, 0, 0), crossing, end] * 2,
+        name="monday",
+    )
+    standing = solve(monday)
+    assert [s.place for s in standing[0].dstates] == [0, 1, 2, 2, 1, 0]
+    tuesday = Trace.from_steps("bz", ["around"], stars=[crossing] * 2, name="tuesday")
+    with patch.object(added_drives, "READABLE", 0):
+        found = solve(tuesday, onto=standing)[0]
+    assert [s.place for s in found.dstates] == [0, 1, 2, 2, 1, 0, 1, 1]
 
 
 MONDAY = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")

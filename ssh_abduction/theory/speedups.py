@@ -308,7 +308,7 @@ TABLE = (
             "visits",
             "sides_framed",
             "paths_framed",
-            and_also=(*PAIRS_OF_STEPS, *OF_TRACES, "asserted same"),
+            and_also=(*PAIRS_OF_STEPS, *OF_TRACES, "asserted same", "the field same_place"),
         ),
     ),
     Speedup(

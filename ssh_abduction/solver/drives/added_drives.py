@@ -269,9 +269,9 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, *, joins: bool) -> 
     """Return the theory for a digest and a new drive, with assertions that keep the existing map.
 
     They say that steps at different dstates or places of a piece are different. Assertions of the
-    theory about old steps are moved to steps of the digest. If `joins`, steps at one dstate of that
-    map are also asserted to be one dstate. The fast engine for frames can obey such assertions. For
-    other theories, they switch fast engines off.
+    theory about old steps are moved to steps of the digest. If `joins`, steps at one dstate or
+    place of that map are also asserted to be at one. The fast engine for frames can obey such
+    assertions. For other theories, they switch fast engines off.
     """
     place = [ssh_map.dstates[s].place for s in digest.labels]
     first = first_index_of(digest.labels)
@@ -284,15 +284,31 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, *, joins: bool) -> 
                 pairs = apart if place[i] == place[j] else elsewhere
                 pairs.append((min(i, j), max(i, j)))
     labels = ssh_map.dstate_at
-    same = digest.moved(theory.same, labels)
+    same, same_place = digest.moved(theory.same, labels), digest.moved(theory.same_place, labels)
     if joins:
-        same += [(first[s], t) for t, s in enumerate(digest.labels) if first[s] != t]
+        one, together = _joined(digest, ssh_map)
+        same, same_place = same + one, same_place + together
     return theory.replace(
         same=tuple(same),
         different=(*digest.moved(theory.different, labels), *apart),
         elsewhere=(*digest.moved(theory.elsewhere, labels), *elsewhere),
-        same_place=tuple(digest.moved(theory.same_place, labels)),
+        same_place=tuple(same_place),
     )
+
+
+def _joined(digest: Digest, ssh_map: SSHMap) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Return pairs of steps of a digest that join the steps of each dstate, and of each place."""
+    first: dict[int, int] = {}
+    first_at: dict[int, int] = {}
+    same: list[tuple[int, int]] = []
+    same_place: list[tuple[int, int]] = []
+    for t, s in enumerate(digest.labels):
+        place = ssh_map.dstates[s].place
+        if first.setdefault(s, t) != t:
+            same.append((first[s], t))
+        elif place is not None and first_at.setdefault(place, t) != t:
+            same_place.append((first_at[place], t))
+    return same, same_place
 
 
 def _keeps(found: SSHMap, digest: Digest, ssh_map: SSHMap) -> bool:
@@ -342,16 +358,10 @@ def _with_assertions(
     """
     if len(part) > READABLE:
         return found, ()
-    first: dict[int, int] = {}
-    first_at: dict[int, int] = {}
-    same, same_place = list(pinned.same), list(pinned.same_place)
-    for t, s in enumerate(digest.labels):
-        place = ssh_map.dstates[s].place
-        if first.setdefault(s, t) != t:
-            same.append((first[s], t))
-        elif place is not None and first_at.setdefault(place, t) != t:
-            same_place.append((first_at[place], t))
-    stands = pinned.replace(same=tuple(same), same_place=tuple(same_place))
+    same, same_place = _joined(digest, ssh_map)
+    stands = pinned.replace(
+        same=(*pinned.same, *same), same_place=(*pinned.same_place, *same_place)
+    )
     again = solving.solve(part, stands)
     if again.status is Status.UNSATISFIABLE:
         return found, ()

@@ -124,7 +124,8 @@ class VisitLabels:
     def _first_visits(self, chart: FramedChart) -> set[int]:
         """Return the visits that clingo gets first: all, or those of the clique and early ones."""
         # Clingo has to know all visits that the user says are at one place.
-        is_lazy = self._task.speedups.lazy and not self._task.log.pairs.one
+        said = self._task.log.pairs.one or self._task.theory.same_place
+        is_lazy = self._task.speedups.lazy and not said
         first = chart.visits_with(FIRST_PAIRS) if is_lazy else len(chart.stars)
         return {*range(first), *(chart.facing[node][0] for node in self.clique)}
 

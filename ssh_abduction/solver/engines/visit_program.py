@@ -40,6 +40,7 @@ class GivenVisits:
         turns: The turns, as (node, direction, node).
         fits: The pairs of visits that may be at one place.
         joined: The pairs of visits that are at one place, as the user says.
+        together: The same, where the user does not say how their frames are turned.
     """
 
     visits: set[int] = field(default_factory=set)
@@ -48,6 +49,7 @@ class GivenVisits:
     turns: set[tuple[int, str, int]] = field(default_factory=set)
     fits: frozenset[Pair] = frozenset()
     joined: frozenset[Pair] = frozenset()
+    together: frozenset[tuple[int, int]] = frozenset()
 
 
 class VisitProgram:
@@ -65,7 +67,7 @@ class VisitProgram:
         self.chart = chart
         self.batch = -1
         self._asker, self._trace, self._sides = asker, task.trace, sides
-        self._one = pairs_in(task.log.pairs.one)
+        self._one, self._together = pairs_in(task.log.pairs.one), task.theory.same_place
         cores = ["--opt-strategy=usc"] if task.speedups.core_guided else []
         asker.control = new_control("visits", "", ["--heuristic=Domain", *cores])
         self.least = 0
@@ -112,7 +114,9 @@ class VisitProgram:
         joined = sorted(self._joined() - known.joined)
         known.joined |= frozenset(joined)
         part = f"visits_{self.batch}"
-        facts = visits_lp.visit_facts(self.batch, nodes, leaves, new, unfit, joined)
+        together = sorted(self._at_one_place() - known.together)
+        known.together |= frozenset(together)
+        facts = visits_lp.visit_facts(self.batch, nodes, leaves, new, unfit, joined, together)
         control.add(part, [], facts)
         control.add(part, [], sides_lp.turn_facts(self.batch, chart, added, turns))
         control.ground([(part, []), ("more", number_symbols(self.batch))])
@@ -135,6 +139,13 @@ class VisitProgram:
                     earlier = (first, last, (other - slot) % 4)
                     found.add(earlier if first <= last else (last, first, (slot - other) % 4))
         return found
+
+    def _at_one_place(self) -> set[tuple[int, int]]:
+        """List the pairs of visits with steps that the user says are at one place."""
+        node_of, facing = self.chart.node_of, self.chart.facing
+        pairs = [pair for pair in self._together if max(pair) < len(node_of)]
+        visits = {tuple(sorted(facing[node_of[t]][0] for t in pair)) for pair in pairs}
+        return {(i, j) for i, j in visits if i != j}
 
     def read(self, model: clingo.Model) -> list[Pair]:
         """Read the pairs of visits that are at one place in an answer."""

@@ -41,6 +41,11 @@ def paths_framed_facts(
     visits = {(chart.facing[s][0], chart.facing[x][0]): (s, x) for s, x in chart.away}
     facts += [f"far_nodes({s},{x})." for s, x in visits.values()]
     steps = len(chart.node_of)
+    facts += [
+        f"together({chart.node_of[i]},{chart.node_of[t]})."
+        for i, t in theory.same_place
+        if max(i, t) < steps
+    ]
     for number, equalities in enumerate(forbidden):
         if all(max(equality.first, equality.second) < steps for equality in equalities):
             nodes = [

@@ -22,15 +22,24 @@ def visit_facts(
     fits: Iterable[tuple[int, int, int]],
     unfit: Iterable[tuple[int, int, int]] = (),
     joined: Iterable[tuple[int, int, int]] = (),
+    together: Iterable[tuple[int, int]] = (),
 ) -> str:
     """Return the facts for one batch.
 
     Each node (the steps of a visit that face one slot) has its number, visit and slot. `leaves` has
     each visit that ends, with the slot that it leaves through, and the action. Triples (I, J, R)
     stand for pairs of visits: `fits` may be at one place, `unfit` of earlier batches are now known
-    not to be, and `joined` are at one place, as the user says.
+    not to be, and `joined` are at one place, as the user says. So are the pairs (I, J) of
+    `together`, with any rotation.
     """
-    new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit, "joined": joined}
+    new: dict[str, Iterable[tuple[int, ...]]] = {
+        "node": nodes,
+        "leaves": leaves,
+        "fits": fits,
+        "unfit": unfit,
+        "joined": joined,
+        "together": together,
+    }
     return "\n".join(
         f"{name}({batch},{','.join(map(str, args))})."
         for name, rows in new.items()
