@@ -8,11 +8,13 @@ which doors the robot drove through. Four questions judge a map:
 * Has each room that the robot entered a place or an edge of its own? Most visits to its place are
   in the room. All travels on its edge pass the room between their ends.
 * Are no two doors confused? Doors are on edges of the map. Two doors are confused if two travels
-  are on one edge, and each passed a door that the other did not.
+  are on one edge, and each passed a door that the other did not. The halves of a double door count
+  as one door: two doors between the same rooms, less than HALF metres apart.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Mapping, Sequence
 from itertools import combinations, pairwise
@@ -20,6 +22,8 @@ from typing import Any
 
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.robot_logs.edges import edges_of
+
+HALF = 1.5
 
 
 def untold(
@@ -55,7 +59,17 @@ def untold(
 
 def rooms_and_doors(told: Mapping[str, Any]) -> tuple[list[str | None], dict[int, str]]:
     """Read the room of each scan, and the doors, from the truth that the simulator wrote."""
-    return list(told["scans"]), {passed["scan"]: passed["door"] for passed in told["crossings"]}
+    doors = told["doors"]
+    half_of = {
+        name: next(
+            other
+            for other, half in doors.items()
+            if {*half["rooms"]} == {*door["rooms"]} and math.dist(half["at"], door["at"]) < HALF
+        )
+        for name, door in doors.items()
+    }
+    passed = {crossing["scan"]: half_of[crossing["door"]] for crossing in told["crossings"]}
+    return list(told["scans"]), passed
 
 
 def told_line(rows: Sequence[dict[str, Any]]) -> str:

@@ -79,6 +79,17 @@ def test_junctions_are_found_where_ways_meet(patch: Patch, bearings: list[float]
             assert min(radians_between(way, bearing) for way in ways) < math.radians(20)
 
 
+@pytest.mark.parametrize(("length", "count"), [(0.8, 0), (3.0, 2)], ids=["desk", "wall"])
+def test_long_obstacle_that_stands_free_is_a_wall(length: float, count: int) -> None:
+    """Doors at both ends of a wall leave it alone in free space. Ways part at these ends."""
+    rooms = patch_of((-8, 0.2, 8, 2), (-8, -2, 8, 2), solid=((-length / 2, -0.1, length / 2, 0.1),))
+    found = junctions(rooms, ROOM)
+    assert len(found) == count
+    for junction in found:
+        assert length / 2 < abs(junction.middle[0]) < length / 2 + 2.5
+        assert len(junction.branches) == 3
+
+
 def test_robot_wider_than_the_map_finds_no_junctions() -> None:
     """A mask as wide as this robot needs more memory than there is."""
     assert not junctions(patch_of(CORRIDOR, (-1, -8, 1, 8)), 25.0)

@@ -32,8 +32,10 @@ from perception.places.local_map import CELL, EIGHT, Bools, Patch
 from perception.places.thinning import Edge, Graph, Node, graph_of, thinned
 from perception.places.track import Array
 
-# Obstacles that stand free and cover less than this many square metres are furniture.
-FURNITURE = 4.0
+# Obstacles that stand free are furniture if they cover less than FURNITURE square metres, and the
+# diagonal of the rectangle around them is shorter than LONG metres. Longer ones may be walls. Both
+# include the margin that the middle of the robot cannot enter.
+FURNITURE, LONG = 4.0, 3.0
 # A branch counts if it leads at least OUT metres out of the disc of its junction, and at least
 # SHARE times the radius of the disc.
 OUT, SHARE = 0.75, 0.5
@@ -159,6 +161,9 @@ def passable(patch: Patch, room: float) -> Bools:
     sizes = np.bincount(holes.ravel(), minlength=count + 1) * CELL**2
     small = sizes < FURNITURE
     small[0] = False
+    for hole, (rows, columns) in enumerate(ndimage.find_objects(holes), start=1):
+        sides = rows.stop - rows.start, columns.stop - columns.start
+        small[hole] &= math.hypot(*sides) * CELL < LONG
     for side in (holes[0], holes[-1], holes[:, 0], holes[:, -1]):
         small[side] = False
     return np.asarray(reached | small[holes])
