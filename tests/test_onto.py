@@ -12,6 +12,7 @@ import pytest
 from brute_force import Key, key, minimal_maps
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from onto import walks
 from strategies import TOYS, theories
 from test_framed import framed_theories, framed_traces
 from test_together import joint_traces
@@ -25,7 +26,6 @@ from ssh_abduction.data.drives import starts_of, together
 from ssh_abduction.data.errors import SolverError, TraceError
 from ssh_abduction.solver import Status, choosing
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.drives import added_drives
 from ssh_abduction.solver.drives.digest import Digest
 from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory import Speedups
@@ -100,7 +100,6 @@ def test_onto_lists_minimal_maps_that_keep_the_existing_map(data: st.DataObject)
 def test_onto_with_frames_keeps_places_that_only_minimality_joins(
     old: Trace, new: Trace, theory: Theory, data: st.DataObject
 ) -> None:
-    """Long traces are solved once only. Here all traces count as long."""
     standing = solve(old, theory, max_maps=1)
     if not standing.maps:
         return
@@ -108,10 +107,7 @@ def test_onto_with_frames_keeps_places_that_only_minimality_joins(
     every = solve(joint, theory.replace(prefer=()), max_maps=None)
     kept = [ssh_map for ssh_map in every if allows(key(ssh_map))]
     few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
-    with (
-        patch.object(choosing, "FEW_STEPS", few_steps),
-        patch.object(added_drives, "READABLE", 0),
-    ):
+    with patch.object(choosing, "FEW_STEPS", few_steps):
         if not kept:
             with pytest.raises(SolverError, match="expected a drive that agrees"):
                 solve(new, theory, onto=standing)
@@ -123,7 +119,7 @@ def test_onto_with_frames_keeps_places_that_only_minimality_joins(
     assert [check(joint, ssh_map, theory) for ssh_map in solution[:2]] == [()] * len(solution[:2])
 
 
-def test_long_drive_keeps_a_place_that_only_minimality_joined() -> None:
+def test_drive_keeps_a_place_that_only_minimality_joined() -> None:
     """Two ways of Monday seem to be one way there and back. Tuesday sees another view behind."""
     crossing, end = (1, 1, 1, 1), (0, 0, 1, 0)
     monday = Trace.from_steps(
@@ -135,9 +131,17 @@ def test_long_drive_keeps_a_place_that_only_minimality_joined() -> None:
     standing = solve(monday)
     assert [s.place for s in standing[0].dstates] == [0, 1, 2, 2, 1, 0]
     tuesday = Trace.from_steps("bz", ["around"], stars=[crossing] * 2, name="tuesday")
-    with patch.object(added_drives, "READABLE", 0):
-        found = solve(tuesday, onto=standing)[0]
+    found = solve(tuesday, onto=standing)[0]
     assert [s.place for s in found.dstates] == [0, 1, 2, 2, 1, 0, 1, 1]
+
+
+def test_drive_keeps_a_dstate_that_the_fewest_dstates_would_split() -> None:
+    """Together, the drives have more steps than the readable encodings are used for."""
+    old, new = (walk.trace for walk in walks(5, 60, 2, seed=14201, looks=8))
+    standing = solve(old, Theory.causal(), max_maps=1)
+    found = solve(new[:9], onto=standing, max_maps=1)[0]
+    assert found.dstate_at[: len(old)] == standing[0].dstate_at
+    assert len(found.dstates) <= len(standing[0].dstates) + 9
 
 
 MONDAY = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")

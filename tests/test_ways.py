@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import maze
-from strategies import traces
+from strategies import step_pairs, traces
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
@@ -62,7 +62,8 @@ def test_frameless_maps_equal_those_of_the_plain_encoding(data: st.DataObject) -
     """Clingo gets the paths that an answer contradicts, or only incompatible links. It starts with
     few names. A minimal map is known or not."""
     trace = data.draw(traces(max_steps=6), label="trace").without_stars().without_displacements()
-    theory = data.draw(bare_theories(), label="theory")
+    said = {kind: data.draw(step_pairs(len(trace)), label=kind) for kind in ("same", "same_place")}
+    theory = data.draw(bare_theories(), label="theory").replace(**said)
     contrary = data.draw(st.sampled_from([0, 1, ways.CONTRARY]), label="contrary")
     spares = data.draw(st.sampled_from([0, 2]), label="spare names")
     patience = data.draw(st.sampled_from([0, name_search.PATIENCE]), label="patience")
@@ -84,6 +85,19 @@ def test_frameless_maps_equal_those_of_the_plain_encoding(data: st.DataObject) -
     assert len(found) == len(expected.maps)
     assert best.cost == expected.cost.preferred_by(theory)
     assert engine.bound == best.cost[0]
+
+
+@settings(max_examples=6)
+@given(st.data())
+def test_causal_maps_join_steps_that_a_person_joins(data: st.DataObject) -> None:
+    """Some pairs of steps contradict the trace."""
+    trace = data.draw(traces(max_steps=6), label="trace").without_stars().without_displacements()
+    theory = Theory.causal().replace(same=data.draw(step_pairs(len(trace)), label="same"))
+    expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
+    with patch.object(choosing, "FEW_STEPS", 0):
+        solution = solve(trace, theory, max_maps=None)
+    assert (solution.status, solution.complete) == (expected.status, expected.complete)
+    assert set(solution) == set(expected)
 
 
 @settings(max_examples=4)

@@ -17,7 +17,7 @@ from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import joined_drives, together
 from ssh_abduction.data.errors import SolverError
-from ssh_abduction.data.maps import check_of_trace
+from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.deprecated import renamed_parameters
@@ -33,7 +33,7 @@ from ssh_abduction.solver.obeying import obeyed, with_correction_warnings, with_
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
-from ssh_abduction.solver.start import Limits
+from ssh_abduction.solver.start import Limits, Start
 from ssh_abduction.solver.values import Progress
 from ssh_abduction.theory.old_choices import with_old_choices
 from ssh_abduction.theory.settle import Problem
@@ -104,7 +104,7 @@ def solve(
     watch = Watch(time_limit, memory_limit)
     watch.start()
 
-    def find(trace: Trace, theory: Theory) -> Solution:
+    def find(trace: Trace, theory: Theory, known: Sequence[SSHMap] = ()) -> Solution:
         search = Search(
             trace,
             theory,
@@ -114,6 +114,7 @@ def solve(
             memory_limit=memory_limit,
             speedups=speedups,
             on_progress=on_progress,
+            _start=Start(known=tuple(known)),
         )
         return search.solution(tuple(search))
 

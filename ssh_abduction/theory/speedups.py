@@ -255,7 +255,7 @@ TABLE = (
             theory.level == "causal" and theory.prefer == ("dstates",) and not theory.has_faults
         ),
         CAUSAL,
-        _kept_by("names", and_also=(*PAIRS_OF_STEPS, *OF_TRACES)),
+        _kept_by("names", and_also=(*PAIRS_OF_STEPS, *OF_TRACES, "asserted same")),
     ),
     Speedup(
         "named dstates with faults",
@@ -323,7 +323,10 @@ TABLE = (
         ),
         PLACES,
         _kept_by(
-            "names", "sides_frameless", "paths_frameless", and_also=(*PAIRS_OF_STEPS, *OF_TRACES)
+            "names",
+            "sides_frameless",
+            "paths_frameless",
+            and_also=(*PAIRS_OF_STEPS, *OF_TRACES, "asserted same", "the field same_place"),
         ),
     ),
     Speedup(

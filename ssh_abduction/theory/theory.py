@@ -102,8 +102,7 @@ class Theory:
         same: Pairs of steps known to be one dstate.
         different: Pairs of steps known to be different dstates.
         elsewhere: Pairs of steps known to be at different places.
-        same_place: Pairs of steps known to be at one place. Unless star=frame, they switch off the
-            fast engines.
+        same_place: Pairs of steps known to be at one place.
         weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats:
             the prices of their dstates, places, paths and faults, plus half of the chi-square of
             their misfit to the displacements. auto: cost if displacements are used, dstates come

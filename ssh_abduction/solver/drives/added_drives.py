@@ -1,10 +1,9 @@
 """Add a drive to the map of old drives, in about the time that solving the new drive takes.
 
 The map of the old drives is the *existing map*: the joint map must keep its dstates and places. The
-solver does not get the old drives. It gets a digest of them (`digest.py`). Steps of the digest that
-are at different dstates or places of the existing map are asserted to be different. If the best
-maps split no dstate of the existing map, they are the best of all maps that keep it. If they do,
-the steps of each dstate are asserted to be one dstate, too, if the traces are short enough.
+solver does not get the old drives. It gets a digest of them (`digest.py`), and assertions about its
+steps: those at one dstate or place of the existing map are at one, and others are not. The search
+begins with the existing map, to which a sketch adds the new drives.
 
 With displacements, a long drive is laid on the existing map (`laying.py`). If that fails, or if the
 drives are short, the solver gets all old steps.
@@ -20,7 +19,7 @@ drives are short, the solver gets all old steps.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -62,9 +61,12 @@ _LIMITS = ("time limit", "memory limit", "interrupted")  # what ends a search ea
 
 @dataclass(frozen=True)
 class Solving:
-    """How to solve a trace: a function, the speed-ups, and the clock and limits of all solving."""
+    """How to solve a trace: a function, the speed-ups, and the clock and limits of all solving.
 
-    solve: Callable[[Trace, Theory], Solution]
+    The function gets a trace, a theory, and maps to begin with.
+    """
+
+    solve: Callable[[Trace, Theory, Sequence[SSHMap]], Solution]
     speedups: Speedups
     watch: Watch
 
@@ -115,16 +117,13 @@ def solve_onto(
         part = together([digest.trace, trace.without_displacements() if short else trace])
 
     # 4. The minimal maps of this trace that keep the old map.
-    pinned = _pinned(theory, digest, ssh_map, joins=in_use.star == "frame")
-    found = solving.solve(part, pinned)
+    pinned = _pinned(theory, digest, ssh_map)
+    found = solving.solve(part, pinned, tuple(_sketched(digest, ssh_map, part, in_use)))
     kept = tuple(m for m in found.maps if _keeps(m, digest, ssh_map))
-    ended = found.stopped in _LIMITS
-    if not kept and not ended and found.status is not Status.UNSATISFIABLE:
-        found, kept = _with_assertions(part, pinned, digest, ssh_map, found, solving)
 
     # 5. Their labels for all steps of all drives.
     maps = tuple(_of_all_drives(m, digest, ssh_map, joint, in_use) for m in kept)
-    if not maps and ended and (grown := _grown(ssh_map, old, problem)):
+    if not maps and found.stopped in _LIMITS and (grown := _grown(ssh_map, old, problem)):
         found, maps = replace(found, status=Status.FEASIBLE, cost=Cost.of(grown)), (grown,)
     if not maps:
         raise _contradiction(old, trace, ssh_map, digest, found)
@@ -159,13 +158,17 @@ def _of_joint_trace(
 def _of_all_drives(
     found: SSHMap, digest: Digest, ssh_map: SSHMap, joint: Trace, theory: Theory
 ) -> SSHMap:
-    """Make a map of all drives from a map of a digest and a new drive.
-
-    The robot may first have visited a place at another dstate than the digest. That dstate has
-    heading 0.
-    """
+    """Make a map of all drives from a map of a digest and a new drive."""
     labels = digest.labels_of_all(found, ssh_map)
-    whole = replace(found, dstate_at=labels, starts=starts_of(joint), names=())
+    return _begun(replace(found, dstate_at=labels), joint, theory)
+
+
+def _begun(found: SSHMap, joint: Trace, theory: Theory) -> SSHMap:
+    """Number the dstates and headings of a map in the order in which a trace visits them.
+
+    The first dstate that the robot visits at a place has heading 0.
+    """
+    labels, whole = found.dstate_at, replace(found, starts=starts_of(joint), names=())
     if theory.star == "gateways":
         whole = with_allowed_headings(joint, whole, theory.axioms) or whole
     elif theory.star == "frame":
@@ -213,6 +216,21 @@ def _grown(ssh_map: SSHMap, old: Trace, problem: Problem) -> SSHMap | None:
         return None
     grown = replace(sketch.map(), starts=starts_of(problem.trace), names=())
     return grown if Judging(problem).accepts(grown) else None
+
+
+def _sketched(digest: Digest, ssh_map: SSHMap, part: Trace, theory: Theory) -> Iterator[SSHMap]:
+    """Add new places for a new drive to the existing map, without a search.
+
+    The search begins with these maps of the digest and the drive, if they break no axiom. So its
+    best map has at most one dstate more for each new step, also at a limit.
+    """
+    if theory.unknown_views:
+        return
+    standing = replace(ssh_map, dstate_at=digest.labels)
+    for homing in (True, False):
+        sketch = sketch_beyond(standing, digest.trace, theory, homing)
+        if first_contradiction(sketch, part) is None:
+            yield _begun(sketch.map(), part, theory)
 
 
 def _existing(existing: object) -> tuple[Trace, SSHMap]:
@@ -265,50 +283,25 @@ def _check_assertions(theory: Theory, old: Trace, ssh_map: SSHMap) -> bool:
     return joins
 
 
-def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap, *, joins: bool) -> Theory:
+def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap) -> Theory:
     """Return the theory for a digest and a new drive, with assertions that keep the existing map.
 
-    They say that steps at different dstates or places of a piece are different. Assertions of the
-    theory about old steps are moved to steps of the digest. If `joins`, steps at one dstate or
-    place of that map are also asserted to be at one. The fast engine for frames can obey such
-    assertions. For other theories, they switch fast engines off.
+    They say that steps at one dstate or place of the existing map are at one, and that steps at
+    different dstates or places of a piece are different. Assertions of the theory about old steps
+    are moved to steps of the digest.
     """
-    place = [ssh_map.dstates[s].place for s in digest.labels]
-    first = first_index_of(digest.labels)
-    apart: list[tuple[int, int]] = []
-    elsewhere: list[tuple[int, int]] = []
-    for s, i in first.items():
-        # If equal steps are asserted to be equal, one step of each dstate is enough.
-        for x, j in first.items() if joins else ((x, j) for j, x in enumerate(digest.labels)):
-            if digest.must_differ(s, x):
-                pairs = apart if place[i] == place[j] else elsewhere
-                pairs.append((min(i, j), max(i, j)))
-    labels = ssh_map.dstate_at
-    same, same_place = digest.moved(theory.same, labels), digest.moved(theory.same_place, labels)
-    if joins:
-        one, together = _joined(digest, ssh_map)
-        same, same_place = same + one, same_place + together
-    return theory.replace(
-        same=tuple(same),
-        different=(*digest.moved(theory.different, labels), *apart),
-        elsewhere=(*digest.moved(theory.elsewhere, labels), *elsewhere),
-        same_place=tuple(same_place),
-    )
-
-
-def _joined(digest: Digest, ssh_map: SSHMap) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Return pairs of steps of a digest that join the steps of each dstate, and of each place."""
-    first: dict[int, int] = {}
-    first_at: dict[int, int] = {}
-    same: list[tuple[int, int]] = []
-    same_place: list[tuple[int, int]] = []
-    for t, s in enumerate(digest.labels):
-        place = ssh_map.dstates[s].place
-        if first.setdefault(s, t) != t:
-            same.append((first[s], t))
-        elif place is not None and first_at.setdefault(place, t) != t:
-            same_place.append((first_at[place], t))
-    return same, same_place
+    first, labels = first_index_of(digest.labels), ssh_map.dstate_at
+    place = {s: ssh_map.dstates[s].place for s in first}
+    moved = {kind: digest.moved(getattr(theory, kind), labels) for kind in ASSERTIONS}
+    for (s, i), (x, j) in combinations(first.items(), 2):
+        if digest.must_differ(s, x):
+            moved["different" if place[s] == place[x] else "elsewhere"].append((i, j))
+    moved["same"] += [(first[s], t) for t, s in enumerate(digest.labels) if first[s] != t]
+    first_at = first_index_of(place[s] for s in digest.labels)
+    moved["same_place"] += [
+        (t, i) for s, i in first.items() if place[s] is not None and (t := first_at[place[s]]) != i
+    ]
+    return theory.replace(**moved)
 
 
 def _keeps(found: SSHMap, digest: Digest, ssh_map: SSHMap) -> bool:
@@ -346,26 +339,6 @@ def _broken(
         and ssh_map.dstates[s].place is not None
     }
     return sorted(split | merged), sorted(moved)
-
-
-def _with_assertions(
-    part: Trace, pinned: Theory, digest: Digest, ssh_map: SSHMap, found: Solution, solving: Solving
-) -> tuple[Solution, tuple[SSHMap, ...]]:
-    """Solve again, and assert which steps of the digest are at one dstate or place.
-
-    Returns the new solution, and its maps that keep the existing map; or, if the trace is too long
-    for that, the old solution `found` and no maps.
-    """
-    if len(part) > READABLE:
-        return found, ()
-    same, same_place = _joined(digest, ssh_map)
-    stands = pinned.replace(
-        same=(*pinned.same, *same), same_place=(*pinned.same_place, *same_place)
-    )
-    again = solving.solve(part, stands)
-    if again.status is Status.UNSATISFIABLE:
-        return found, ()
-    return again, tuple(m for m in again.maps if _keeps(m, digest, ssh_map))
 
 
 def _weighed(found: Solution, digest: Digest, ssh_map: SSHMap) -> Weighed | None:

@@ -54,10 +54,13 @@ class _Far:
 
     Attributes:
         placed: The steps that the evidence names, each with its dstate.
+        denied: Whether the constraint is the opposite: the user says that the one pair is at one
+            place.
     """
 
     pairs: tuple[tuple[int, int], ...]
     placed: tuple[tuple[int, int], ...]
+    denied: bool = False
 
     @classmethod
     def of(cls, labels: Sequence[int], equalities: Collection[Equality]) -> _Far | None:
@@ -232,13 +235,18 @@ class PlacesAndPaths:
         )
 
     def _far_away(self, labels: Sequence[int]) -> list[_Far]:
-        """List what evidence says about dstates at different places, single pairs first."""
+        """List what is known about dstates at different places or at one, single pairs first."""
         away = self._task.log.pairs.elsewhere.items()
         found = {
             (labels[i], labels[t]): (i, t) for t, others in away if t < len(labels) for i in others
         }
         alone = [
             _Far((pair,), tuple(zip(steps, pair, strict=True))) for pair, steps in found.items()
+        ]
+        alone += [
+            _Far(((labels[i], labels[t]),), ((i, labels[i]), (t, labels[t])), denied=True)
+            for i, t in self._task.theory.same_place
+            if max(i, t) < len(labels)
         ]
         return alone + [far for equalities in self._refused if (far := _Far.of(labels, equalities))]
 
@@ -267,13 +275,15 @@ class PlacesAndPaths:
         """
         control = Control(options, self._asker.watch.check, PREPARING)
         control.load_encodings("paths_frameless", "preference")
-        apart = [member.pairs for member in far]
-        dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links), *chain(*apart)))
+        apart = [member.pairs for member in far if not member.denied]
+        close = [pair for member in far if member.denied for pair in member.pairs]
+        ends = chain(*((s, x) for s, _, x in links), *chain(*apart), *close)
+        dstates = dict.fromkeys(chain(dstates, ends))
         control.add(
             "base",
             [],
             paths_lp.paths_frameless_facts(
-                self._task.theory, dstates, links, self._actions, apart, single=single
+                self._task.theory, dstates, links, self._actions, apart, close, single=single
             ),
         )
         task = self._task

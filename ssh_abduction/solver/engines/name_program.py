@@ -22,6 +22,7 @@ from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.steps.chart import Chart, Link
+from ssh_abduction.theory.pairs import pairs_in
 
 # Clingo cannot be stopped while it prepares to solve. That takes about this share of the time that
 # grounding took.
@@ -105,6 +106,7 @@ class NameProgram:
         self.pinned, self.forbidden = pinned, forbidden
         self._task, self._asker, self._fitting = task, asker, fitting
         self._spares = spares
+        self._one = pairs_in(task.log.pairs.one)
         self._known = self._new_control()
 
     @property
@@ -192,6 +194,7 @@ class NameProgram:
         added = [link for link in links if link not in known.links]
         given: list[tuple[int, int, Sequence[int], int | None]] = []
         far: list[tuple[int, int]] = []
+        before = set(known.nodes)
         for t in (end for s, _, x in added for end in (s, x)):
             if t in known.nodes:
                 continue
@@ -205,7 +208,8 @@ class NameProgram:
                     far += [(t, int(u)) for u in np.flatnonzero(excluded)]
                 known.is_open[t] = True
         known.links.update(dict.fromkeys(added))
-        self._asker.control.tell(names_lp.batch_facts(known.batches, given, added, far))
+        one = [pair for pair in self._one if known.nodes.issuperset(pair) > before.issuperset(pair)]
+        self._asker.control.tell(names_lp.batch_facts(known.batches, given, added, far, one))
         self._asker.control.ground([("more", number_symbols(known.batches))])
         known.batches += 1
 
@@ -216,8 +220,10 @@ class NameProgram:
         self._asker.control.tell(names_lp.not_together(number, pairs))
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
-        """Whether the dstates of a map agree with the evidence about pairs of steps."""
+        """Whether the dstates of a map agree with what is known about pairs of steps."""
         if any(all(labels[i] == labels[j] for i, j in pairs) for pairs in self.forbidden):
+            return False
+        if any(labels[i] != labels[t] for i, t in self._one if t < len(labels)):
             return False
         return not self.chart.excluded or self.chart.is_map(labels)
 

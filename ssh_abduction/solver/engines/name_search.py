@@ -86,7 +86,8 @@ class NameSearch:
         labels = None
         while labels is None and (names := (yield from self._cheapest_answer())) is not None:
             labels = self._labels_by(names)
-        yield labels or self._incumbent.labels or []
+        if best := labels or self._incumbent.labels:
+            yield best
 
     def _cheapest_answer(self) -> Generator[list[int], None, dict[int, int] | None]:
         """Find the cheapest answer for the links that clingo has; None if a known map is as good.
@@ -95,8 +96,8 @@ class NameSearch:
         """
         while True:
             names, proven = self._cheapest(self._patience)
-            if proven and names is not None:
-                return names
+            if proven:
+                return names  # None if what the user says contradicts the trace
             yield from self._helped()
             if self._incumbent.is_settled():
                 return None

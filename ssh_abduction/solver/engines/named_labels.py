@@ -46,6 +46,7 @@ from ssh_abduction.solver.engines.name_search import Incumbent, NameSearch
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.chart import Chart, Link
+from ssh_abduction.theory.pairs import pairs_in
 
 # Before clingo has all links, any answer may show that a link is missing. So hold back the maps of
 # a list until it is complete. If it has this many maps, give clingo all links instead, and then
@@ -150,9 +151,12 @@ class NamedLabels:
         )
         self._search = NameSearch(self._task, self._asker, self._program, known, self._fitting)
         links: Iterable[Link] = pinned.chart.links
-        if speedups.lazy:  # only links that begin at the first step or at a pinned one
+        if speedups.lazy:
+            # Only links that begin at the first step or at a pinned one, and those at steps that
+            # the user says are one dstate.
             first = {0, *pinned.clique}
-            links = [link for link in links if link[0] in first]
+            said = {t for pair in pairs_in(self._task.log.pairs.one) for t in pair}
+            links = [link for link in links if link[0] in first or not said.isdisjoint(link[::2])]
         self._program.give_links(links)
 
     def _first_spares(self, pinned: Pinned) -> dict[int, int]:

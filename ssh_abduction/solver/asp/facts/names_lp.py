@@ -57,12 +57,13 @@ def batch_facts(
     nodes: Iterable[tuple[int, int, Sequence[int], int | None]],
     links: Iterable[tuple[int, int, int]],
     apart: Iterable[tuple[int, int]],
+    one: Iterable[tuple[int, int]],
 ) -> str:
     """Return the facts for one batch: the nodes of one call.
 
     Each node has its number, its view, the names that it can have, and the last node with this view
     that clingo has already (or None). `links` are triples of a node, an action, and the node that
-    the action leads to. Nodes that are `apart` are different dstates.
+    the action leads to. Nodes that are `apart` are different dstates, nodes of `one` are one.
     """
     facts = []
     for t, view, names, before in nodes:
@@ -71,6 +72,7 @@ def batch_facts(
         facts += [f"follows({before},{t})."] if before is not None and len(names) > 1 else []
     facts += [f"link({batch},{t},{action},{u})." for t, action, u in links]
     facts += [f"apart({batch},{t},{u})." for t, u in apart]
+    facts += [f"one({batch},{t},{u})." for t, u in one]
     return "\n".join(facts)
 
 

@@ -62,14 +62,16 @@ def paths_frameless_facts(
     links: Iterable[tuple[int, int, int]],
     actions: Mapping[int, Action],
     far: Iterable[Collection[tuple[int, int]]] = (),
+    close: Iterable[tuple[int, int]] = (),
     *,
     single: bool = False,
 ) -> str:
     """Return the facts for paths_frameless.lp about dstates and the links between them.
 
     `links` are triples of a dstate, the number of an action, and the dstate that it leads to. In
-    each set of `far`, at least one pair of dstates is at different places. If `single`, places and
-    segments are merged only if the axioms force them to be one. This is solved faster.
+    each set of `far`, at least one pair of dstates is at different places. The pairs of `close` are
+    at one place. If `single`, places and segments are merged only if the axioms force them to be
+    one. This is solved faster.
     """
     facts = [
         sides_framed_facts(theory),
@@ -77,6 +79,7 @@ def paths_frameless_facts(
         *(["single."] if single else []),
     ]
     facts += [f"is({x})." for x in dstates]
+    facts += [f"close({x},{y})." for x, y in close]
     for number, pairs in enumerate(far):
         facts += [
             f"far({x},{y})." if len(pairs) == 1 else f"far({number},{x},{y})." for x, y in pairs
