@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -318,7 +319,7 @@ def test_name_follows_its_steps_if_places_are_renumbered() -> None:
     assert first.names[0].id != second.names[0].id
     both = said.with_name("end", "place", "monday:3")  # in this map, both are one place
     (third,) = solve(JOINT, corrections=both)
-    assert [n.text for n in third.names] == ["start"]
+    assert [n.text for n in third.names] == ["start", "end"]
 
 
 def test_solve_reports_corrections_that_contradict_the_trace(
@@ -814,6 +815,24 @@ def test_opposite_correction_replaces_the_old_one(first: str, then: str, left: l
     assert said.pairs[1] in changed.pairs
 
 
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--same", "p0,p1"], "--same: step 'p0': .*; places are for --elsewhere and --same-place"),
+        (
+            ["--elsewhere", "p1,p1"],
+            "--elsewhere: expected two different places, such as kitchen,p7",
+        ),
+        (["--same", "monday:1"], "--same: expected two different steps, such as monday:12,tuesday"),
+    ],
+)
+def test_correct_says_what_a_pair_is(
+    options: list[str], told: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["correct", str(folder / "building"), *options]) == 1
+    assert re.search(told, capsys.readouterr().err)
+
+
 def test_corrections_of_one_command_count_in_their_order(folder: Path) -> None:
     building = str(folder / "building")
     for first, then in (("same", "different"), ("different", "same")):
@@ -834,11 +853,14 @@ def test_solve_warns_of_names_that_the_map_does_not_have(
     save_corrections(said.with_name("cafe", "place", "tuesday:0"), folder / "building")
     assert main(solving(folder)) == 0
     told = capsys.readouterr()
-    assert "name 'cafe' of the place of tuesday:0: it is not used" in told.err
+    assert "name 'cafe' of the place of tuesday:0: it is not shown" in told.err
     assert "this place is also 'kitchen'; rename or remove one of them" in told.err
     assert len(load_corrections(folder / "building").names) == 2
     assert "name 'kitchen'" not in told.err
     assert "(kitchen)" in told.out
+    for name in ("kitchen", "cafe"):  # all verbs know both
+        assert main(["route", str(folder / "building"), "--from", "0", "--to", name]) == 0
+        assert "to place 1 (kitchen): " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("options", [["tuesday"], ["--jobs", "1"], ["--front", "1"]])

@@ -13,6 +13,7 @@ from worlds import written
 from ssh_abduction import SSHMap, Theory, Trace, export_map, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, together
+from ssh_abduction.data.regions import Region
 from ssh_abduction.explain import explain_place
 from ssh_abduction.rivals import Listing, difference, shared_sides
 
@@ -214,6 +215,13 @@ def test_name_of_a_region_is_shown_by_all_verbs(
         assert "region 3 (east ward)" in export_map(ssh_map, to)
     assert main(["name", "maps.json", "region9", "nowhere"]) == 1
     assert "expected a region of the map" in capsys.readouterr().err
+    wide = Region(0, (0, 3), (), None, ())
+    inner = [Region(i, (p,), (), None, (0,)) for i, p in ((1, 0), (2, 3))]
+    solution, nested = solve(written(CORNER)), replace(ssh_map, regions=(wide, *inner), names=())
+    Path("nested").mkdir()
+    replace(solution, maps=(nested,)).save("nested/maps.json")
+    assert main(["name", "nested", "region0", "wing"]) == 1
+    assert "whose places all belong to regions that are smaller" in capsys.readouterr().err
 
 
 @pytest.mark.slow

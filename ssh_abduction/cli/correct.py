@@ -107,10 +107,15 @@ def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
     Sentences about places also take places, such as "kitchen,p7".
     """
     about_places = kind in ("elsewhere", "same_place")
-    steps = at_comma(pair, saved.step_at_place if about_places else saved.step)
+    flag = f"--{kind.replace('_', '-')}"
+    try:
+        steps = at_comma(pair, saved.step_at_place if about_places else saved.step)
+    except MapError as error:
+        hint = "" if about_places else "; places are for --elsewhere and --same-place"
+        raise MapError(f"{flag}: {error}{hint}") from None
     if len(steps) != 2 or steps[0] == steps[1]:
-        raise MapError(
-            f"--{kind.replace('_', '-')}: expected two steps such as monday:12,tuesday:3, got "
-            f"{brief(pair)}; name two"
+        what = (
+            "places, such as kitchen,p7" if about_places else "steps, such as monday:12,tuesday:3"
         )
+        raise MapError(f"{flag}: expected two different {what}, got {brief(pair)}; name two")
     return steps[0], steps[1]

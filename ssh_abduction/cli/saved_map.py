@@ -22,6 +22,7 @@ from ssh_abduction.data.drives import Drive, step_name, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
 from ssh_abduction.data.map_parts import NAMED, thing_named
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.regions import region_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
 from ssh_abduction.rivals.listing import Listing
@@ -130,7 +131,7 @@ class SavedMap:
 
     def _numbered_or_named(self, text: str) -> tuple[str, str] | None:
         """Find a place, path or region by its number or name, as `thing`; None for a step."""
-        # If two places with names became one place of this map, the map has only the first name.
+        # A place may have two names, each of a step. So return the step of this name.
         for naming in self._names:
             if naming.name == text:
                 return naming.kind, naming.step
@@ -141,11 +142,18 @@ class SavedMap:
             t for t, s in enumerate(self.map.dstate_at) if number_at(self.map, kind, s) == number
         )
         first = next(here, None)
+        region = next((r for r in self.map.regions or () if r.id == number), None)
+        if first is None and kind == "region" and region is not None:
+            others = {f"region{region_of(self.map.regions, place)}" for place in region.places}
+            raise MapError(
+                f"{text}: expected a region to which some step belongs, got {brief(text)}, whose "
+                "places all belong to regions that are smaller or behind a door; name one of "
+                f"{', '.join(sorted(others))}"
+            )
         if first is None:
             raise MapError(
                 f"{text}: expected a {kind} of the map, got {brief(text)}, but the map has none "
-                "of this number" + ", or none with a place of its own" * (kind == "region") + "; "
-                "ssh-abduction show lists them"
+                "of this number; ssh-abduction show lists them"
             )
         return kind, step_name(self.drives, first)
 

@@ -139,6 +139,8 @@ class Corrections:
     def of_names(cls, ssh_map: SSHMap, drives: Sequence[Drive]) -> Corrections:
         """Return the names of a map as corrections, each for the first step that it is about.
 
+        A second name of a place is for the second step there, as a step has one name.
+
         Args:
             drives: The drives of its trace.
 
@@ -150,13 +152,13 @@ class Corrections:
         numbers = {
             kind: [number_at(ssh_map, kind, label) for label in ssh_map.dstate_at] for kind in NAMED
         }
-        return cls(
-            names=tuple(
-                Naming(name.text, name.kind, step_name(drives, numbers[name.kind].index(name.id)))
-                for name in ssh_map.names
-                if name.id in numbers[name.kind]
-            )
-        )
+        left: dict[tuple[str, int], list[int]] = {}  # the steps that have no name yet
+        found: list[Naming] = []
+        for name in ssh_map.names:
+            here = [t for t, number in enumerate(numbers[name.kind]) if number == name.id]
+            if here := left.setdefault((name.kind, name.id), here):
+                found.append(Naming(name.text, name.kind, step_name(drives, here.pop(0))))
+        return cls(names=tuple(found))
 
     @classmethod
     def for_drives(cls, trace: Trace) -> Corrections:
@@ -342,20 +344,20 @@ class Corrections:
     def named(self, ssh_map: SSHMap, drives: Sequence[Drive]) -> SSHMap:
         """Return a map with the names that a person gave.
 
-        If two names are of one place of this map, the first one counts.
+        If two names are of one place of this map, the map has both, and shows the first one.
 
         Args:
             drives: The drives of its trace.
         """
         checked_map(ssh_map)
-        found: dict[tuple[str, int], str] = {}
+        found: list[Name] = []
         for naming in self.known_in(drives).names:
             label = ssh_map.dstate_at[self._number(drives, naming.step)]
             number = number_at(ssh_map, naming.kind, label)
             if number is not None:
-                found.setdefault((naming.kind, number), naming.name)
-        names = (Name(kind, number, text) for (kind, number), text in sorted(found.items()))
-        return replace(ssh_map, names=tuple(names))
+                found.append(Name(naming.kind, number, naming.name))
+        found.sort(key=lambda name: (name.kind, name.id))  # keeps the order of a place's names
+        return replace(ssh_map, names=tuple(found))
 
     def without(self, sentence: Said | Passage) -> Corrections:
         """Return the same corrections without one sentence, of `pairs` or `gateways`.

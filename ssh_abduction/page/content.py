@@ -126,7 +126,7 @@ def _entry(ssh_map: SSHMap, name: str, shared: _SharedParts) -> dict[str, Any]:
         regions = tuple((r.places, r.bounds, r.door) for r in ssh_map.regions)
         entry["regions"] = shared.regions[regions]
     if ssh_map.names:
-        entry["names"] = {f"{n.kind} {n.id}": n.text for n in ssh_map.names}
+        entry["names"] = {f"{n.kind} {n.id}": n.text for n in reversed(ssh_map.names)}
     if ssh_map.fit:
         entry["chi2"] = round(ssh_map.fit.chi2, 1)
     if ssh_map.faults:

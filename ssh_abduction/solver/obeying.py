@@ -112,7 +112,7 @@ def _unused_names(corrections: Corrections, solution: Solution) -> Iterator[str]
                 else f"this {naming.kind} is also {brief(used)}; rename or remove one of them"
             )
             yield (
-                f"{named(corrections.source or 'corrections')}: {naming}: it is not used: in the "
+                f"{named(corrections.source or 'corrections')}: {naming}: it is not shown: in the "
                 f"first map, {why}"
             )
 
