@@ -98,7 +98,7 @@ def test_scan_matching_corrects_the_odometry(hall: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    ["check", "compare", "explain FOLDER 0 1", "view -o PAGE", "localise"],
+    ["check", "compare", "explain FOLDER 0 1", "explain FILE 0 1", "view -o PAGE", "localise"],
 )
 def test_verbs_accept_the_folder_of_a_map(
     runs: Path, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -107,7 +107,7 @@ def test_verbs_accept_the_folder_of_a_map(
     hall = runs / "hall"
     maps, trace = str(hall / "maps.json"), str(hall / "trace.jsonl")
     if verb == "explain":
-        short = ["explain", str(hall), "0", "1"]
+        short = ["explain", str(hall) if others[0] == "FOLDER" else maps, "0", "1"]
         full = ["explain", trace, "0", "1", "--theory", maps]
     elif verb == "localise":
         short, full = [verb, str(hall), str(hall)], [verb, maps, trace]

@@ -16,6 +16,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.data.map_parts import Fault, Name
 from ssh_abduction.data.maps import DState, Fit, MapPath, Pose
+from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solver import with_regions
 
 
@@ -206,9 +207,22 @@ def test_route_errors_name_the_range(arguments: dict[str, object], message: str)
         route(solve(rectangle(8)).maps[0], **arguments)  # type: ignore[arg-type]
 
 
-def test_route_by_places_needs_paths() -> None:
-    with pytest.raises(MapError, match="the map has no paths"):
+def test_route_by_places_needs_places() -> None:
+    with pytest.raises(MapError, match="the map has no places"):
         route(solve(rectangle(8), Theory.causal()).maps[0], 0, 1, by="places")
+
+
+def test_route_by_places_leads_back_without_paths() -> None:
+    """Maps of logs have no paths. The robot can drive back, although it never did."""
+    moves = [(5, 0, 0)] * 3 + [(0, 0, 3.1416)]
+    actions = ["travel", "travel", "travel", "around"]
+    found = solve(Trace.from_steps("abcde", actions, displacements=moves), BARE)
+    with pytest.raises(MapError, match="take --by places"):
+        route(found, None, "p1")
+    back = route(found, None, "p1", by="places")
+    assert (back.actions, back.places) == (("travel", "travel"), (3, 2, 1))
+    assert (back.views, back.is_known) == (("e", None, None), False)
+    assert route(found, "p0", "p3", by="places").is_known
 
 
 def test_renumbered_map_keeps_its_poses(square: SSHMap) -> None:

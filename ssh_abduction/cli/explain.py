@@ -21,6 +21,7 @@ from ssh_abduction.cli.options import (
     number_steps,
     theory_of,
     theory_of_maps,
+    trace_beside,
     trace_of_maps,
     trace_path,
 )
@@ -101,6 +102,8 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     if not Path(trace_path(options.trace)).exists():  # a folder with a file of solve -o
         options.trace = maps_path(options.trace)
+    if trace_beside(options.trace):  # the file of maps in a folder that map wrote
+        options.trace = str(Path(options.trace).parent)
     kept = trace_of_maps(options.trace)
     if kept is not None or Path(options.trace).is_dir():
         options.theory = options.theory or maps_path(options.trace)

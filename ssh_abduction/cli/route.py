@@ -43,7 +43,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "--by",
         "what to minimise (default: actions). With actions or metres, a route uses only moves "
-        "that the robot has made. With places, it may use any move along a path of the map",
+        "that the robot has made. With places, it may use any move along a path of the "
+        "map, and drive back where it came from",
         choices=("actions", "places", "metres"),
         default="actions",
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from collections.abc import Set as AbstractSet
+from itertools import product
 from typing import Any, TypeAlias
 
 import networkx as nx
@@ -17,8 +18,8 @@ from ssh_abduction.data.words import meant
 from ssh_abduction.output.layout import drawable_poses
 
 # The number of a dstate (distinctive state: a place and a heading). Or a course (place, path,
-# direction) that no dstate of the map faces.
-Node: TypeAlias = "int | tuple[int, int, int]"
+# direction) that no dstate of the map faces. In a map without paths, the last two are None.
+Node: TypeAlias = "int | tuple[int, int | None, int | None]"
 # Costs of moves in a route by places. Among routes with equally many travels, the one with fewer
 # actions wins. Among those with equally many actions, the one with more known moves wins.
 KNOWN_MOVE, UNTRIED_MOVE, OPEN_TURN = 1.0, 1.5, 2.5
@@ -32,14 +33,15 @@ class MoveGraph:
     """A directed graph whose edges are the moves that are possible in a map, with costs.
 
     Nodes are dstates, and also courses (place, path, direction) that no dstate faces. Edges are
-    links; for routes by places also moves that paths imply.
+    links; for routes by places also moves that paths imply or, in a map without paths such as that
+    of a log, the way back of each travel.
 
     Args:
         by: What the shortest route minimises: "actions", "places" or "metres".
         drives: The drives of the map's trace, to find steps such as "monday:12".
 
     Raises:
-        MapError: The map has no poses for "metres", or no paths for "places".
+        MapError: The map has no poses for "metres", or no places for "places".
 
     Attributes:
         map: The map.
@@ -57,18 +59,20 @@ class MoveGraph:
                 "solve a trace with displacements, and without a short time limit, or take --by "
                 "actions"
             )
-        if by == "places" and not ssh_map.paths:
+        if by == "places" and not ssh_map.places:
             raise MapError(
-                "by: expected actions or metres, got places: the map has no paths; "
+                "by: expected actions or metres, got places: the map has no places; "
                 "solve with --theory topological, or take --by actions"
             )
         # One travel costs more than all turns of a route together, as a route has at most as many
         # moves as there are dstates and courses.
-        courses = 2 * sum(len(path.order) for path in ssh_map.paths)
+        courses = 2 * sum(len(path.order) for path in ssh_map.paths) + len(ssh_map.places)
         self._travel_cost = OPEN_TURN * (len(ssh_map.dstates) + courses)
         self._graph = self._of_links()
-        if by == "places":
+        if by == "places" and ssh_map.paths:
             self._add_implied()
+        elif by == "places":
+            self._add_returns()
         self.closed = _closed_gateways(ssh_map)
         shut = [edge for edge in self._graph.edges if self._passes_closed(*edge)]
         self._graph.remove_edges_from(shut)
@@ -214,6 +218,28 @@ class MoveGraph:
             for node in courses_here:
                 for aside in courses_here - {node}:
                     self._imply(node, aside, around if self._is_around(node, aside) else None)
+
+    def _add_returns(self) -> None:
+        """Add the way back of each travel, and turns between all dstates of a place."""
+        dstates, links = self.map.dstates, self.map.links
+        travels = [
+            (dstates[target].place, dstates[source].place, action)
+            for source, action, target in links
+            if None not in (dstates[source].place, dstates[target].place)
+            and dstates[source].place != dstates[target].place
+        ]
+        action = travels[0][2] if len({action for _, _, action in travels}) == 1 else None
+        at: dict[int | None, set[Node]] = {}
+        for place in self.map.places:
+            faced = self._dstates_at(place, "map")
+            at[place] = {*faced, (place, None, None)}
+            for node, aside in product(at[place], faced):
+                if node != aside:
+                    self._imply(node, aside, None)
+        for there, back, _ in travels:
+            assert back is not None
+            for node in at[there]:
+                self._imply(node, (back, None, None), action)
 
     def _passes_closed(self, source: Node, target: Node) -> bool:
         """Whether a move leaves or enters a place by a gateway that was last seen closed."""

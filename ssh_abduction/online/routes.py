@@ -15,7 +15,8 @@ Hierarchy"). At the *causal* level, a route is a chain of links: the robot did e
 before. At the *topological* level, a route is a chain of places and paths: a path leads both ways,
 and at a place the robot can turn to each path through the place. So a route by places exists even
 if there is no chain of links, for example back along a street that was driven one way only. Moves
-that were never tried are marked. A turn for which the map has no action gets the action None.
+that were never tried are marked. A turn for which the map has no action gets the action None. In a
+map without paths, such as that of a log, each travel also leads back.
 
 A coarse route names the regions to leave and to enter, and the paths to pass. A region behind a
 place can only be left and entered through this place, its door. If the start lies right of a path
@@ -56,7 +57,7 @@ class Move:
     Attributes:
         action: The name of the action; None if the map does not know which action does this move.
         known: Whether the map has a link for the move, so that the robot did it before. Otherwise
-            the paths of the map imply the move.
+            the places and paths of the map imply the move.
         dstate: The dstate at the end; None if the robot never faced that way there.
         view: The view to expect at the end; None if it is unknown.
         place: The place at the end; None if the dstate has no place.
@@ -155,7 +156,7 @@ class Route:
         if self.metres is not None and self.moves:
             parts.append(f"{self.metres:.1f} m")
         if untried := sum(not move.known for move in self.moves):
-            parts.append(f"{untried} of them never tried, but implied by the paths of the map")
+            parts.append(f"{untried} of them never tried, but implied by the places of the map")
         elif self.maps > 1:
             parts.append(f"{len(self.agree)} of {self.maps} maps expect the same views")
         if not self.moves:
@@ -199,13 +200,14 @@ def route(
             dstate of the last step.
         goal: A dstate, place or region, named in the same way.
         by: What to minimise. "actions" and "metres" use links only, so the robot did each move
-            before. "places" minimises travels, and also uses moves that the paths of the map imply.
+            before. "places" minimises travels, and also uses moves that the paths of the map imply,
+            or the ways back of all travels if there are no paths.
         avoid: Dstates, places and regions that the route must not visit, named in the same way.
         map: The number of the map to use, from 1, or its id.
 
     Raises:
         MapError: There is no such dstate, place, region or map; no route exists; the map has no
-            poses for "metres", or no paths for "places".
+            poses for "metres", or no places for "places".
     """
     one_of("by", by, BY, MapError, mend="say what the route minimises")
     listing = Listing.of(maps)
@@ -310,7 +312,7 @@ def _raise_no_route(
     mend = "drive on (ssh-abduction next says what to try)"
     if graph.closed:
         mend = "no route passes a gateway that was last seen closed; drive on if it is open again"
-    elif graph.by != "places" and graph.map.paths:
+    elif graph.by != "places" and graph.map.places:
         mend = "take --by places, which may lead where the robot has not driven, or drive on"
     reached = counted(graph.dstates_from(here), "dstates")
     raise MapError(
