@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterator
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -124,3 +125,17 @@ def test_unproven_maps_of_a_mended_trace_are_not_minimal() -> None:
         mending = Mending(search._parts.task, solver)
         (*_, best) = mending.maps()
         assert mending.minimal_maps(0) == ((best.map,), is_listed)
+
+
+@pytest.mark.parametrize("status", [Status.OPTIMAL, Status.UNSATISFIABLE])
+def test_piece_that_ran_out_of_time_is_no_clash(status: Status) -> None:
+    """The least cost may be proven before a map is found. Then the piece has a map."""
+
+    def ended(search: Search) -> Iterator[SSHMap]:
+        search._parts.known.status = status
+        return iter(())
+
+    trace = Trace.from_steps("abc", ["travel", "travel"])
+    with patch.object(Search, "unranked", ended):
+        found = Search(trace)._solve_mended(trace, settle(trace, Theory()).theory, 1, 1.0)
+    assert found == ((), status is Status.UNSATISFIABLE)

@@ -376,7 +376,9 @@ class Search:
         if search.stopped == "interrupted":
             self.interrupt()
         is_listed = most == 1 or search.complete or search.stopped == "maps limit"
-        return maps, is_listed and search.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
+        # A limit may come after the proof of the least cost, and before the first map.
+        is_optimal = search.status is Status.OPTIMAL and bool(maps)
+        return maps, is_listed and (is_optimal or search.status is Status.UNSATISFIABLE)
 
     def interrupt(self) -> None:
         """End the search soon, with the best answer so far.
