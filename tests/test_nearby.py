@@ -145,6 +145,24 @@ def test_limit_leaves_the_small_map_found_near_a_guess() -> None:
     assert check(walk.trace, solution.maps[0], CAUSAL) == ()
 
 
+def test_long_trace_is_guessed_before_clingo_has_all_links() -> None:
+    walk = maze(4, 4, steps=600, seed=1)
+    truth = {state: number for number, state in enumerate(dict.fromkeys(walk.truth))}
+    chart = Chart.of_steps(Log(walk.trace, CAUSAL), len(walk.trace))
+    guess = _labels_of(chart, walk.truth, truth)
+    with (
+        patch.object(pinned, "AT_ONCE", 500),
+        patch.object(small_maps.SmallMaps, "from_beginning", lambda _: iter([guess])),
+        patch.object(name_program.NameProgram, "more_links", side_effect=KeyboardInterrupt),
+        patch.object(name_search, "PATIENCE", 1),
+    ):
+        limited = Search(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"))
+        solution = limited.solution(tuple(limited))
+    assert solution.stopped == "interrupted"
+    assert solution.cost
+    assert solution.cost.dstates <= len(truth)
+
+
 def _labels_of(chart: Chart, states: tuple[object, ...], number: dict[object, int]) -> list[int]:
     labels = [-1] * len(chart.seen)
     for node, state in zip(chart.node_of, states, strict=True):

@@ -158,7 +158,9 @@ class NameSearch:
         if self._may_help and not self._hard and not self._program.pinned.is_long:
             yield from self._small.merged()
         self._hard = True
-        if self._program.has_all_links and self._may_help and not self._had_all_help:
+        # It takes long until clingo has all links of a long trace, so guess before.
+        is_time = self._program.has_all_links or self._program.pinned.is_long
+        if is_time and self._may_help and not self._had_all_help:
             self._had_all_help = True
             yield from self._near_a_guess()
 
