@@ -207,8 +207,8 @@ def test_places_that_fit_after_others_are_merged() -> None:
         {ssh_map.place_of(t) for t in range(drive.first, drive.stop)}
         for drive in drives_of(problem.trace)
     ]
-    assert [len(some) for some in places] == [11, 13]
-    assert len(places[0] & places[1]) >= 10
+    assert [len(some) for some in places] == [13, 13]
+    assert len(places[0] & places[1]) == 11
 
 
 @pytest.mark.slow
