@@ -23,6 +23,7 @@ from typing import Any
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.robot_logs.edges import edges_of
 
+# The middles of the halves of a double door are less than this many metres apart.
 HALF = 1.5
 
 

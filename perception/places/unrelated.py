@@ -22,7 +22,7 @@ import numpy as np
 
 from perception.places.closures import KEPT, TURN, VisitMatch, is_reliable
 from perception.places.matching import Scene, Turned, match
-from perception.places.track import Array, Track, points_turned
+from perception.places.track import Array, Track, points_moved, points_turned
 from perception.places.visits import Visit, patches_of
 from ssh_abduction.data.groups import gathered
 
@@ -191,13 +191,9 @@ def _relations(found: Sequence[VisitMatch], first: Array, last: Array) -> _Frame
     `first` and `last` have the poses of the visits of each drive, (n, 3).
     """
     at, there = first[[one.first for one in found]], last[[one.last for one in found]]
-    shifts = np.array([one.match.shift for one in found]).reshape(-1, 2)
-    cos, sin = np.cos(at[:, 2]), np.sin(at[:, 2])
-    onward = np.column_stack(
-        [cos * shifts[:, 0] - sin * shifts[:, 1], sin * shifts[:, 0] + cos * shifts[:, 1]]
-    )
+    seen = [points_moved(pose, one.match.shift) for pose, one in zip(at, found, strict=True)]
     turns = np.array([one.match.turn for one in found]) + at[:, 2] - there[:, 2]
-    return _FrameMatches(turns, at[:, :2] + onward, there[:, :2])
+    return _FrameMatches(turns, np.array(seen).reshape(-1, 2), there[:, :2])
 
 
 def _largest(found: Sequence[VisitMatch], relations: _FrameMatches) -> list[VisitMatch]:

@@ -141,21 +141,20 @@ class SavedMap:
         here = (
             t for t, s in enumerate(self.map.dstate_at) if number_at(self.map, kind, s) == number
         )
-        first = next(here, None)
+        if (first := next(here, None)) is not None:
+            return kind, step_name(self.drives, first)
         region = next((r for r in self.map.regions or () if r.id == number), None)
-        if first is None and kind == "region" and region is not None:
+        if kind == "region" and region is not None:
             others = {f"region{region_of(self.map.regions, place)}" for place in region.places}
             raise MapError(
                 f"{text}: expected a region to which some step belongs, got {brief(text)}, whose "
                 "places all belong to regions that are smaller or behind a door; name one of "
                 f"{', '.join(sorted(others))}"
             )
-        if first is None:
-            raise MapError(
-                f"{text}: expected a {kind} of the map, got {brief(text)}, but the map has none "
-                "of this number; ssh-abduction show lists them"
-            )
-        return kind, step_name(self.drives, first)
+        raise MapError(
+            f"{text}: expected a {kind} of the map, got {brief(text)}, but the map has none of "
+            "this number; ssh-abduction show lists them"
+        )
 
     def thing_to_name(self, text: str) -> tuple[str, str]:
         """Find what a person names, as `thing`. If it has a name, return the step of this name."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from collections.abc import Set as AbstractSet
-from itertools import product
+from itertools import permutations
 from typing import Any, TypeAlias
 
 import networkx as nx
@@ -221,25 +221,23 @@ class MoveGraph:
 
     def _add_returns(self) -> None:
         """Add the way back of each travel, and turns between all dstates of a place."""
-        dstates, links = self.map.dstates, self.map.links
-        travels = [
-            (dstates[target].place, dstates[source].place, action)
-            for source, action, target in links
-            if None not in (dstates[source].place, dstates[target].place)
-            and dstates[source].place != dstates[target].place
-        ]
-        action = travels[0][2] if len({action for _, _, action in travels}) == 1 else None
-        at: dict[int | None, set[Node]] = {}
-        for place in self.map.places:
-            faced = self._dstates_at(place, "map")
-            at[place] = {*faced, (place, None, None)}
-            for node, aside in product(at[place], faced):
-                if node != aside:
+        at: dict[int, set[Node]] = {}  # the nodes of each place
+        for s in self.map.dstates:
+            if s.place is not None:
+                at.setdefault(s.place, {(s.place, None, None)}).add(s.id)
+        for here in at.values():
+            for node, aside in permutations(here, 2):
+                if isinstance(aside, int):
                     self._imply(node, aside, None)
-        for there, back, _ in travels:
-            assert back is not None
+        travels = []
+        for source, action, target in self.map.links:
+            back, there = self.course(source)[0], self.course(target)[0]
+            if back is not None and there is not None and back != there:
+                travels.append((action, there, back))
+        actions = {action for action, _, _ in travels}
+        for action, there, back in travels:
             for node in at[there]:
-                self._imply(node, (back, None, None), action)
+                self._imply(node, (back, None, None), action if len(actions) == 1 else None)
 
     def _passes_closed(self, source: Node, target: Node) -> bool:
         """Whether a move leaves or enters a place by a gateway that was last seen closed."""
