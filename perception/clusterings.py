@@ -28,20 +28,15 @@ NEIGHBOURS = 3
 
 @dataclass(frozen=True)
 class Tried:
-    """The clusterings that a ViewClusterer tried, and its choice.
+    """The clusterings that a ViewClusterer tried, and its choice."""
 
-    Attributes:
-        k: The chosen number of views.
-        quality: For each number of views k that was tried, M: the gap between clusters divided by
-            their width (`perception.quality.cluster_quality`).
-        trimmed: The same, but with quantiles instead of extremes (`trimmed_quality`).
-        labels: For each k that was tried, the view of each image, (n,).
-    """
-
-    k: int
+    k: int  # the chosen number of views
+    # For each number of views k that was tried, M: the gap between clusters divided by their width
+    # (`perception.quality.cluster_quality`).
     quality: dict[int, float]
+    # The same, but with quantiles instead of extremes (`trimmed_quality`).
     trimmed: dict[int, float]
-    labels: dict[int, NDArray[np.intp]]
+    labels: dict[int, NDArray[np.intp]]  # for each k that was tried, the view of each image, (n,)
 
     @property
     def runner_up(self) -> int | None:

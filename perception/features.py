@@ -43,18 +43,13 @@ class TellingFeatures:
 
     A method gives each feature a share of at least 0. The shares of a method sum to 1, or are all 0
     if no feature helps. The module describes the methods.
-
-    Attributes:
-        margin: (d,) shares by margin.
-        permutation: (d,) shares by permutation.
-        linear: (d,) shares by logistic regression.
-        recognised: Share of images whose nearest other image is of their own dstate, from 0 to 1.
-            At about 0.5 the dstates look the same, and the shares above mean nothing.
     """
 
-    margin: Floats
-    permutation: Floats
-    linear: Floats
+    margin: Floats  # (d,) shares by margin
+    permutation: Floats  # (d,) shares by permutation
+    linear: Floats  # (d,) shares by logistic regression
+    # Share of images whose nearest other image is of their own dstate, from 0 to 1. At about 0.5
+    # the dstates look the same, and the shares above mean nothing.
     recognised: float
 
     @property

@@ -59,22 +59,14 @@ class ImageLikelihood:
 
     Below, the images are the remembered images of the recogniser, in the form in which its last
     estimator compares images (by default, reciprocals of ranges).
-
-    Attributes:
-        recogniser: The fitted PlaceRecogniser, or a pipeline that ends with one.
-        classes: (c,) labels of the places.
-        within: Mean squared distance from an image to the nearest other image of its place.
-        spread: Mean squared distance from an image to the mean of all images.
-        centre: (d,) mean of all images.
-        dimensions: Number of beams that vary independently, from 1 to d; see the module.
     """
 
-    recogniser: Any
-    classes: NDArray[Any]
-    within: float
-    spread: float
-    centre: NDArray[np.float64]
-    dimensions: float
+    recogniser: Any  # the fitted PlaceRecogniser, or a pipeline that ends with one
+    classes: NDArray[Any]  # (c,) labels of the places
+    within: float  # mean squared distance from an image to the nearest other image of its place
+    spread: float  # mean squared distance from an image to the mean of all images
+    centre: NDArray[np.float64]  # (d,) mean of all images
+    dimensions: float  # number of beams that vary independently, from 1 to d; see the module
 
     @classmethod
     def of(cls, recogniser: Any) -> ImageLikelihood:

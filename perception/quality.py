@@ -52,16 +52,11 @@ SEEN, FEW = 6, 2
 
 @dataclass(frozen=True)
 class SpanningTree:
-    """A minimum spanning tree of n images under Euclidean distance.
+    """A minimum spanning tree of n images under Euclidean distance."""
 
-    Attributes:
-        edges: (n - 1, 2) indices of the two images at the ends of each edge, the shortest edge
-            first.
-        lengths: (n - 1,) length of each edge, ascending; 0 between equal images.
-    """
-
+    # (n - 1, 2) indices of the two images at the ends of each edge, the shortest edge first.
     edges: Integers
-    lengths: Floats
+    lengths: Floats  # (n - 1,) length of each edge, ascending; 0 between equal images
 
     @property
     def distinct(self) -> int:

@@ -143,23 +143,15 @@ def cloned(name: str, estimator: Any, *methods: str) -> Any:
 
 @dataclass(frozen=True)
 class LearningCurve:
-    """The recognition rate as a function of the number of images seen.
+    """The recognition rate as a function of the number of images seen."""
 
-    Attributes:
-        sizes: (s,) numbers of images to learn from.
-        mean: (s,) mean share of recognised images over the folds, in [0, 1].
-        lowest: (s,) lowest share over the folds.
-        highest: (s,) highest share over the folds.
-        folds: Number of folds.
-        untested: Labels with a single image. They are not tested, since no image to learn from is
-            left if that image is tested.
-    """
-
-    sizes: tuple[int, ...]
-    mean: tuple[float, ...]
-    lowest: tuple[float, ...]
-    highest: tuple[float, ...]
-    folds: int
+    sizes: tuple[int, ...]  # (s,) numbers of images to learn from
+    mean: tuple[float, ...]  # (s,) mean share of recognised images over the folds, in [0, 1]
+    lowest: tuple[float, ...]  # (s,) lowest share over the folds
+    highest: tuple[float, ...]  # (s,) highest share over the folds
+    folds: int  # number of folds
+    # Labels with a single image. They are not tested, since no image to learn from is left if that
+    # image is tested.
     untested: tuple[Any, ...] = ()
 
 

@@ -27,19 +27,12 @@ DEPTH = 0.25
 
 @dataclass(frozen=True)
 class Opening:
-    """A door as an opening in a wall.
+    """A door as an opening in a wall."""
 
-    Attributes:
-        middle: (x, y) in metres.
-        along: Direction of the wall in radians.
-        width: Width of the opening in metres.
-        depth: Thickness of the wall: metres from the outline of one room to that of the other.
-    """
-
-    middle: tuple[float, float]
-    along: float
-    width: float
-    depth: float
+    middle: tuple[float, float]  # (x, y) in metres
+    along: float  # direction of the wall in radians
+    width: float  # width of the opening in metres
+    depth: float  # thickness of the wall: metres from the outline of one room to that of the other
 
     def frame(self, points: Array) -> Array:
         """Convert points, (n, 2) in metres, to metres along and across the wall, from the middle.
@@ -70,16 +63,11 @@ class Opening:
 
 @dataclass(frozen=True)
 class Building:
-    """A plan with walls and openings.
-
-    Attributes:
-        plan: The floor plan.
-        segments: (n, 4) walls in metres.
-        openings: The opening of each door, in the order of the plan.
-    """
+    """A plan with walls and openings."""
 
     plan: Plan
-    segments: Array = field(repr=False)
+    segments: Array = field(repr=False)  # (n, 4) walls in metres
+    # The opening of each door, in the order of the plan.
     openings: tuple[Opening, ...] = field(repr=False)
 
     @classmethod

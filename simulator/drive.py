@@ -34,30 +34,20 @@ TINY = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class RecordedDrive:
-    """A completed drive.
+    """A completed drive."""
 
-    Attributes:
-        name: Name of the drive.
-        ranges: (n, beams) metres; infinite if the laser saw nothing within its reach.
-        odometry: (n, 3) pose by the odometer at each scan: x and y in metres, heading in radians.
-            It begins at (0, 0, 0).
-        poses: (n, 3) true pose at each scan.
-        times: (n,) seconds since the beginning.
-        metres: Length of the drive.
-        odometer: Noise of the odometry.
-        laser: The scanner that took the scans.
-        truth: True places and poses, as JSON-like data for evaluation only; empty until `judged`
-            adds it.
-    """
-
-    name: str
+    name: str  # name of the drive
+    # (n, beams) metres; infinite if the laser saw nothing within its reach.
     ranges: Array = field(repr=False)
+    # (n, 3) pose by the odometer at each scan: x and y in metres, heading in radians. It begins at
+    # (0, 0, 0).
     odometry: Array = field(repr=False)
-    poses: Array = field(repr=False)
-    times: Array = field(repr=False)
-    metres: float
-    odometer: Odometer
-    laser: Laser
+    poses: Array = field(repr=False)  # (n, 3) true pose at each scan
+    times: Array = field(repr=False)  # (n,) seconds since the beginning
+    metres: float  # length of the drive
+    odometer: Odometer  # noise of the odometry
+    laser: Laser  # the scanner that took the scans
+    # True places and poses, as JSON-like data for evaluation only; empty until `judged` adds it.
     truth: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
@@ -95,22 +85,16 @@ class RecordedDrive:
 
 @dataclass
 class Recorder:
-    """Records the pose of a robot after each motion, and when a scan is due.
+    """Records the pose of a robot after each motion, and when a scan is due."""
 
-    Attributes:
-        every: Metres between scans.
-        turn: Radians between scans if the robot turns.
-        poses: Pose after each motion, or after each part of a long motion.
-        scans: For each world (each arrangement of the clutter), the indices of poses at which a
-            scan is taken.
-        metres: Distance driven so far.
-    """
-
-    every: float = EVERY
-    turn: float = math.radians(10)
+    every: float = EVERY  # metres between scans
+    turn: float = math.radians(10)  # radians between scans if the robot turns
+    # Pose after each motion, or after each part of a long motion.
     poses: list[Pose] = field(default_factory=list)
+    # For each world (each arrangement of the clutter), the indices of poses at which a scan is
+    # taken.
     scans: list[tuple[World, list[int]]] = field(default_factory=list)
-    metres: float = 0.0
+    metres: float = 0.0  # distance driven so far
     _seconds: list[float] = field(default_factory=list)  # Time of each pose.
     _way: float = 0.0  # Metres since the last scan.
     _turned: float = 0.0

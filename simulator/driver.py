@@ -63,24 +63,16 @@ class Tolerance:
 
 @dataclass
 class Driver:
-    """A robot in a world, with its laser, as control laws use it.
+    """A robot in a world, with its laser, as control laws use it."""
 
-    Attributes:
-        world: The world, with the clutter as it is on this tour.
-        robot: The robot, with its true pose and its odometry.
-        laser: The robot's laser.
-        rng: Source of the noise of the laser.
-        tolerance: Largest errors with which hill-climbing ends.
-        on_travel: Function that is called with the driver after each motion of a travel.
-        recorder: Records the pose after each motion, for a log; None without a log.
-    """
-
-    world: World
-    robot: SimulatedRobot
+    world: World  # the world, with the clutter as it is on this tour
+    robot: SimulatedRobot  # the robot, with its true pose and its odometry
     laser: Laser
-    rng: np.random.Generator
-    tolerance: Tolerance = Tolerance()
+    rng: np.random.Generator  # source of the noise of the laser
+    tolerance: Tolerance = Tolerance()  # largest errors with which hill-climbing ends
+    # Function that is called with the driver after each motion of a travel.
     on_travel: Callable[[Driver], None] | None = None
+    # Records the pose after each motion, for a log; None without a log.
     recorder: Recorder | None = None
 
     def look(self, images: int = 1) -> Array:

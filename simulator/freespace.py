@@ -43,19 +43,13 @@ SMOOTH = 0.3
 
 @dataclass
 class FreeSpace:
-    """A grid of cells with walls and obstacles. Row 0 is at the bottom.
+    """A grid of cells with walls and obstacles. Row 0 is at the bottom."""
 
-    Attributes:
-        corner: (x, y) of the lower left corner in metres.
-        occupied: (rows, columns) mask of the cells with walls or obstacles.
-        radius: Radius of the robot in metres.
-        off: (rows, columns) distance in metres to the nearest wall. Obstacles that are marked later
-            do not count.
-    """
-
-    corner: Point
-    occupied: Mask = field(repr=False)
-    radius: float
+    corner: Point  # (x, y) of the lower left corner in metres
+    occupied: Mask = field(repr=False)  # (rows, columns) mask of the cells with walls or obstacles
+    radius: float  # radius of the robot in metres
+    # (rows, columns) distance in metres to the nearest wall. Obstacles that are marked later do not
+    # count.
     off: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -134,17 +128,12 @@ class FreeSpace:
 
 @dataclass(frozen=True)
 class FreeRectangle:
-    """A rectangular part of free space.
+    """A rectangular part of free space."""
 
-    Attributes:
-        corner: (x, y) of the lower left corner in metres.
-        clearance: (rows, columns) distance in metres to the nearest occupied cell.
-        least: Smallest distance of the robot's middle from occupied cells, in metres.
-    """
-
-    corner: Point
+    corner: Point  # (x, y) of the lower left corner in metres
+    # (rows, columns) distance in metres to the nearest occupied cell.
     clearance: Array = field(repr=False)
-    least: float
+    least: float  # smallest distance of the robot's middle from occupied cells, in metres
 
     def way(self, start: Point, goal: Point) -> Array | None:
         """Find a route between points (x, y): short, and ROOM metres from walls if possible.

@@ -52,16 +52,11 @@ ACTIONS = {
 
 @dataclass
 class Here:
-    """The place where the robot is.
+    """The place where the robot is."""
 
-    Attributes:
-        ranges: (360,) panorama: the range at each degree, in metres.
-        place: Streets and fixed point that the panorama shows.
-        heading: Heading of the robot relative to the panorama, in radians counterclockwise.
-    """
-
-    ranges: Array
-    place: Place
+    ranges: Array  # (360,) panorama: the range at each degree, in metres
+    place: Place  # streets and fixed point that the panorama shows
+    # Heading of the robot relative to the panorama, in radians counterclockwise.
     heading: float = 0.0
 
 
@@ -70,12 +65,9 @@ class Pilot:
 
     Args:
         driver: Moves the robot, and takes its laser images.
-
-    Attributes:
-        here: The place where the robot is; set by `begin`.
     """
 
-    here: Here
+    here: Here  # the place where the robot is; set by `begin`
 
     def __init__(self, driver: Driver) -> None:
         self.driver = driver

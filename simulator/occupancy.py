@@ -52,27 +52,20 @@ TRUTHS = {
 
 @dataclass(frozen=True, slots=True)
 class MapFile:
-    """The fields of the YAML file of an occupancy map.
+    """The fields of the YAML file of an occupancy map."""
 
-    Attributes:
-        image: Path of the image.
-        resolution: Metres a pixel.
-        origin: (x, y) of the lower left corner of the image in metres, and its counterclockwise
-            rotation in radians.
-        negate: Whether white pixels are occupied, instead of black ones.
-        occupied_thresh: A pixel is occupied if it is darker than this, from 0 (white) to 1 (black);
-            with `negate`, if it is brighter.
-        free_thresh: A pixel is free if it is brighter than this, on the same scale.
-        mode: Rule that turns pixels into cells: "trinary", "scale" or "raw".
-    """
-
-    image: Path
-    resolution: float
+    image: Path  # path of the image
+    resolution: float  # metres a pixel
+    # (x, y) of the lower left corner of the image in metres, and its counterclockwise rotation in
+    # radians.
     origin: tuple[float, float, float]
-    negate: bool = False
+    negate: bool = False  # whether white pixels are occupied, instead of black ones
+    # A pixel is occupied if it is darker than this, from 0 (white) to 1 (black); with `negate`, if
+    # it is brighter.
     occupied_thresh: float = OCCUPIED_THRESH
+    # A pixel is free if it is brighter than this, on the same scale.
     free_thresh: float = FREE_THRESH
-    mode: Mode = "trinary"
+    mode: Mode = "trinary"  # rule that turns pixels into cells: "trinary", "scale" or "raw"
 
 
 def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:

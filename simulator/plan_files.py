@@ -29,32 +29,21 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 @dataclass(frozen=True)
 class Room:
-    """A room.
+    """A room."""
 
-    Attributes:
-        name: Name in the file, which no other room has.
-        use: Purpose of the room; empty if the file does not say it.
-        centre: (x, y) of the middle in metres.
-        polygon: (x, y) of each corner in metres; empty if unknown.
-    """
-
-    name: str
-    use: str
-    centre: Point
+    name: str  # name in the file, which no other room has
+    use: str  # purpose of the room; empty if the file does not say it
+    centre: Point  # (x, y) of the middle in metres
+    # (x, y) of each corner in metres; empty if unknown.
     polygon: tuple[Point, ...] = field(default=(), repr=False)
 
 
 @dataclass(frozen=True)
 class Door:
-    """A door between two rooms.
+    """A door between two rooms."""
 
-    Attributes:
-        rooms: Indices of the two rooms in the plan.
-        position: (x, y) of the middle in metres.
-    """
-
-    rooms: tuple[int, int]
-    position: Point
+    rooms: tuple[int, int]  # indices of the two rooms in the plan
+    position: Point  # (x, y) of the middle in metres
 
 
 def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tuple[Door, ...]]:

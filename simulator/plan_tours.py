@@ -30,16 +30,11 @@ MOST_STEPS = 10_000_000
 
 @dataclass(frozen=True)
 class Stand:
-    """The distinctive state of the robot: a room and a heading.
+    """The distinctive state of the robot: a room and a heading."""
 
-    Attributes:
-        room: Index of the room.
-        gateway: Index of the gateway of the room that the robot faces or has behind it.
-        faces: Whether the robot faces the gateway. Otherwise, the gateway is behind it.
-    """
-
-    room: int
-    gateway: int
+    room: int  # index of the room
+    gateway: int  # index of the gateway of the room that the robot faces or has behind it
+    # Whether the robot faces the gateway. Otherwise, the gateway is behind it.
     faces: bool = True
 
 

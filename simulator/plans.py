@@ -35,18 +35,12 @@ APART = 3.0
 
 @dataclass(frozen=True)
 class RoomGateway:
-    """A door as seen from the middle of a room.
+    """A door as seen from the middle of a room."""
 
-    Attributes:
-        door: Index of the door in the plan.
-        to: Index of the room behind the door.
-        bearing: Direction from the middle of the room, in degrees clockwise from north (+y).
-        opposite: Index of the opposite gateway among those of the same room; None without one.
-    """
-
-    door: int
-    to: int
-    bearing: float
+    door: int  # index of the door in the plan
+    to: int  # index of the room behind the door
+    bearing: float  # direction from the middle of the room, in degrees clockwise from north (+y)
+    # Index of the opposite gateway among those of the same room; None without one.
     opposite: int | None = None
 
 

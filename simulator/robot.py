@@ -72,19 +72,13 @@ class SimulatedRobot:
         body: Errors of its motions and its odometry.
         pose: Start pose: x and y in metres, heading in radians.
         rng: Source of the errors.
-
-    Attributes:
-        body: Errors of its motions and its odometry.
-        pose: True pose.
-        driven: Metres driven, forward or back, by odometry.
-        odometry: Pose by odometry, which starts at (0, 0, 0).
     """
 
     def __init__(self, body: Body, pose: Pose, rng: np.random.Generator) -> None:
-        self.body = body
-        self.pose = pose
-        self.driven = 0.0
-        self.odometry: Pose = (0.0, 0.0, 0.0)
+        self.body = body  # errors of its motions and its odometry
+        self.pose = pose  # the true one
+        self.driven = 0.0  # metres driven, forward or back, by odometry
+        self.odometry: Pose = (0.0, 0.0, 0.0)  # pose by odometry, which starts at (0, 0, 0)
         self._rng = rng
         self._reported = self.odometry  # The odometry at the last report.
         # Covariance of odometry since the last report, in the start frame.

@@ -155,17 +155,12 @@ def _line(start: Point, goal: Point) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """A round through rooms, which ends where it began.
+    """A round through rooms, which ends where it began."""
 
-    Attributes:
-        way: (n, 2) points of the route in metres.
-        rooms: (n,) index of the room of each point of the route.
-        doors: For each passage through a door, in order: the index in `way` of the point in the
-            door, and the index of the door.
-    """
-
-    way: Array = field(repr=False)
-    rooms: NDArray[np.intp] = field(repr=False)
+    way: Array = field(repr=False)  # (n, 2) points of the route in metres
+    rooms: NDArray[np.intp] = field(repr=False)  # (n,) index of the room of each point of the route
+    # For each passage through a door, in order: the index in `way` of the point in the door, and
+    # the index of the door.
     doors: tuple[tuple[int, int], ...]
 
     @classmethod

@@ -26,23 +26,14 @@ AHEAD_AND_LEFT = np.stack([np.cos(BEARINGS), np.sin(BEARINGS)], axis=1)
 
 @dataclass(frozen=True)
 class WallPositions:
-    """Positions of the walls in metres and radians. None means that no such wall is visible.
+    """Positions of the walls in metres and radians. None means that no such wall is visible."""
 
-    Attributes:
-        tilt: Heading of the robot relative to the axis of the walls, counterclockwise.
-        front: Distance to the wall ahead.
-        left: Distance to the wall on the left.
-        right: Distance to the wall on the right.
-        left_street: Distance ahead to the far wall of a street that opens to the left.
-        right_street: Distance ahead to the far wall of a street that opens to the right.
-    """
-
-    tilt: float
-    front: float | None
-    left: float | None
-    right: float | None
-    left_street: float | None
-    right_street: float | None
+    tilt: float  # heading of the robot relative to the axis of the walls, counterclockwise
+    front: float | None  # distance to the wall ahead
+    left: float | None  # distance to the wall on the left
+    right: float | None  # distance to the wall on the right
+    left_street: float | None  # distance ahead to the far wall of a street that opens to the left
+    right_street: float | None  # distance ahead to the far wall of a street that opens to the right
 
     def to_go(self, reach: float, streets: bool = True) -> float | None:
         """Measure how far ahead the fixed point of the next place is, in metres.

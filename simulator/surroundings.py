@@ -51,14 +51,10 @@ class Wall:
 
     Points and directions are complex numbers: metres ahead of the robot (real part), and metres to
     its left (imaginary part).
-
-    Attributes:
-        start: The end that the robot sees first, counterclockwise.
-        end: The other end.
     """
 
-    start: complex
-    end: complex
+    start: complex  # the end that the robot sees first, counterclockwise
+    end: complex  # the other end
 
     @property
     def way(self) -> complex:
@@ -68,18 +64,12 @@ class Wall:
 
 @dataclass(frozen=True)
 class Street:
-    """A street that leads away from the robot.
+    """A street that leads away from the robot."""
 
-    Attributes:
-        bearing: Direction in radians, counterclockwise from straight ahead.
-        middle: Point of the street's midline that is nearest to the robot, as a complex number in
-            metres.
-        length: Metres for which walls are visible on both sides.
-    """
-
-    bearing: float
+    bearing: float  # direction in radians, counterclockwise from straight ahead
+    # Point of the street's midline that is nearest to the robot, as a complex number in metres.
     middle: complex
-    length: float
+    length: float  # metres for which walls are visible on both sides
 
     @property
     def offset(self) -> float:
@@ -178,15 +168,11 @@ def _between(
 
 @dataclass(frozen=True)
 class Place:
-    """A place as a panorama shows it.
+    """A place as a panorama shows it."""
 
-    Attributes:
-        streets: Streets that lead away, clockwise from straight behind the robot.
-        fixed: Where hill-climbing would stop, as a complex number: metres ahead, and metres to the
-            left. None where the robot just passes: a street goes straight on, or no wall ends it.
-    """
-
-    streets: tuple[Street, ...]
+    streets: tuple[Street, ...]  # streets that lead away, clockwise from straight behind the robot
+    # Where hill-climbing would stop, as a complex number: metres ahead, and metres to the left.
+    # None where the robot just passes: a street goes straight on, or no wall ends it.
     fixed: complex | None
 
     @classmethod
@@ -274,13 +260,10 @@ class Panorama:
 
     Args:
         image: The first image, (180,) metres.
-
-    Attributes:
-        headings: Heading of the robot at each image in radians, 0 at the first.
     """
 
     def __init__(self, image: Array) -> None:
-        self.headings = [0.0]
+        self.headings = [0.0]  # heading of the robot at each image in radians, 0 at the first
         self._rows = [_around(image, 0.0)]
         self._first = self._rows[0]  # For each degree, the first range that was seen.
 

@@ -33,19 +33,12 @@ def noise_of(log: OdometryLog, world: World, body: Body, tolerance: Tolerance | 
 
 @dataclass
 class Eye:
-    """Makes the logged image of a step: ranges of the laser, or a panorama.
+    """Makes the logged image of a step: ranges of the laser, or a panorama."""
 
-    Attributes:
-        camera: The camera; None to log ranges.
-        walls: Number of segments of the world without clutter.
-        rng: Source of noise of the camera.
-        actions: Number of actions of the whole drive. The hour of the day follows from the share
-            that is done.
-    """
-
-    camera: Camera | None
-    walls: int
-    rng: np.random.Generator
+    camera: Camera | None  # the camera; None to log ranges
+    walls: int  # number of segments of the world without clutter
+    rng: np.random.Generator  # source of noise of the camera
+    # Number of actions of the whole drive. The hour of the day follows from the share that is done.
     actions: int
 
     def image(self, driver: Driver, ranges: Array, done: int) -> tuple[float, ...]:
@@ -65,17 +58,12 @@ class Eye:
 
 @dataclass
 class OdometryLog:
-    """Collects the odometry between the logged steps.
+    """Collects the odometry between the logged steps."""
 
-    Attributes:
-        robot: The robot whose odometry is collected.
-        reports: Motion by odometry from each step to the next.
-        begun: Whether a step was logged already on this floor.
-    """
-
-    robot: SimulatedRobot
+    robot: SimulatedRobot  # whose odometry is collected
+    # Motion by odometry from each step to the next.
     reports: list[Report] = field(default_factory=list)
-    begun: bool = False
+    begun: bool = False  # whether a step was logged already on this floor
 
     def displacement(self) -> Displacement | None:
         """Return metres ahead and to the left and radians turned since the last step by odometry.

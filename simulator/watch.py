@@ -34,17 +34,11 @@ NOISY, BLURRED = 0.1, 0.03
 
 @dataclass
 class DriveWatch:
-    """Checks the drive of a robot. Its methods are used as `with` blocks around motions.
+    """Checks the drive of a robot. Its methods are used as `with` blocks around motions."""
 
-    Attributes:
-        world: The world as in its file.
-        driver: The robot that is watched.
-        tours: Number of tours that are driven.
-    """
-
-    world: World
-    driver: Driver
-    tours: int
+    world: World  # the world as in its file
+    driver: Driver  # of the robot that is watched
+    tours: int  # number of tours that are driven
     _home: Pose | None = field(default=None, init=False)
 
     @contextmanager

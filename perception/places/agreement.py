@@ -62,22 +62,15 @@ LEAST_CHANGE, CLOSER_TURNED, CLOSER_WIDENED = 10, 0.75, 0.85
 
 @dataclass(frozen=True)
 class Agreement:
-    """Comparison of the trajectories by scan matching and by odometry.
+    """Comparison of the trajectories by scan matching and by odometry."""
 
-    Attributes:
-        odometry: Metres driven by odometry, over all stretches.
-        scans: Metres driven by scan matching, over the same stretches.
-        angle: Direction of motion by scans minus that by odometry; radians to the left.
-        turning: Median ratio of turns by scans to turns by odometry; None if there are few turns.
-        parted: Number of stretches in which the two trajectories diverge.
-        of: Number of stretches that are compared for `parted`. The robot drives in each of them.
-    """
-
-    odometry: float
-    scans: float
-    angle: float = 0.0
+    odometry: float  # metres driven by odometry, over all stretches
+    scans: float  # metres driven by scan matching, over the same stretches
+    angle: float = 0.0  # direction of motion by scans minus that by odometry; radians to the left
+    # Median ratio of turns by scans to turns by odometry; None if there are few turns.
     turning: float | None = None
-    parted: int = 0
+    parted: int = 0  # number of stretches in which the two trajectories diverge
+    # Number of stretches that are compared for `parted`. The robot drives in each of them.
     of: int = 0
 
     @property

@@ -42,17 +42,11 @@ MATCHES, SCENES = 32, 128
 
 @dataclass(frozen=True, eq=False)
 class VisitMatch:
-    """A reliable match of two visits.
+    """A reliable match of two visits."""
 
-    Attributes:
-        first: Index of the earlier visit.
-        last: Index of the later visit.
-        match: The pose of the middle of the later place relative to the middle of the earlier
-            place.
-    """
-
-    first: int
-    last: int
+    first: int  # index of the earlier visit
+    last: int  # index of the later visit
+    # The pose of the middle of the later place relative to the middle of the earlier place.
     match: Match
 
 
@@ -108,16 +102,12 @@ def is_reliable(found: Match) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Gate:
-    """The relative poses that the track allows for two visits.
+    """The relative poses that the track allows for two visits."""
 
-    Attributes:
-        poses: (d, 3) x, y and rotation of the later visit in the frame of the earlier one, for each
-            of the d drifts of the heading that are tried.
-        covariance: (3, 3) covariance of these poses by the track, times INFLATED.
-    """
-
+    # (d, 3) x, y and rotation of the later visit in the frame of the earlier one, for each of the d
+    # drifts of the heading that are tried.
     poses: Array
-    covariance: Array
+    covariance: Array  # (3, 3) covariance of these poses by the track, times INFLATED
 
     @property
     def turns(self) -> range:

@@ -101,36 +101,25 @@ def _track_of(log: RobotLog, steps: Unknown) -> Track:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Followed:
-    """A scan with its pose on the track.
+    """A scan with its pose on the track."""
 
-    Attributes:
-        scan: The scan as it was logged.
-        pose: x, y in metres and heading in radians, in the frame of the first scan.
-        covariance: (3, 3) covariance of the motion from the previous scan, in the frame of the
-            robot at the previous scan.
-        share: Share of the points of the scan on known walls; NaN if its beams meet nothing.
-        cut: Whether the motion from the previous scan is unknown.
-        broken: Whether the robot may be anywhere, so that a new trajectory begins.
-    """
-
-    scan: Scan
-    pose: Pose
+    scan: Scan  # as it was logged
+    pose: Pose  # x, y in metres and heading in radians, in the frame of the first scan
+    # (3, 3) covariance of the motion from the previous scan, in the frame of the robot at the
+    # previous scan.
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    # Share of the points of the scan on known walls; NaN if its beams meet nothing.
     share: float = 1.0
-    cut: bool = False
-    broken: bool = False
+    cut: bool = False  # whether the motion from the previous scan is unknown
+    broken: bool = False  # whether the robot may be anywhere, so that a new trajectory begins
 
 
 class GrowingTrack:
-    """A track to which scans are added. Each needs about 100 bytes.
-
-    Attributes:
-        cuts: Indices of the scans before which the motion is unknown, so far.
-    """
+    """A track to which scans are added. Each needs about 100 bytes."""
 
     def __init__(self) -> None:
         """Start before the first scan."""
-        self.cuts: list[int] = []
+        self.cuts: list[int] = []  # indices of the scans before which the motion is unknown, so far
         self._breaks: list[int] = []
         self._rows = array("d")  # pose, covariance and share of each scan
 
@@ -189,23 +178,14 @@ def poses_of_scans(
 
 @dataclass(frozen=True, eq=False)
 class _ScanMotion:
-    """A motion from one scan to the next.
+    """A motion from one scan to the next."""
 
-    Attributes:
-        scan: The next scan.
-        seen: The surfaces that it shows.
-        recent: The surfaces in previous scans, in the frame of the track.
-        last: Pose of the previous scan.
-        onward: The motion by odometry.
-        before: The motion to the previous scan.
-    """
-
-    scan: Scan
-    seen: Surfaces
-    recent: deque[Surfaces]
-    last: Pose
-    onward: Pose
-    before: Pose
+    scan: Scan  # the next scan
+    seen: Surfaces  # the surfaces that it shows
+    recent: deque[Surfaces]  # the surfaces in previous scans, in the frame of the track
+    last: Pose  # pose of the previous scan
+    onward: Pose  # the motion by odometry
+    before: Pose  # the motion to the previous scan
 
     def judged(self, doubt: Doubt) -> Followed:
         """Match the scan: with the odometry if it can be trusted, otherwise without."""

@@ -77,27 +77,18 @@ VOLUME = math.log(4 / 3 * math.pi * (INFLATED * GATE) ** 1.5)
 
 @dataclass(frozen=True, eq=False)
 class Imported:
-    """Result of `import_log`.
+    """Result of `import_log`."""
 
-    Attributes:
-        trace: One step for each distinctive state that the robot passed, with view, image, star
-            (the exits as directions) and displacement from the previous step.
-        track: Trajectory of the robot.
-        width: Width of the robot in metres.
-        visits: Stays at distinctive places, in order.
-        seconds: Processor time in seconds, by stage: track, places, trace, views.
-        notes: Sentences on suspicious features of the odometry and the track.
-        starts: Scans, besides the first one, at which a drive starts.
-        poses: The poses of the visits, fitted to the closures, as `fitted_poses` returns them.
-    """
-
+    # One step for each distinctive state that the robot passed, with view, image, star (the exits
+    # as directions) and displacement from the previous step.
     trace: Trace
-    track: Track
-    width: float
-    visits: tuple[Visit, ...]
-    seconds: Mapping[str, float]
-    notes: tuple[str, ...] = ()
-    starts: tuple[int, ...] = ()
+    track: Track  # trajectory of the robot
+    width: float  # width of the robot in metres
+    visits: tuple[Visit, ...]  # stays at distinctive places, in order
+    seconds: Mapping[str, float]  # processor time in seconds, by stage: track, places, trace, views
+    notes: tuple[str, ...] = ()  # sentences on suspicious features of the odometry and the track
+    starts: tuple[int, ...] = ()  # scans, besides the first one, at which a drive starts
+    # The poses of the visits, fitted to the closures, as `fitted_poses` returns them.
     poses: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 

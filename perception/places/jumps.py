@@ -383,15 +383,11 @@ def stands_still(log: RobotLog) -> NDArray[np.bool_]:
 
 
 class StandstillCheck:
-    """Notices whether the robot moves while its odometer stands still.
-
-    Attributes:
-        moved: Whether the robot moved in this way.
-    """
+    """Notices whether the robot moves while its odometer stands still."""
 
     def __init__(self) -> None:
         """Start before the first scan."""
-        self.moved = False
+        self.moved = False  # whether the robot moved in this way
         self._first: Scan | None = None  # of those at one pose
 
     def add(self, scan: Scan) -> None:

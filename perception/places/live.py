@@ -158,15 +158,12 @@ class Teller:
 
     Args:
         tell: A function that gets each note.
-
-    Attributes:
-        notes: The notes so far.
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
         """Start without any note."""
         self._tell = tell
-        self.notes: list[str] = []
+        self.notes: list[str] = []  # the notes so far
         self._kinds: set[str] = set()
 
     def __call__(self, notes: Iterable[str]) -> None:

@@ -43,19 +43,13 @@ class Patch:
     """A square section of a local map; masks have the shape (rows, columns).
 
     Rows count along x and columns along y of the frame of the track.
-
-    Attributes:
-        free: Mask of cells that were seen to be free.
-        occupied: Mask of cells with an obstacle. Cells that are neither free nor occupied are
-            unobserved.
-        trail: Mask of cells that the robot drove over within the window.
-        corner: (x, y) centre of cell (0, 0) in metres, in the frame of the track.
     """
 
-    free: Bools
+    free: Bools  # mask of cells that were seen to be free
+    # Mask of cells with an obstacle. Cells that are neither free nor occupied are unobserved.
     occupied: Bools
-    trail: Bools
-    corner: Array
+    trail: Bools  # mask of cells that the robot drove over within the window
+    corner: Array  # (x, y) centre of cell (0, 0) in metres, in the frame of the track
 
     def position(self, cell: Array | Cell) -> Array:
         """Compute the centre (x, y) of a cell in metres, in the frame of the track."""
@@ -64,17 +58,11 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class PackedPatch:
-    """The free and the occupied cells of a patch, in a bit each.
+    """The free and the occupied cells of a patch, in a bit each."""
 
-    Attributes:
-        shape: Rows and columns.
-        bits: (2, …) the packed masks.
-        corner: (x, y) centre of cell (0, 0) in metres, in the frame of the track.
-    """
-
-    shape: tuple[int, ...]
-    bits: NDArray[np.uint8]
-    corner: Array
+    shape: tuple[int, ...]  # rows and columns
+    bits: NDArray[np.uint8]  # (2, …) the packed masks
+    corner: Array  # (x, y) centre of cell (0, 0) in metres, in the frame of the track
 
     @staticmethod
     def of(patch: Patch) -> PackedPatch:

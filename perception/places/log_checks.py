@@ -109,15 +109,11 @@ def describe_feet(log: RobotLog) -> list[str]:
 
 
 class StuckLaser:
-    """Notices whether the laser repeats one scan while the robot drives on.
-
-    Attributes:
-        notes: A note on the first such stretch, if there is one.
-    """
+    """Notices whether the laser repeats one scan while the robot drives on."""
 
     def __init__(self) -> None:
         """Start before the first scan."""
-        self.notes: list[str] = []
+        self.notes: list[str] = []  # a note on the first such stretch, if there is one
         self._last: Scan | None = None
         self._metres = 0.0
 

@@ -81,38 +81,25 @@ _SHARP, _BLURRED = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """How the second of two places lies relative to the first.
+    """How the second of two places lies relative to the first."""
 
-    Attributes:
-        score: Mean agreement of the walls, at most 1.
-        turn: Rotation from the axes of the second map to those of the first, in radians.
-        shift: (x, y) of the second middle relative to the first, in metres, by the axes of the
-            first map.
-        mutual: Area that both maps observed, as a share of the smaller one.
-        spread: Standard deviation of the shift over all shifts and turns, in metres.
-    """
-
-    score: float
-    turn: float
+    score: float  # mean agreement of the walls, at most 1
+    turn: float  # rotation from the axes of the second map to those of the first, in radians
+    # (x, y) of the second middle relative to the first, in metres, by the axes of the first map.
     shift: Array
-    mutual: float
-    spread: float
+    mutual: float  # area that both maps observed, as a share of the smaller one
+    spread: float  # standard deviation of the shift over all shifts and turns, in metres
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The local map around the middle of a place, prepared for matching.
+    """The local map around the middle of a place, prepared for matching."""
 
-    Attributes:
-        walls: (m, 2) wall points in metres, relative to the middle.
-        codes: For each cell, twice the squared distance to the nearest wall in cells, plus 1 if
-            the cell was observed. A scene with only these small numbers needs little memory.
-        shift: The middle in metres, relative to the middle of the cells.
-    """
-
-    walls: Array
+    walls: Array  # (m, 2) wall points in metres, relative to the middle
+    # For each cell, twice the squared distance to the nearest wall in cells, plus 1 if the cell was
+    # observed. A scene with only these small numbers needs little memory.
     codes: NDArray[np.uint16]
-    shift: Array
+    shift: Array  # the middle in metres, relative to the middle of the cells
 
     @staticmethod
     def of(patch: Patch | PackedPatch, middle: Array) -> Scene:
@@ -177,17 +164,12 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """A scene in several rotations.
+    """A scene in several rotations."""
 
-    Attributes:
-        scene: The scene without rotation.
-        turns: The rotations in radians, n.
-        spectra: The transforms of the wall points, the blurred walls and the observed cells:
-            (3, n, SIZE, SIZE // 2 + 1).
-    """
-
-    scene: Scene
-    turns: Sequence[float]
+    scene: Scene  # without rotation
+    turns: Sequence[float]  # the rotations in radians, n
+    # The transforms of the wall points, the blurred walls and the observed cells: (3, n, SIZE, SIZE
+    # // 2 + 1).
     spectra: _Spectra
 
     @staticmethod

@@ -90,21 +90,13 @@ def with_partings(
 
 @dataclass(frozen=True, eq=False)
 class _Alignment:
-    """How the trajectory at a visit lies relative to the trajectory at an earlier one.
+    """How the trajectory at a visit lies relative to the trajectory at an earlier one."""
 
-    Attributes:
-        first: Metres driven up to the earlier visit.
-        last: Metres driven up to the later visit.
-        turn: Rotation from the axes at the later visit to those at the earlier one, in radians.
-        here: (x, y) of a point by the earlier visit, in metres.
-        there: (x, y) of the same point by the later visit.
-    """
-
-    first: float
-    last: float
-    turn: float
-    here: Array
-    there: Array
+    first: float  # metres driven up to the earlier visit
+    last: float  # metres driven up to the later visit
+    turn: float  # rotation from the axes at the later visit to those at the earlier one, in radians
+    here: Array  # (x, y) of a point by the earlier visit, in metres
+    there: Array  # (x, y) of the same point by the later visit
 
     @property
     def reverse(self) -> _Alignment:

@@ -60,17 +60,11 @@ TURN = math.radians(45)
 
 @dataclass(frozen=True, eq=False)
 class Junction:
-    """A point of a local map where ways part, or where the only way bends.
+    """A point of a local map where ways part, or where the only way bends."""
 
-    Attributes:
-        middle: (x, y) in metres, in the frame of the track.
-        radius: Distance from the middle to the nearest obstacle, in metres.
-        branches: (n, 2) x and y of points along each way, beginning in the disc.
-    """
-
-    middle: Array
-    radius: float
-    branches: tuple[Array, ...]
+    middle: Array  # (x, y) in metres, in the frame of the track
+    radius: float  # distance from the middle to the nearest obstacle, in metres
+    branches: tuple[Array, ...]  # (n, 2) x and y of points along each way, beginning in the disc
 
 
 def junctions(patch: Patch, room: float) -> list[Junction]:

@@ -32,17 +32,11 @@ _STEPS = sorted(
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A junction or an end of the lines of a skeleton.
+    """A junction or an end of the lines of a skeleton."""
 
-    Attributes:
-        at: Row and column: (2,) cells.
-        radius: Distance to the nearest cell outside of the mask, in cells.
-        cut: Whether the line ends because the map ends there, so that it may lead on.
-    """
-
-    at: Array
-    radius: float
-    cut: bool = False
+    at: Array  # row and column: (2,) cells
+    radius: float  # distance to the nearest cell outside of the mask, in cells
+    cut: bool = False  # whether the line ends because the map ends there, so that it may lead on
 
     @property
     def cell(self) -> tuple[int, int]:
@@ -53,15 +47,10 @@ class Node:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A line between two nodes.
+    """A line between two nodes."""
 
-    Attributes:
-        ends: The numbers of the two nodes; equal for a loop.
-        cells: (n, 2) rows and columns along the line, from the first node to the second.
-    """
-
-    ends: tuple[int, int]
-    cells: Array
+    ends: tuple[int, int]  # the numbers of the two nodes; equal for a loop
+    cells: Array  # (n, 2) rows and columns along the line, from the first node to the second
 
     @cached_property
     def length(self) -> float:
@@ -80,15 +69,10 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """The lines of a skeleton.
+    """The lines of a skeleton."""
 
-    Attributes:
-        nodes: A dict from numbers to nodes.
-        edges: Edges in any order.
-    """
-
-    nodes: dict[int, Node]
-    edges: list[Edge]
+    nodes: dict[int, Node]  # a dict from numbers to nodes
+    edges: list[Edge]  # edges in any order
 
     @property
     def degrees(self) -> Counter[int]:

@@ -31,15 +31,10 @@ AHEAD, SIDEWAYS, LEAST_WAY = 0.9, 0.5, 10.0
 
 @dataclass(frozen=True)
 class Units:
-    """The units of odometry.
+    """The units of odometry."""
 
-    Attributes:
-        count: How many units of length make a metre.
-        degrees: Whether headings are in degrees.
-    """
-
-    count: float = 1.0
-    degrees: bool = False
+    count: float = 1.0  # how many units of length make a metre
+    degrees: bool = False  # whether headings are in degrees
 
     def converted(self, scan: Scan) -> Scan:
         """Copy a scan, with its odometry in metres and radians."""

@@ -31,15 +31,10 @@ BEGIN, END, SHRINK, ROUNDS = 1.0, 0.25, 0.75, 12
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Points on smooth surfaces.
+    """Points on smooth surfaces."""
 
-    Attributes:
-        points: (m, 2) metres.
-        normals: (m, 2) unit normals.
-    """
-
-    points: Array
-    normals: Array
+    points: Array  # (m, 2) metres
+    normals: Array  # (m, 2) unit normals
 
     def __len__(self) -> int:
         """The number of points."""

@@ -37,20 +37,14 @@ REINDEX = "index it again (rosbag reindex, ros2 bag reindex, mcap recover), or r
 
 @dataclass
 class Files:
-    """The open files of one drive.
+    """The open files of one drive."""
 
-    Attributes:
-        format: `ros1`, `ros2` or `mcap`.
-        readers: A reader for each part of the drive, in order: one of rosbags, or a `Salvage`.
-        notes: Sentences about the files that a user should know, such as that a part is missing.
-        folder: A temporary folder for links to the files, and for what is unpacked.
-        stack: It closes the readers.
-    """
-
-    format: str
-    folder: Path
-    stack: ExitStack
+    format: str  # `ros1`, `ros2` or `mcap`
+    folder: Path  # a temporary folder for links to the files, and for what is unpacked
+    stack: ExitStack  # it closes the readers
+    # A reader for each part of the drive, in order: one of rosbags, or a `Salvage`.
     readers: list[Any] = field(default_factory=list)
+    # Sentences about the files that a user should know, such as that a part is missing.
     notes: list[str] = field(default_factory=list)
 
     def open_folder(self, path: Path) -> None:

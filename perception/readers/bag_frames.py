@@ -21,24 +21,15 @@ FIXED = (0.01, 0.01)
 
 @dataclass
 class FrameTransform:
-    """The transform from a parent frame to a frame, which is the pose of the frame in its parent.
+    """The transform from a parent frame to a frame: the pose of the frame in its parent."""
 
-    Attributes:
-        parent: Name of the parent frame.
-        translation: (3,) translation in the last message, in metres.
-        rotation: (3, 3) rotation in the last message.
-        first: Pose in the plane in the first message.
-        track: Poses in the plane over time; None for a static transform.
-        count: Number of messages.
-        off: Largest difference of a pose from `first`, in metres and radians.
-    """
-
-    parent: str
-    translation: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-    first: Pose
-    track: RecordedTrack | None
-    count: int = 0
+    parent: str  # name of the parent frame
+    translation: NDArray[np.float64]  # (3,) translation in the last message, in metres
+    rotation: NDArray[np.float64]  # (3, 3) rotation in the last message
+    first: Pose  # pose in the plane in the first message
+    track: RecordedTrack | None  # poses in the plane over time; None for a static transform
+    count: int = 0  # number of messages
+    # Largest difference of a pose from `first`, in metres and radians.
     off: tuple[float, float] = (0.0, 0.0)
 
     @property

@@ -159,59 +159,42 @@ class Survey:
     """Findings of the first pass about one kind of lines with scans.
 
     A line has two poses. The mount is the first pose as seen from the second.
-
-    Attributes:
-        scans: Number of scans.
-        beams: Number of beams of the first scan.
-        most: Largest range in metres.
-        repeated: Number of times that `most` occurs.
-        mount: Mount at the first scan.
-        mounted: Number of scans with about the same mount.
-        wandered: Number of scans with a very different mount.
-        same: Number of scans whose two poses are equal.
-        restarts: Number of scans for which the next ODOM line repeats the pose of the scan, though
-            the previous ODOM line has another pose. The times of the lines exclude that the robot
-            simply moved.
-        moves: Number of scans for which the previous ODOM line has another pose, so that a restart
-            could be seen.
-        unmoved: Numbers of the lines of scans before which no ODOM line gives motion.
-        poses: Second poses of all scans: x, y, heading, x, …
     """
 
-    scans: int = 0
-    beams: int = 0
-    most: float = 0.0
-    repeated: int = 0
-    mount: Pose | None = None
-    mounted: int = 0
-    wandered: int = 0
-    same: int = 0
+    scans: int = 0  # number of scans
+    beams: int = 0  # number of beams of the first scan
+    most: float = 0.0  # largest range in metres
+    repeated: int = 0  # number of times that `most` occurs
+    mount: Pose | None = None  # mount at the first scan
+    mounted: int = 0  # number of scans with about the same mount
+    wandered: int = 0  # number of scans with a very different mount
+    same: int = 0  # number of scans whose two poses are equal
+    # Number of scans for which the next ODOM line repeats the pose of the scan, though the previous
+    # ODOM line has another pose. The times of the lines exclude that the robot simply moved.
     restarts: int = 0
+    # Number of scans for which the previous ODOM line has another pose, so that a restart could be
+    # seen.
     moves: int = 0
+    # Numbers of the lines of scans before which no ODOM line gives motion.
     unmoved: list[int] = field(default_factory=list)
+    # Second poses of all scans: x, y, heading, x, …
     poses: array[float] = field(default_factory=lambda: array("d"))
 
 
 @dataclass(slots=True)
 class Findings:
-    """Findings of the first pass.
+    """Findings of the first pass."""
 
-    Attributes:
-        kinds: Findings for each kind of lines with scans.
-        parameters: Values of PARAM lines about the laser, by name: offset, side, angle, reach, fov.
-        tags: Number of lines of each kind.
-        lengths: For each kind of line with poses, how many lines have each number of words. In
-            lines with scans, only words after the poses count.
-        graph: Vertices and edges of the log.
-        damage: Description of the first scan that cannot be read; empty if there is none.
-    """
-
+    # Findings for each kind of lines with scans.
     kinds: dict[str, Survey] = field(default_factory=dict)
+    # Values of PARAM lines about the laser, by name: offset, side, angle, reach, fov.
     parameters: dict[str, float] = field(default_factory=dict)
-    tags: Counter[str] = field(default_factory=Counter)
+    tags: Counter[str] = field(default_factory=Counter)  # number of lines of each kind
+    # For each kind of line with poses, how many lines have each number of words. In lines with
+    # scans, only words after the poses count.
     lengths: dict[bytes, Counter[int]] = field(default_factory=dict)
-    graph: PoseGraph = field(default_factory=PoseGraph)
-    damage: str = ""
+    graph: PoseGraph = field(default_factory=PoseGraph)  # vertices and edges of the log
+    damage: str = ""  # description of the first scan that cannot be read; empty if there is none
 
     def usual_length(self, tag: bytes) -> int:
         """Compute the largest number of words that most lines of a kind reach."""

@@ -122,14 +122,10 @@ class LaserOptions:
 
 @dataclass(frozen=True)
 class Meaning:
-    """Which ranges of a laser mean that nothing came back.
+    """Which ranges of a laser mean that nothing came back."""
 
-    Attributes:
-        reach: A range of at least this many metres means that nothing came back.
-        free: Kinds of beams without a measurement that also mean this, a subset of KINDS.
-    """
-
-    reach: float
+    reach: float  # a range of at least this many metres means that nothing came back
+    # Kinds of beams without a measurement that also mean this, a subset of KINDS.
     free: frozenset[str]
 
 

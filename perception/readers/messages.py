@@ -39,26 +39,17 @@ class Damaged(Exception):  # noqa: N818 - becomes a Damage
 
 @dataclass(frozen=True, slots=True)
 class ScanLine:
-    """A line that holds a scan.
+    """A line that holds a scan."""
 
-    Attributes:
-        kind: First word of the line, one of KINDS.
-        ranges: (n,) ranges in metres.
-        shape: Bearing of the first beam and step between beams in radians, and reach in metres;
-            None if the line does not have them.
-        first: First pose: the pose of the laser, or a corrected pose; None without poses.
-        second: Second pose: the pose of the robot; None without poses.
-        time: Seconds; None if missing.
-        after: Number of words after the poses.
-    """
-
-    kind: str
-    ranges: NDArray[np.float64]
+    kind: str  # first word of the line, one of KINDS
+    ranges: NDArray[np.float64]  # (n,) ranges in metres
+    # Bearing of the first beam and step between beams in radians, and reach in metres; None if the
+    # line does not have them.
     shape: tuple[float, float, float] | None
-    first: Pose | None
-    second: Pose | None
-    time: float | None
-    after: int
+    first: Pose | None  # first pose: the pose of the laser, or a corrected pose; None without poses
+    second: Pose | None  # second pose: the pose of the robot; None without poses
+    time: float | None  # seconds; None if missing
+    after: int  # number of words after the poses
 
 
 def words(raw: bytes | None) -> list[bytes]:

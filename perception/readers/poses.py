@@ -56,14 +56,10 @@ class RecordedTrack:
 
 @dataclass(frozen=True)
 class TimedPoses:
-    """Poses sorted by time.
+    """Poses sorted by time."""
 
-    Attributes:
-        times: (n,) seconds, ascending.
-        poses: (n, 3) x and y in metres, heading in radians. Headings do not jump by a full turn.
-    """
-
-    times: Array
+    times: Array  # (n,) seconds, ascending
+    # (n, 3) x and y in metres, heading in radians. Headings do not jump by a full turn.
     poses: Array
 
     @classmethod

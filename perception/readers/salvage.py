@@ -29,23 +29,14 @@ ROS1_MESSAGE, ROS1_CHUNK, CONNECTION = 2, 5, 7
 
 
 class Message(NamedTuple):
-    """A message of a bag.
+    """A message of a bag."""
 
-    Attributes:
-        connection: Number of the connection, which is one sender's messages to one topic.
-        topic: Name of the topic.
-        msgtype: Message kind, such as sensor_msgs/msg/LaserScan.
-        sender: Name of the sender; empty if the format does not store it.
-        time: Time of recording in nanoseconds.
-        data: The serialised message.
-    """
-
-    connection: int
-    topic: str
-    msgtype: str
-    sender: str
-    time: int
-    data: bytes
+    connection: int  # number of the connection, which is one sender's messages to one topic
+    topic: str  # name of the topic
+    msgtype: str  # message kind, such as sensor_msgs/msg/LaserScan
+    sender: str  # name of the sender; empty if the format does not store it
+    time: int  # time of recording in nanoseconds
+    data: bytes  # the serialised message
 
 
 @dataclass(frozen=True)

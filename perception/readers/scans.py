@@ -163,18 +163,13 @@ class RobotLog:
 
 @dataclass(frozen=True, eq=False)
 class SurveyedLog:
-    """A log that was surveyed. Its scans can be read once.
+    """A log that was surveyed. Its scans can be read once."""
 
-    Attributes:
-        format: Name of the format.
-        notes: Sentences about the log that a user should know.
-        items: Iterator over scans, with ranges as the driver wrote them, and skipped parts, in the
-            order of the file.
-        assumed: Notes on what the reader assumed. The key of a note is the field of
-            `perception.readers.echoes.LaserOptions` by which a user can say otherwise.
-    """
-
-    format: str
-    notes: tuple[str, ...]
+    format: str  # name of the format
+    notes: tuple[str, ...]  # sentences about the log that a user should know
+    # Iterator over scans, with ranges as the driver wrote them, and skipped parts, in the order of
+    # the file.
     items: Iterator[Scan | Damage]
+    # Notes on what the reader assumed. The key of a note is the field of
+    # `perception.readers.echoes.LaserOptions` by which a user can say otherwise.
     assumed: Mapping[str, str] = field(default_factory=dict)

@@ -73,15 +73,11 @@ class UnderWay:
     """A series of searches that can be ended together.
 
     A signal handler or another thread can end the current search and all later ones.
-
-    Attributes:
-        search: The current or last search; None before the first one.
-        interrupted: Whether `interrupt` was called, or Ctrl-C ended a search.
     """
 
     def __init__(self) -> None:
-        self.search: Search | None = None
-        self.interrupted = False
+        self.search: Search | None = None  # the current or last search; None before the first one
+        self.interrupted = False  # whether `interrupt` was called, or Ctrl-C ended a search
 
     def interrupt(self) -> None:
         """End the current search soon, with its best answer so far. End later searches, too."""

@@ -29,18 +29,13 @@ class RunnerUpWarning(UserWarning):
 
 @dataclass(frozen=True)
 class SecondMap:
-    """The result for the second best number of views (the runner-up), if it is another map.
+    """The result for the second best number of views (the runner-up), if it is another map."""
 
-    Attributes:
-        views: Number of chosen views.
-        other_views: Number of views of the runner-up.
-        dstates: Number of dstates in the map of the chosen views; None if they have no map.
-        solution: The solution for the views of the runner-up. It may have no map.
-    """
-
-    views: int
-    other_views: int
+    views: int  # number of chosen views
+    other_views: int  # number of views of the runner-up
+    # Number of dstates in the map of the chosen views; None if they have no map.
     dstates: int | None
+    # The solution for the views of the runner-up. It may have no map.
     solution: Solution
 
     @property

@@ -31,13 +31,9 @@ ALIKE = 0.5
 
 @dataclass(frozen=True)
 class Traces:
-    """Traces of one world. Their n steps are numbered one trace after the other.
+    """Traces of one world. Their n steps are numbered one trace after the other."""
 
-    Attributes:
-        each: The traces, in the order in which their steps are numbered.
-    """
-
-    each: tuple[Trace, ...]
+    each: tuple[Trace, ...]  # the traces, in the order in which their steps are numbered
 
     @classmethod
     def of(cls, given: Any) -> Traces:

@@ -418,15 +418,11 @@ def _are_alike(maps: tuple[SSHMap, ...]) -> bool:
 
 
 class Abilities:
-    """The actions that a robot can do: now, at any time, and whenever it sees a view and a star.
-
-    Attributes:
-        here: The actions that the robot can do now, by name.
-        ever: All actions that the robot could do at some step so far, by name.
-    """
+    """The actions that a robot can do: now, at any time, and whenever it sees a view and a star."""
 
     def __init__(self) -> None:
-        self.here: dict[str, Action] = {}
+        self.here: dict[str, Action] = {}  # the actions that the robot can do now, by name
+        # All actions that the robot could do at some step so far, by name.
         self.ever: dict[str, Action] = {}
         # The names of actions by view and star, and by view alone.
         self._names: dict[tuple[object, object], set[str]] = {}

@@ -45,23 +45,16 @@ DSTATE = 10
 
 @dataclass(frozen=True, slots=True)
 class ExtendedMap:
-    """An explanation of all steps so far: a map, and how it was extended.
+    """An explanation of all steps so far: a map, and how it was extended."""
 
-    Attributes:
-        map: The map that the solver found, of the first steps or of all.
-        labels: The dstate of each step so far.
-        shows: The view and star of each dstate.
-        links: For each dstate and name of an action, the dstate that the action leads to.
-        faults: The observations and actions that are treated as wrong.
-        cost: The counts that the theory minimises, the most important first. Dstates, with the
-            price of faults, count in tenths.
-    """
-
-    map: SSHMap
-    labels: tuple[int, ...]
-    shows: tuple[Seen, ...]
+    map: SSHMap  # the map that the solver found, of the first steps or of all
+    labels: tuple[int, ...]  # the dstate of each step so far
+    shows: tuple[Seen, ...]  # the view and star of each dstate
+    # For each dstate and name of an action, the dstate that the action leads to.
     links: Mapping[tuple[int, str], int]
-    faults: tuple[Fault, ...]
+    faults: tuple[Fault, ...]  # the observations and actions that are treated as wrong
+    # The counts that the theory minimises, the most important first. Dstates, with the price of
+    # faults, count in tenths.
     cost: tuple[int, ...]
 
     @classmethod

@@ -48,18 +48,12 @@ DRAFTS = 3
 
 @dataclass(frozen=True, slots=True)
 class StepOptions:
-    """The limits and speed-ups for solving at each step.
+    """The limits and speed-ups for solving at each step."""
 
-    Attributes:
-        time_limit: Seconds for each step. A step may take a little longer. None waits for the exact
-            answer.
-        max_maps: Keep at most this many minimal maps; None keeps all.
-        speedups: Flags that say which speed-ups of the solver to use.
-    """
-
+    # Seconds for each step. A step may take a little longer. None waits for the exact answer.
     time_limit: float | None
-    max_maps: int | None
-    speedups: Speedups
+    max_maps: int | None  # keep at most this many minimal maps; None keeps all
+    speedups: Speedups  # flags that say which speed-ups of the solver to use
 
 
 class MapKeeper:
@@ -69,12 +63,6 @@ class MapKeeper:
         problem: The steps so far, and the theory: it allows no faults, and no field is "auto".
         options: The time limit and the other options of a step.
         before: The keeper of fewer steps that this one replaces; None for the first.
-
-    Attributes:
-        minimal: The minimal maps.
-        drafts: Maps that were made without a search.
-        searches: The number of searches by clingo so far.
-        search: The last search, which the next one continues; None before the first.
     """
 
     standing = None  # only `Recovery`, for theories with faults, has a standing
@@ -86,8 +74,10 @@ class MapKeeper:
         self._problem, self._options = problem, options
         self._judging = Judging(problem)
         self.minimal = MinimalMaps(trace, theory, self._judging)
-        self.drafts = Drafts(problem, self._judging)
+        self.drafts = Drafts(problem, self._judging)  # maps that were made without a search
+        # The number of searches by clingo so far.
         self.searches: int = before.searches if before else 0
+        # The last search, which the next one continues; None before the first.
         self.search: Search | None = None
         self._found: Solution | None = None  # the solution of this search, without its maps
         self._next_search = 0  # no search before the trace has this many steps
@@ -218,15 +208,10 @@ class MapKeeper:
 
 @dataclass(slots=True)
 class Draft:
-    """A sketch (a map made without a search), and how far the evidence has tested it.
-
-    Attributes:
-        sketch: The sketch.
-        passed: The number of first steps for which no evidence rejected it.
-    """
+    """A sketch (a map made without a search), and how far the evidence has tested it."""
 
     sketch: Sketch
-    passed: int = 0
+    passed: int = 0  # the number of first steps for which no evidence rejected it
 
 
 class Drafts:

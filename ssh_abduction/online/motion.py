@@ -34,15 +34,10 @@ MARGIN = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A displacement with its error.
+    """A displacement with its error."""
 
-    Attributes:
-        displacement: (dx, dy, dtheta), in metres and radians.
-        noise: Its covariance, (3, 3).
-    """
-
-    displacement: Displacement
-    noise: Array
+    displacement: Displacement  # (dx, dy, dtheta), in metres and radians
+    noise: Array  # its covariance, (3, 3)
 
     @classmethod
     def of(cls, displacement: Displacement, covariance: Covariance, odometry: Odometry) -> Motion:
@@ -73,15 +68,10 @@ class Motion:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Away:
-    """The robot left a dstate some steps ago, and was at no dstate of the map since.
+    """The robot left a dstate some steps ago, and was at no dstate of the map since."""
 
-    Attributes:
-        probabilities: The probability of this for each dstate that it left, (N,).
-        motion: The motion since then.
-    """
-
-    probabilities: Array
-    motion: Motion
+    probabilities: Array  # the probability of this for each dstate that it left, (N,)
+    motion: Motion  # the motion since then
 
     @property
     def total(self) -> float:

@@ -23,21 +23,16 @@ class MinimalMaps:
         trace: The steps so far.
         theory: The theory, in which no field is "auto".
         judging: Judges maps by the evidence and the checker, for this theory.
-
-    Attributes:
-        maps: The minimal maps. If `replays` is false, the maps that clingo found last, which may
-            not be proven minimal.
-        status: UNKNOWN until clingo has proven which maps are minimal.
-        complete: Whether `maps` are all minimal maps.
-        cost: The counts of a minimal map; None if they are unknown.
-        replays: Whether the claim in `mapper.py` holds for the theory, so that maps are replayed.
     """
 
     def __init__(self, trace: Trace, theory: Theory, judging: Judging) -> None:
+        # The minimal maps. If `replays` is false, the maps that clingo found last, which may not be
+        # proven minimal.
         self.maps: list[ExtendedMap] = []
-        self.status = Status.UNKNOWN
-        self.complete = False
-        self.cost: Cost | None = None
+        self.status = Status.UNKNOWN  # UNKNOWN until clingo has proven which maps are minimal
+        self.complete = False  # whether `maps` are all minimal maps
+        self.cost: Cost | None = None  # the counts of a minimal map; None if they are unknown
+        # Whether the claim in `mapper.py` holds for the theory, so that maps are replayed.
         self.replays = row("prefixes").holds_for(theory)
         self._trace, self._theory, self._judging = trace, theory, judging
 

@@ -28,15 +28,12 @@ class ReturnDoubts:
     Args:
         margin: Number of dstates; 0 doubts no return.
         time_limit: Seconds for finding a map without one return; None waits for the exact answer.
-
-    Attributes:
-        undecided: Returns for which there was too little time to decide.
-        twins: The returns that no experiment can test, each with a map without the return that
-            always predicts the same as the minimal map. The caller adds them.
     """
 
     def __init__(self, margin: int, time_limit: float | None) -> None:
-        self.undecided: set[Doubt] = set()
+        self.undecided: set[Doubt] = set()  # returns for which there was too little time to decide
+        # The returns that no experiment can test, each with a map without the return that always
+        # predicts the same as the minimal map. The caller adds them.
         self.twins: dict[Doubt, SSHMap] = {}
         self._margin, self._time_limit = margin, time_limit
         self._least: dict[Doubt, int] = {}  # lower bound of the dstates of a map without the return

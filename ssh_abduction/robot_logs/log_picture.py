@@ -122,25 +122,15 @@ def doubtful_joins(solution: Solution) -> list[tuple[int, int, float]]:
 
 @dataclass(frozen=True)
 class _Sheet:
-    """What is drawn under the map, in metres.
+    """What is drawn under the map, in metres."""
 
-    Attributes:
-        poses: The pose of each scan.
-        headings: The heading of each step, in radians.
-        spots: The middle of the place of each visit, by its own pose.
-        walls: (n, 2) points of walls.
-        unit: Units of the page in a metre.
-        is_corrected: Whether the poses are corrected ones.
-        bounds: The first scan of each drive, and the number of scans.
-    """
-
-    poses: Sequence[Pose]
-    headings: Sequence[float]
-    spots: Sequence[Point]
-    walls: Array
-    unit: float
-    is_corrected: bool
-    bounds: Sequence[int]
+    poses: Sequence[Pose]  # the pose of each scan
+    headings: Sequence[float]  # the heading of each step, in radians
+    spots: Sequence[Point]  # the middle of the place of each visit, by its own pose
+    walls: Array  # (n, 2) points of walls
+    unit: float  # units of the page in a metre
+    is_corrected: bool  # whether the poses are corrected ones
+    bounds: Sequence[int]  # the first scan of each drive, and the number of scans
 
     @classmethod
     def of(cls, log: RobotLog, imported: Imported, ssh_map: SSHMap | None) -> _Sheet:

@@ -17,21 +17,14 @@ from ssh_abduction.evaluation.paper.experiments import EXPERIMENTS, FoundMaps, S
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim about an experiment.
+    """A claim about an experiment."""
 
-    Attributes:
-        text: The claim.
-        paper: The value in the paper.
-        here: A function that writes the value of a run as text.
-        holds: A function that tells whether the claim holds in a run.
-        ours: Whether the claim is not in the paper. Then it follows from the argument of the paper,
-            or it is about this robot alone.
-    """
-
-    text: str
-    paper: str
-    here: Callable[[SeedRun], str]
-    holds: Callable[[SeedRun], bool]
+    text: str  # the claim
+    paper: str  # the value in the paper
+    here: Callable[[SeedRun], str]  # a function that writes the value of a run as text
+    holds: Callable[[SeedRun], bool]  # a function that tells whether the claim holds in a run
+    # Whether the claim is not in the paper. Then it follows from the argument of the paper, or it
+    # is about this robot alone.
     ours: bool = False
 
 

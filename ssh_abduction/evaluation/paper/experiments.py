@@ -39,25 +39,15 @@ from ssh_abduction.theory.theory import Theory
 
 @dataclass(frozen=True)
 class PaperExperiment:
-    """One of the paper's experiments.
+    """One of the paper's experiments."""
 
-    Attributes:
-        world: The name of the world.
-        tours: The number of tours that the robot drives.
-        k_max: The largest number of views (clusters of images) that is tried.
-        views: The number of views in the paper.
-        dstates: The number of dstates in the paper.
-        places: The number of places in the paper.
-        paths: The number of paths in the paper.
-    """
-
-    world: str
-    tours: int
-    k_max: int
-    views: int
-    dstates: int
-    places: int
-    paths: int
+    world: str  # the name of the world
+    tours: int  # the number of tours that the robot drives
+    k_max: int  # the largest number of views (clusters of images) that is tried
+    views: int  # the number of views in the paper
+    dstates: int  # the number of dstates in the paper
+    places: int  # the number of places in the paper
+    paths: int  # the number of paths in the paper
 
 
 EXPERIMENTS = {
@@ -75,32 +65,21 @@ WITH_STARS = Theory.topological().replace(displacement="none")
 
 @dataclass(frozen=True)
 class Clustering:
-    """The views (clusters of images) of one seed.
+    """The views (clusters of images) of one seed."""
 
-    Attributes:
-        k: The chosen number of views.
-        quality: M for each number of views that was tried.
-        uncertainty: U for each number of views that was tried.
-        largest_k: The largest number of views with U = 1.
-    """
-
-    k: int
-    quality: dict[int, float]
-    uncertainty: dict[int, float]
-    largest_k: int
+    k: int  # the chosen number of views
+    quality: dict[int, float]  # M for each number of views that was tried
+    uncertainty: dict[int, float]  # U for each number of views that was tried
+    largest_k: int  # the largest number of views with U = 1
 
 
 @dataclass(frozen=True)
 class FoundMaps:
-    """The minimal maps of one seed.
+    """The minimal maps of one seed."""
 
-    Attributes:
-        cost: The numbers of dstates, places and paths of a minimal map; None if no map was found.
-        maps: The number of minimal maps.
-    """
-
+    # The numbers of dstates, places and paths of a minimal map; None if no map was found.
     cost: dict[str, int] | None
-    maps: int
+    maps: int  # the number of minimal maps
 
     @classmethod
     def of(cls, solution: Solution) -> FoundMaps:
@@ -114,17 +93,11 @@ class FoundMaps:
 
 @dataclass(frozen=True)
 class Labelling:
-    """The labels of steps that follow from the views alone, compared with the true dstates.
+    """The labels of steps that follow from the views alone, compared with the true dstates."""
 
-    Attributes:
-        right: Whether the labels are the true dstates, one to one.
-        aliased: The number of pairs of true dstates that share a view.
-        told_apart: The number of these pairs that share no label.
-    """
-
-    right: bool
-    aliased: int
-    told_apart: int
+    right: bool  # whether the labels are the true dstates, one to one
+    aliased: int  # the number of pairs of true dstates that share a view
+    told_apart: int  # the number of these pairs that share no label
 
 
 @dataclass(frozen=True)
@@ -133,48 +106,31 @@ class Contrast:
 
     Two parts are left out, one at a time. First there are no maps: images are clustered into as
     many views as there are dstates. Second, images are taken at equal distances, not at dstates.
-
-    Attributes:
-        alone_uncertainty: U if there is one cluster per dstate.
-        alone_distinct: The number of dstates that then share no cluster with another dstate.
-        even_quality: M at the chosen number of views, for images taken at equal distances.
-        even_uncertainty: U at the chosen number of views, for the same images.
     """
 
-    alone_uncertainty: float
-    alone_distinct: int
-    even_quality: float
-    even_uncertainty: float
+    alone_uncertainty: float  # U if there is one cluster per dstate
+    alone_distinct: int  # the number of dstates that then share no cluster with another dstate
+    even_quality: float  # M at the chosen number of views, for images taken at equal distances
+    even_uncertainty: float  # U at the chosen number of views, for the same images
 
 
 @dataclass(frozen=True)
 class SeedRun:
-    """The results of an experiment for one seed.
+    """The results of an experiment for one seed."""
 
-    Attributes:
-        seed: The seed of all noise.
-        images: The number of images.
-        clustering: The views.
-        by_views: The minimal maps from the views alone.
-        by_stars: The minimal maps from the views and the openings that the robot saw.
-        labelling: The labels of steps that follow from the views alone.
-        curve: The learning curve on these labels.
-        rates: The rates, 0 to 1, at which the true dstate of an image is recognised after learning
-            labels. The keys are the sources of the labels: "clustering alone", "map", "truth".
-        contrast: Results without a part of the method.
-        spread: For each tour, the largest offset of a pose from the mean pose of its dstate, in x
-            and y (metres) and heading (radians). Shape (tours, 3).
-    """
-
-    seed: int
-    images: int
-    clustering: Clustering
-    by_views: FoundMaps
-    by_stars: FoundMaps
-    labelling: Labelling
-    curve: LearningCurve
+    seed: int  # the seed of all noise
+    images: int  # the number of images
+    clustering: Clustering  # the views
+    by_views: FoundMaps  # the minimal maps from the views alone
+    by_stars: FoundMaps  # the minimal maps from the views and the openings that the robot saw
+    labelling: Labelling  # the labels of steps that follow from the views alone
+    curve: LearningCurve  # the learning curve on these labels
+    # The rates, 0 to 1, at which the true dstate of an image is recognised after learning labels.
+    # The keys are the sources of the labels: "clustering alone", "map", "truth".
     rates: dict[str, float]
-    contrast: Contrast
+    contrast: Contrast  # results without a part of the method
+    # For each tour, the largest offset of a pose from the mean pose of its dstate, in x and y
+    # (metres) and heading (radians). Shape (tours, 3).
     spread: list[list[float]]
 
 
@@ -316,24 +272,16 @@ class NotchOutcome:
     """The result of the method for one notch and one spread of poses.
 
     The offset of a pose is its difference from the mean pose at its dstate.
-
-    Attributes:
-        notch: The depth of the notch in metres.
-        scale: The factor by which the offsets that the robot left are multiplied.
-        spread: The root mean square of the multiplied offsets of positions in metres.
-        k: The chosen number of views.
-        uncertainty: U at that number of views (1 if all images of a dstate have one view).
-        right: Whether there is only one minimal map, and its labels are the true dstates, one to
-            one.
-        rate: The rate, 0 to 1, at which the true dstate is recognised after learning true labels.
     """
 
-    notch: float
-    scale: float
-    spread: float
-    k: int
-    uncertainty: float
+    notch: float  # the depth of the notch in metres
+    scale: float  # the factor by which the offsets that the robot left are multiplied
+    spread: float  # the root mean square of the multiplied offsets of positions in metres
+    k: int  # the chosen number of views
+    uncertainty: float  # U at that number of views (1 if all images of a dstate have one view)
+    # Whether there is only one minimal map, and its labels are the true dstates, one to one.
     right: bool
+    # The rate, 0 to 1, at which the true dstate is recognised after learning true labels.
     rate: float
 
 
