@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ssh_abduction.cli.parsing import Parser, true_or_false
-from ssh_abduction.data.corrections import ASSERTIONS
+from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS
 from ssh_abduction.data.corrections_file import load_corrections
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
@@ -66,12 +66,7 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
         f"(default: {default})",
         to=group,
     )
-    for name, text in (
-        ("same", "are one dstate"),
-        ("different", "are different dstates"),
-        ("elsewhere", "are at different places"),
-        ("same_place", "are at one place"),
-    ):
+    for name, text in ASSERTED.items():
         parser.add(
             f"--{name.replace('_', '-')} I,J",
             f"assume that steps I and J {text}",

@@ -36,8 +36,14 @@ from ssh_abduction.data.step import SEEN
 from ssh_abduction.data.trace import Trace, checked_trace
 
 FORMAT, VERSION = "ssh-corrections", 1
-# The kinds of pairs of steps, which are fields of a theory.
-ASSERTIONS = ("same", "different", "elsewhere", "same_place")
+# What a person says of two steps, by kind. The kinds are fields of a theory.
+ASSERTED = {
+    "same": "are one dstate",
+    "different": "are different dstates",
+    "elsewhere": "are at different places",
+    "same_place": "are at one place",
+}
+ASSERTIONS = tuple(ASSERTED)
 # The kinds that contradict a kind if they are said of the same steps.
 _AGAINST = {
     "same": ("different", "elsewhere"),

@@ -38,30 +38,26 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     """
     path = a_path("path", path, MapError)
     source = "standard input" if path == "-" else named(path)
+
+    def refused(what: str, mend: str = "write it with solve --json") -> MapError:
+        return MapError(f"{source}: expected {what}; {mend}")
+
     try:
         with nullcontext(sys.stdin.buffer) if path == "-" else Path(path).open("rb") as file:
             text = file.read(LARGEST + 1)
         if len(text) > LARGEST:
-            raise MapError(
-                f"{source}: expected at most {LARGEST // 2**20} MiB, got more; "
-                f"list fewer (solve --maps)"
-            )
+            raise refused(f"at most {LARGEST // 2**20} MiB, got more", "list fewer (solve --maps)")
         if not text.strip():
-            raise MapError(
-                f"{source}: expected JSON, got an empty file; write it with solve --json"
-            )
+            raise refused("JSON, got an empty file")
         return parse_json(text.decode("utf-8"))
     except MapError:
         raise
     except OSError as error:
-        raise MapError(
-            f"{source}: expected a readable file of maps: {error.strerror or error}; check the path"
-        ) from None
+        why = error.strerror or error
+        raise refused(f"a readable file of maps: {why}", "check the path") from None
     except MemoryError:
-        raise MapError(
-            f"{source}: expected a file of maps that fits into memory, got a larger one; "
-            f"list fewer (solve --maps)"
-        ) from None
+        what = "a file of maps that fits into memory, got a larger one"
+        raise refused(what, "list fewer (solve --maps)") from None
     except json.JSONDecodeError as error:
         raise _broken(error, text, source) from None
     except NotFinite as error:
@@ -70,17 +66,11 @@ def read_json(path: str | os.PathLike[str]) -> Any:
             f"write it with solve --json"
         ) from None
     except HalfCharacter as error:
-        raise MapError(
-            f"{source}: expected text, got {error}; write it with solve --json"
-        ) from None
+        raise refused(f"text, got {error}") from None
     except (UnicodeDecodeError, AttributeError):  # text in another encoding, a closed stream
-        raise MapError(
-            f"{source}: expected JSON in UTF-8, got something else; write it with solve --json"
-        ) from None
+        raise refused("JSON in UTF-8, got something else") from None
     except ValueError as error:
-        raise MapError(
-            f"{source}: expected JSON, got {error}; write it with solve --json"
-        ) from None
+        raise refused(f"JSON, got {error}") from None
 
 
 def _broken(error: json.JSONDecodeError, text: bytes, source: str) -> MapError:

@@ -17,7 +17,7 @@ import math
 from collections.abc import Collection
 from functools import lru_cache
 
-from ssh_abduction.data.star import ROUNDING, SPREAD, Frame
+from ssh_abduction.data.star import ROUNDING, SPREAD, Frame, angle_between
 from ssh_abduction.data.trace import Action
 
 
@@ -50,11 +50,6 @@ def arc(centre: float, most: float) -> frozenset[int]:
     """List the whole degrees from 0 to 359 that differ by at most `most` from `centre`."""
     least, last = centre - most + ROUNDING, centre + most - ROUNDING
     return frozenset(angle % 360 for angle in range(math.floor(least), math.ceil(last) + 1))
-
-
-def angle_between(a: float, b: float) -> float:
-    """Return the angle between two bearings, 0 to 180 degrees."""
-    return min((a - b) % 360, (b - a) % 360)
 
 
 def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:

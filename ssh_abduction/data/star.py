@@ -115,13 +115,15 @@ class Frame:
 
     def faces(self, slot: int) -> bool:
         """Whether the gateway with this number (slot) is straight ahead of the robot."""
-        is_ahead = abs((self.bearings[slot] + 180) % 360 - 180) <= self.spreads[slot] + ROUNDING
-        return is_ahead and not self.is_closed(slot)
+        return self._is_towards(slot, 0)
 
     def has_behind(self, slot: int) -> bool:
         """Whether the gateway with this slot is straight behind the robot."""
-        is_behind = abs(self.bearings[slot] % 360 - 180) <= self.spreads[slot] + ROUNDING
-        return is_behind and not self.is_closed(slot)
+        return self._is_towards(slot, 180)
+
+    def _is_towards(self, slot: int, way: float) -> bool:
+        off = angle_between(self.bearings[slot], way)
+        return off <= self.spreads[slot] + ROUNDING and not self.is_closed(slot)
 
     def is_closed(self, slot: int) -> bool:
         """Whether the gateway with this slot is closed on this drive, and open on another."""
@@ -204,7 +206,7 @@ class Star:
     def too_near(self) -> tuple[float, float] | None:
         """The bearings of two gateways whose spreads overlap; None if there are none."""
         for a, b in combinations([gateway for gateway in self.gateways if gateway.open], 2):
-            if abs((a.bearing - b.bearing + 180) % 360 - 180) <= a.spread + b.spread:
+            if angle_between(a.bearing, b.bearing) <= a.spread + b.spread:
                 return a.bearing, b.bearing
         return None
 
@@ -286,7 +288,7 @@ def with_gateway(star: Sequence[Entry], bearing: float, *, is_open: bool) -> tup
             )
         return (*star[:quarter], int(is_open), *star[quarter + 1 :])
     entries = [e if isinstance(e, Gateway) else Gateway(float(e or 0)) for e in star]
-    off = [abs((e.bearing - bearing + 180) % 360 - 180) for e in entries]
+    off = [angle_between(e.bearing, bearing) for e in entries]
     nearest = min(range(len(off)), key=off.__getitem__, default=None)
     if nearest is None or off[nearest] > max(entries[nearest].spread, QUARTER):
         return (*star, bearing % 360) if is_open else tuple(star)
@@ -302,6 +304,11 @@ def _without(entry: Entry, removed: int) -> Entry:
     if not isinstance(entry, Gateway) or entry.opposite is None or entry.opposite < removed:
         return entry
     return replace(entry, opposite=None if entry.opposite == removed else entry.opposite - 1)
+
+
+def angle_between(a: float, b: float) -> float:
+    """Return the angle between two bearings, 0 to 180 degrees."""
+    return abs((a - b + 180) % 360 - 180)
 
 
 def near_quarter(bearing: float) -> int | None:

@@ -61,6 +61,17 @@ def attributes_of(value: Any, *names: str) -> dict[str, Any]:
     return {name: _plain(getattr(value, name)) for name in names}
 
 
+class PlainData:
+    """The base class of dataclasses whose plain data for JSON is all of their fields."""
+
+    __slots__ = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all fields as plain data, as the commands print it with --json."""
+        value: Any = self
+        return attributes_of(value, *(field.name for field in fields(value)))
+
+
 def only_known(**fields: Any) -> dict[str, Any]:
     """Return the fields that are not None.
 

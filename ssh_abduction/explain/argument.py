@@ -90,6 +90,7 @@ class Argument:
         first, second = pair
         self._pair = piece.steps.index(first), piece.steps.index(second)
         self._axioms = Axioms(piece, stop, relaxed=True)
+        self._goal = facts.conclusion("one_dstate" if one else "two_dstates", *self._pair)
         self._supposed: Assumption = (facts.are_one(*self._pair), not one)
         order = piece.theory.axioms
         clash = self._axioms.smallest_clash([self._supposed])
@@ -105,23 +106,18 @@ class Argument:
         if size <= FEW_STEPS or self._piece.theory.level == "causal":
             return range(size)
         first, second = self._pair
-        named = {t for _, step in self._links for t in (step - 1, step, step - second + first)} | {
-            first,
-            second,
-        }
-        return [t for t in named if 0 <= t < size]
+        named = {t for _, step in self._links for t in (step - 1, step, step - second + first)}
+        return [t for t in named | {first, second} if 0 <= t < size]
 
     def derivation(self) -> Derivation:
         """Find the argument and put it into words."""
         self._draw_all()
         inferences, summary = self._written()
         first, second = (self._piece.steps[k] for k in self._pair)
-        supposed = any(inference.supposed for inference in inferences)
-        supposition = (
-            f"steps {first} and {second} are {'different dstates' if self._one else 'one dstate'}"
-            if supposed
-            else None
-        )
+        supposition = None
+        if any(inference.supposed for inference in inferences):
+            what = "different dstates" if self._one else "one dstate"
+            supposition = f"steps {first} and {second} are {what}"
         links = tuple(self._checked_links())
         return Derivation(
             self._piece.steps, first, second, self._one, links, inferences, supposition, summary
@@ -136,7 +132,6 @@ class Argument:
         only several links at once decide it, suppose the opposite, and go on until there is a
         contradiction.
         """
-        goal = facts.conclusion("one_dstate" if self._one else "two_dstates", *self._pair)
         left = list(self._links)
         for supposed in (False, True):
             assumed = [self._supposed] if supposed else []
@@ -156,8 +151,8 @@ class Argument:
                     return
                 known = self._axioms.consequences(_active(placed), assumed, known)
                 self._add(group, known, supposed)
-                if goal in self._born:
-                    if len(self._support(goal)[1]) == len(group):
+                if self._goal in self._born:
+                    if len(self._support(self._goal)[1]) == len(group):
                         return
                     # Several links at once decide the pair. The supposition gives smaller steps.
                     self._lines, self._born, left = [], {}, list(self._links)
@@ -192,12 +187,7 @@ class Argument:
 
     def _written(self) -> tuple[tuple[Inference, ...], str]:
         """Put the lines that are needed into words, each after its premises."""
-        last = self._lines[-1]
-        goal = (
-            None
-            if not last.conclusions
-            else facts.conclusion("one_dstate" if self._one else "two_dstates", *self._pair)
-        )
+        goal = self._goal if self._lines[-1].conclusions else None
         order: list[clingo.Symbol | None] = []
         premises: dict[clingo.Symbol | None, list[clingo.Symbol]] = {}
         links: dict[clingo.Symbol | None, tuple[tuple[str, int], ...]] = {}
@@ -206,9 +196,7 @@ class Argument:
             if conclusion in premises:
                 return
             premises[conclusion], links[conclusion] = self._support(conclusion)
-            for premise in sorted(
-                premises[conclusion], key=lambda premise: facts.read_conclusion(premise)[1]
-            ):
+            for premise in sorted(premises[conclusion], key=lambda p: facts.read_conclusion(p)[1]):
                 visit(premise)
             order.append(conclusion)
 
@@ -263,14 +251,12 @@ class Argument:
         core = self._axioms.core(_active(line.group), given)
         # the conclusions of earlier links may not suffice; then the links themselves do
         if core is None:
-            core = self._axioms.core(
-                _active(line.group), [*given, *((facts.active(*link), True) for link in earlier)]
-            )
-        needed = {symbol for symbol, _ in core or ()}
+            given += ((symbol, True) for symbol in _active(earlier))
+            core = self._axioms.core(_active(line.group), given)
+        needed = [symbol for symbol, _ in core or ()]
         again = tuple(link for link in earlier if facts.active(*link) in needed)
-        return [
-            symbol for symbol, _ in core or () if symbol in self._born and symbol != conclusion
-        ], again + line.group
+        premises = [symbol for symbol in needed if symbol in self._born and symbol != conclusion]
+        return premises, again + line.group
 
     def _rank(self, symbol: clingo.Symbol) -> tuple[bool, bool, int, int, tuple[int, ...]]:
         """Compute a sort key of premises. Premises with lower keys are preferred.
@@ -330,19 +316,13 @@ class Argument:
         self._words.know(self._born)
         if not premises[conclusion]:
             conclusion = goal
-        # these conclusions about the pair only repeat the supposition
-        obvious = (self._pair, ("one_place", "one_dstate", "two_dstates"))
-        clauses = [
-            self._words.of(facts.read_conclusion(p), would=self._lines[self._born[p]].supposed)
-            for p in sorted(
-                premises[conclusion],
-                key=lambda p: (self._lines[self._born[p]].supposed, facts.read_conclusion(p)[1]),
-            )
-            if not (
-                facts.read_conclusion(p)[1] == obvious[0]
-                and facts.read_conclusion(p)[0] in obvious[1]
-            )
+        found = [
+            (self._line_of(p).supposed, facts.read_conclusion(p)) for p in premises[conclusion]
         ]
+        found.sort(key=lambda premise: (premise[0], premise[1][1]))
+        # these conclusions about the pair only repeat the supposition
+        obvious = [(name, self._pair) for name in ("one_place", "one_dstate", "two_dstates")]
+        clauses = [self._words.of(p, would=supposed) for supposed, p in found if p not in obvious]
         said = [] if conclusion is None else [facts.read_conclusion(conclusion)]
         reasons = [
             self._words.reason(axiom, t, said, self._pair, short=True)
@@ -360,19 +340,14 @@ class Argument:
         """
         theory = self._piece.theory
         names = {axiom for axiom, _ in self._links} | set(unchecked(theory))
+        names |= {axiom.name for rules in theory.rules for axiom in rules.axioms}
         left_out = [axiom for axiom in theory.axioms if axiom not in names]
-        own = {axiom.name for rules in theory.rules for axiom in rules.axioms}
-        of_argument = theory.replace(
-            without=[
-                *dict.fromkeys([*theory.without, *(name for name in left_out if name not in own)])
-            ]
-        )
-        ordered = list(dict.fromkeys(link for line in self._lines for link in line.group))
-        for axiom, t in [*ordered, *(link for link in self._links if link not in ordered)]:
+        of_argument = theory.replace(without=[*dict.fromkeys([*theory.without, *left_out])])
+        ordered = [link for line in self._lines for link in line.group]
+        for axiom, t in dict.fromkeys([*ordered, *self._links]):
             found = self._map_without((axiom, t))
-            yield Link(
-                axiom, self._piece.steps[t], found, check(self._piece.trace, found, of_argument)
-            )
+            violations = check(self._piece.trace, found, of_argument)
+            yield Link(axiom, self._piece.steps[t], found, violations)
 
     def _map_without(self, link: tuple[str, int]) -> SSHMap:
         """Find a map that satisfies the supposition and all links but this one.

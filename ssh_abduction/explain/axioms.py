@@ -158,10 +158,8 @@ class Axioms:
             if refused is None:
                 return answer.ssh_map
             axiom, refusal = refused
-            self._forbid(
-                refusal,
-                facts.active(axiom, self._judged_at(axiom, refusal)) if self._pairs else None,
-            )
+            where = facts.active(axiom, self._judged_at(axiom, refusal)) if self._pairs else None
+            self._forbid(refusal, where)
         return None
 
     def tell_of(self, steps: Iterable[int]) -> None:
@@ -221,25 +219,22 @@ class Axioms:
         # contradicts the axioms. Its last assumption is needed. Unsat cores shorten the prefix.
         needed: list[Assumption] = []
         rest = list(assumed)
+
+        def shorter(some: list[Assumption]) -> int:
+            """Count the assumptions up to the last one that is in the last unsat core."""
+            return 1 + max((some.index(a) for a in self._of_last_core(some)), default=-1)
+
         while self._solve(_forget, active, needed):
             # the first `most` assumptions of the rest suffice, the first `least` do not
-            least, most = 0, len(rest)
             if self._solve(_forget, active, [*rest, *needed]):
                 return None
-            most = min(most, 1 + max((rest.index(a) for a in self._of_last_core(rest)), default=-1))
+            least, most = 0, shorter(rest)
             while most - least > 1:
                 middle = (least + most) // 2
                 if self._solve(_forget, active, [*rest[:middle], *needed]):
                     least = middle
                 else:
-                    most = min(
-                        middle,
-                        1
-                        + max(
-                            (rest.index(a) for a in self._of_last_core(rest[:middle])), default=-1
-                        ),
-                    )
-                    most = max(most, least + 1)
+                    most = max(shorter(rest[:middle]), least + 1)
             needed.append(rest[most - 1])
             rest = rest[: most - 1]
         return needed
@@ -247,13 +242,11 @@ class Axioms:
     def _of_last_core(self, assumed: Sequence[Assumption]) -> list[Assumption]:
         """List those of the given assumptions that are in the last unsat core."""
         core = set(self._last_core)
-        literals = [
-            (assumption, self._control.symbolic_atoms[assumption[0]]) for assumption in assumed
-        ]
+        atoms = self._control.symbolic_atoms
         return [
             (symbol, true)
-            for (symbol, true), atom in literals
-            if atom is None or atom.literal * (1 if true else -1) in core
+            for symbol, true in assumed
+            if (atom := atoms[symbol]) is None or atom.literal * (1 if true else -1) in core
         ]
 
     def _answer(
@@ -263,11 +256,8 @@ class Axioms:
         found: list[_ModelMap] = []
 
         def keep(model: clingo.Model) -> None:
-            found.append(
-                _ModelMap(
-                    *facts.read_steps(model), facts.read_map(model, self._trace, self._theory)
-                )
-            )
+            ssh_map = facts.read_map(model, self._trace, self._theory)
+            found.append(_ModelMap(*facts.read_steps(model), ssh_map))
 
         return found[0] if self._solve(keep, active, assumed) else None
 
@@ -298,20 +288,13 @@ class Axioms:
         `_judged_at` returns.
         """
         for evidence in self._evidence:
-            if not self._pairs:
+            steps = [t for axiom, t in sorted(active) if axiom == evidence.axiom]
+            if self._pairs and isinstance(evidence, Displacement):
+                found = [self._refused_together(evidence, answer, t) for t in steps]
+            elif steps or not self._pairs:
                 found = [evidence.refuse(self._trace, answer.ssh_map)]
-            elif isinstance(evidence, Displacement):
-                found = [
-                    self._refused_together(evidence, answer, t)
-                    for axiom, t in sorted(active)
-                    if axiom == evidence.axiom
-                ]
             else:
-                found = (
-                    [evidence.refuse(self._trace, answer.ssh_map)]
-                    if any(axiom == evidence.axiom for axiom, _ in active)
-                    else []
-                )
+                continue
             for refusal in filter(None, found):
                 if not self._pairs or (
                     answer.has(refusal)
@@ -352,11 +335,8 @@ class Axioms:
             return ()
         returns = displacement.returns_of(self._trace)
         said: dict[int, list[tuple[float, str]]] = {t: [] for t in steps}
-        others = [
-            symbol
-            for symbol, pair in self._pairs.items()
-            if pair in clash and pair[0] != displacement.axiom
-        ]
+        kept = {pair for pair in clash if pair[0] != displacement.axiom}
+        others = [symbol for symbol, pair in self._pairs.items() if pair in kept]
         while answer := self._answer(others):
             # single returns come first: their sentence is simpler
             alone = [
@@ -365,15 +345,11 @@ class Axioms:
             if alone:
                 clearest = max(alone, key=returns.excess)
                 refusal: Refusal | None = frozenset([clearest])
-                found = (
-                    returns.excess(clearest),
-                    returns.why_apart(clearest.first, clearest.second, self._names) or "",
-                )
+                why = returns.why_apart(clearest.first, clearest.second, self._names)
+                found = returns.excess(clearest), why or ""
             else:
-                refusal = next(
-                    filter(None, (self._refused_together(displacement, answer, t) for t in steps)),
-                    None,
-                )
+                both = (self._refused_together(displacement, answer, t) for t in steps)
+                refusal = next(filter(None, both), None)
                 found = 0.0, returns.why_not_both(refusal or (), self._names)
             if refusal is None:
                 break
@@ -408,9 +384,7 @@ class Axioms:
             if core is None or not core <= set(some):
                 if self.consistent(some, assumed):
                     return False
-                core = {
-                    symbol for symbol, _ in self._of_last_core([(symbol, True) for symbol in some])
-                }
+                core = {symbol for symbol, _ in self._of_last_core([(s, True) for s in some])}
             return True
 
         for axiom in dict.fromkeys(self._pairs[symbol][0] for symbol in kept):

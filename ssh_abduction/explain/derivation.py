@@ -8,7 +8,7 @@ from typing import Any
 
 from ssh_abduction.checker.checker import Violation
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.words import attributes_of
+from ssh_abduction.data.words import PlainData, attributes_of
 from ssh_abduction.explain.no_map import ClashingAxiom, clashes_of
 
 # If an inference has more reasons than IN_A_LINE, each gets a line of its own.
@@ -36,7 +36,7 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class Inference:
+class Inference(PlainData):
     """One line of an argument.
 
     Attributes:
@@ -52,10 +52,6 @@ class Inference:
     links: tuple[ClashingAxiom, ...]
     premises: tuple[int, ...]
     supposed: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the line as plain data, as `explain --json` prints it."""
-        return attributes_of(self, "says", "because", "premises", "supposed", "links")
 
 
 @dataclass(frozen=True, slots=True)

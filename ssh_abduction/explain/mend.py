@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain, count
 from typing import Any, Unpack
 
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import AbductionError
-from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View
+from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.no_map import Explanation, explain
@@ -196,9 +197,9 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
         search = self._solved(trace, theory, 1, self._watch.left() * SHARE)
         found = next(iter(search), None)
         self._ended(search)
-        return (
-            True if found is not None else False if search.status is Status.UNSATISFIABLE else None
-        )
+        if found is not None:
+            return True
+        return False if search.status is Status.UNSATISFIABLE else None
 
     def _observations(
         self, stretch: range
@@ -218,45 +219,33 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
             if t < stretch[-1] and step.action is not None and not step.action.starts:
                 yield t, "action", repr(step.action.name), self._with_actions(t)
             if t > stretch[0] and step.displacement is not None and theory.displacement == "use":
-                unknown = _with_step(trace, t, replace(step, displacement=None, covariance=None))
-                yield (
-                    t,
-                    "displacement",
-                    str(tuple(round(x, 3) for x in step.displacement)),
-                    [(None, unknown, theory)],
-                )
+                unknown = trace.without_displacements_at([t])
+                moved = tuple(round(x, 3) for x in step.displacement)
+                yield t, "displacement", str(moved), [(None, unknown, theory)]
         for name in ASSERTIONS:
             pairs = getattr(theory, name)
             for pair in pairs:
                 if set(pair) <= set(stretch):
-                    left = theory.replace(
-                        **{name: tuple(other for other in pairs if other != pair)}
-                    )
+                    left = theory.replace(**{name: tuple(p for p in pairs if p != pair)})
                     first, second = (names[t] for t in pair)
                     yield second, name, f"{first} and {second}", [(None, trace, left)]
 
     def _with_views(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
         """Yield alternatives to the view of a step: all other views, and a new one."""
-        step = self.trace.steps[t]
-        views = [
-            view
-            for view in dict.fromkeys(self.trace.views)
-            if view is not None and view != step.view
-        ]
-        new: View = next(name for name in _names("new view") if name not in views)
-        for view in views:
-            yield repr(view), _with_step(self.trace, t, replace(step, view=view)), self.theory
-        yield NEW_VIEW, _with_step(self.trace, t, replace(step, view=new)), self.theory
+        views = dict.fromkeys(self.trace.views, "")
+        others = [view for view in views if view not in (None, self.trace.steps[t].view)]
+        names = chain(["new view"], (f"new view {number}" for number in count(2)))
+        for view in others:
+            yield repr(view), self._changed(t, view=view), self.theory
+        new = next(name for name in names if name not in views)
+        yield NEW_VIEW, self._changed(t, view=new), self.theory
 
     def _with_stars(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
         """Yield alternatives to the star of a step: all other stars of the trace."""
-        step = self.trace.steps[t]
-        for star in dict.fromkeys(
-            other.star for other in self.trace.steps if other.star is not None
-        ):
-            if star != step.star:
-                changed = replace(step, star=star)
-                yield _star(changed), _with_step(self.trace, t, changed), self.theory
+        for star in dict.fromkeys(step.star for step in self.trace.steps):
+            if star is not None and star != self.trace.steps[t].star:
+                changed = self._changed(t, star=star)
+                yield _star(changed.steps[t]), changed, self.theory
 
     def _with_actions(self, t: int) -> Iterator[tuple[str | None, Trace, Theory]]:
         """Yield alternatives to the action of a step: other actions, and an unknown one.
@@ -276,30 +265,14 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
         for action in known.values():
             is_other = step.action is not None and action.name != step.action.name
             if is_other and not (moves and action.breaks_frame):
-                yield (
-                    repr(action.name),
-                    _with_step(self.trace, t, replace(step, action=action)),
-                    self.theory,
-                )
-        yield (
-            None,
-            _with_step(self.trace, t, replace(step, action=Action.that_slipped(t))),
-            self.theory,
-        )
+                yield repr(action.name), self._changed(t, action=action), self.theory
+        yield None, self._changed(t, action=Action.that_slipped(t)), self.theory
 
-
-def _with_step(trace: Trace, t: int, step: Step) -> Trace:
-    """Replace step t of a trace."""
-    return replace(trace, steps=(*trace.steps[:t], step, *trace.steps[t + 1 :]))
-
-
-def _names(stem: str) -> Iterator[str]:
-    """Yield names without end: the stem, then the stem with 2, 3, … after it."""
-    yield stem
-    number = 1
-    while True:
-        number += 1
-        yield f"{stem} {number}"
+    def _changed(self, t: int, **fields: Any) -> Trace:
+        """Return the trace with other fields at step t."""
+        steps = self.trace.steps
+        step = replace(steps[t], **fields)
+        return replace(self.trace, steps=(*steps[:t], step, *steps[t + 1 :]))
 
 
 def _star(step: Step) -> str:

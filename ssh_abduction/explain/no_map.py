@@ -21,7 +21,7 @@ from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import attributes_of
+from ssh_abduction.data.words import PlainData
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.solver import check_rules
@@ -34,7 +34,7 @@ STRETCH = 8
 
 
 @dataclass(frozen=True, slots=True)
-class ClashingAxiom:
+class ClashingAxiom(PlainData):
     """An axiom that cannot hold at all these steps together with the other axioms of a clash.
 
     Attributes:
@@ -45,10 +45,6 @@ class ClashingAxiom:
     axiom: str
     steps: tuple[int, ...]
 
-    def to_dict(self) -> dict[str, object]:
-        """Return the axiom and its steps as plain data."""
-        return attributes_of(self, "axiom", "steps")
-
 
 def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[ClashingAxiom, ...]:
     """Group links (pairs of an axiom and a step) by axiom, in the order of first links."""
@@ -57,7 +53,7 @@ def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[ClashingAxiom, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class Explanation:
+class Explanation(PlainData):
     """A stretch of the trace without a map, and a minimal set of axioms that clash there.
 
     The set is minimal: if one axiom is dropped at only one step, a map satisfies the rest.
@@ -91,10 +87,6 @@ class Explanation:
         where = f"step {self.last}" if self.first == self.last else many
         clash = f"these clash: {', '.join(parts)}" if parts else "some clash"
         return f"no map satisfies the axioms: in {where} {clash}"
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the explanation as plain data, as `solve --json` prints it."""
-        return attributes_of(self, "first", "last", "clashes", "sentences")
 
 
 def explain(

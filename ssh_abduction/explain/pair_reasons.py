@@ -138,21 +138,19 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
 
     def known(self, why: Stop | None = None) -> PairExplanation:
         """Return what is known so far. `why` is the limit that is about to end the search."""
-        verdict = self._verdict()
-        stopped = why or self.stopped
         return PairExplanation(
             self.first,
             self.second,
-            verdict,
-            self._sides[True],
-            self._sides[False],
-            self._listed,
-            self._derivation,
-            self._clash,
-            stopped,
-            self.theory,
-            self._loop(),
-            self._changes,
+            self._verdict(),
+            same=self._sides[True],
+            different=self._sides[False],
+            listed=self._listed,
+            derivation=self._derivation,
+            clash=self._clash,
+            stopped=why or self.stopped,
+            theory=self.theory,
+            loop=self._loop(),
+            changes=self._changes,
         )
 
     def _loop(self) -> str | None:
@@ -207,10 +205,8 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
 
     def _is_beaten(self, side: Side, by: Side) -> bool:
         """Tell whether all maps of this side are known to cost more than a map of the side `by`."""
-        if side.cost is None or not side.proven or by.cost is None:
-            return False
         here, there = side.dearness(self.theory), by.dearness(self.theory)
-        return here is not None and there is not None and here > there
+        return side.proven and here is not None and there is not None and here > there
 
     def _find_out(self) -> None:
         self._begin_with_known_maps()
@@ -232,11 +228,9 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             if one not in self._ruling_out:
                 self._ask_pieces(one, LARGE)
             if one in self._ruling_out:
-                piece = self._shrunk(self._ruling_out[one], one)
-                pair = self.first, self.second
-                self._derivation = Argument(
-                    piece, self.trace, pair, one=not one, stop=self._over
-                ).derivation()
+                piece, pair = self._shrunk(self._ruling_out[one], one), (self.first, self.second)
+                argument = Argument(piece, self.trace, pair, one=not one, stop=self._over)
+                self._derivation = argument.derivation()
         if self._best:
             ssh_map, side = self._best
             places = [ssh_map.place_of(step) for step in (self.first, self.second)]
@@ -354,12 +348,9 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
 
     def _list_minimal_maps(self, settled: bool) -> None:
         """List minimal maps, or one if `settled`. Count those in which the steps are one dstate."""
-        left = self._watch.left()
-        seconds = (
-            min(left, max(CONFIRMING, 0.0 if self.limit is None else self.limit / 10))
-            if settled
-            else left * SHARE
-        )
+        seconds = self._watch.left() * SHARE
+        if settled:
+            seconds = min(self._watch.left(), max(CONFIRMING, (self.limit or 0.0) / 10))
         search = self._solved(self.trace, self.theory, 1 if settled else self._maps, seconds)
         for found in search:
             is_minimal = search.status is Status.OPTIMAL
@@ -378,28 +369,18 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
     def _find_best(self, one: bool) -> None:
         """Find the best map of the side `one`."""
         name = "same" if one else "different"
-        theory = self.theory.replace(
-            **{name: (*getattr(self.theory, name), (self.first, self.second))}
-        )
-        search = self._solved(
-            self.trace,
-            theory,
-            1,
-            self._watch.left() * (SHARE if self._minimum is None else 2 * SHARE),
-        )
+        pairs = (*getattr(self.theory, name), (self.first, self.second))
+        seconds = self._watch.left() * (SHARE if self._minimum is None else 2 * SHARE)
+        search = self._solved(self.trace, self.theory.replace(**{name: pairs}), 1, seconds)
         for found in search:
             proven = search.status is Status.OPTIMAL
             self._keep(found, search.cost, search.nats, proven=proven)
+        side = self._sides[one]
         if search.status is Status.UNSATISFIABLE:
             self._sides[one] = Side(possible=False)
-        elif (
-            self._sides[one].cost
-            and self._minimum
-            and self._sides[one].proven
-            and not self._is_dearer(self._sides[one])
-        ):
+        elif side.cost and self._minimum and side.proven and not self._is_dearer(side):
             self._minimal[one] = True
-            self._sides[one] = replace(self._sides[one], maps=max(1, self._sides[one].maps))
+            self._sides[one] = replace(side, maps=max(1, side.maps))
         # the best maps of both sides are known, although minimal maps were not listed in time
         elif self._minimum is None and all(
             side.proven and side.cost for side in self._sides.values()

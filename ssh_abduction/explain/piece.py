@@ -69,15 +69,13 @@ class Piece:
             )
             for name in ASSERTIONS
         }
+        closures = closures_among(trace.closures, steps)
+        alone = replace(trace, steps=tuple(kept), closures=closures)
         gap = steps[-1] - steps[0] + 1 > len(steps)
-        facts_across = _said_across(problem, number) if gap else ""
         return Piece(
-            problem.changed(
-                replace(trace, steps=tuple(kept), closures=closures_among(trace.closures, steps)),
-                theory.replace(**pairs),
-            ),
+            problem.changed(alone, theory.replace(**pairs)),
             tuple(names[t] for t in steps),
-            facts_across,
+            _said_across(problem, number) if gap else "",
         )
 
 

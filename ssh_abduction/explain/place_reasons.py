@@ -25,7 +25,7 @@ from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import course_named, list_in_words, regions_at
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import attributes_of
+from ssh_abduction.data.words import PlainData
 from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
 from ssh_abduction.solver import Cost, Judging, Stop, with_regions
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -70,7 +70,7 @@ def explain_place(
 
 
 @dataclass(frozen=True, slots=True)
-class PathSide:
+class PathSide(PlainData):
     """The side of a path on which a place lies, and why.
 
     Attributes:
@@ -88,13 +88,9 @@ class PathSide:
     sentence: str
     agree: int
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the side as plain data, as `explain --json` prints it."""
-        return attributes_of(self, "path", "side", "steps", "sentence", "agree")
-
 
 @dataclass(frozen=True, slots=True)
-class PlaceExplanation:
+class PlaceExplanation(PlainData):
     """Where a place lies: its sides of paths, and the regions around it.
 
     Attributes:
@@ -137,8 +133,7 @@ class PlaceExplanation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the explanation as plain data, as `explain --json` prints it."""
-        names = ("place", "sides", "regions", "changes", "maps", "possible", "stopped", "sentences")
-        return attributes_of(self, *names)
+        return {**PlainData.to_dict(self), "sentences": list(self.sentences)}
 
 
 class PlaceQuestion(LimitedQuestion[PlaceExplanation]):

@@ -140,12 +140,11 @@ class PairExplanation:
 
     def _of_costs(self) -> Iterator[str]:
         """Yield a sentence about the cost of the best map that contradicts the verdict."""
-        lost, won, equal = (
-            (self.same, self.different, "=")
-            if self.verdict is Verdict.DIFFERENT_IN_MINIMAL
-            else (self.different, self.same, "≠")
-        )
-        if self.verdict not in (Verdict.DIFFERENT_IN_MINIMAL, Verdict.SAME_IN_MINIMAL):
+        if self.verdict is Verdict.DIFFERENT_IN_MINIMAL:
+            lost, won, equal = self.same, self.different, "="
+        elif self.verdict is Verdict.SAME_IN_MINIMAL:
+            lost, won, equal = self.different, self.same, "≠"
+        else:
             return
         rival = f"with step {self.first} {equal} step {self.second}"
         if lost.possible is False:
@@ -162,10 +161,8 @@ class PairExplanation:
 
     def _weighed(self, lost: Side, won: Side) -> str:
         """Say in nats why the maps of one side cost more than the maps of the other side."""
-        assert lost.nats is not None
-        assert won.nats is not None
-        assert lost.cost is not None
-        assert won.cost is not None
+        assert lost.nats is not None and won.nats is not None  # noqa: PT018
+        assert lost.cost is not None and won.cost is not None  # noqa: PT018
         joining = self.verdict is Verdict.DIFFERENT_IN_MINIMAL
         pair = f"steps {self.first} and {self.second}"
         names = ("dstates", "places", "paths", "faults")  # a fault costs dstates
@@ -199,11 +196,8 @@ class PairExplanation:
         The keys of the dict are `same` (the steps are one dstate) and `different` (they are not).
         """
         sides = {"same": self.same, "different": self.different}
-        best = min(
-            (s for s in sides.values() if s.cost),
-            key=lambda side: side.dearness(self.theory) or (),
-            default=None,
-        )
+        known_sides = [side for side in sides.values() if side.cost]
+        best = min(known_sides, key=lambda side: side.dearness(self.theory) or (), default=None)
         costs = {}
         for name, side in sides.items():
             other = self.different if side is self.same else self.same
@@ -253,10 +247,8 @@ def _counts(cost: Cost, names: Iterable[str]) -> Iterator[tuple[str, float]]:
 
 def _in_words(cost: Cost, names: Iterable[str]) -> str:
     """Put the counts with these names into words."""
-    return (
-        ", ".join(f"{number:g} {_noun(name, number)}" for name, number in _counts(cost, names))
-        or "no count is preferred"
-    )
+    counts = [f"{number:g} {_noun(name, number)}" for name, number in _counts(cost, names)]
+    return ", ".join(counts) or "no count is preferred"
 
 
 def _noun(name: str, number: float) -> str:
@@ -280,12 +272,10 @@ def _effect(nats: float) -> str:
 def _difference(lost: Cost, won: Cost, theory: Theory) -> str:
     """Compare two costs in words: the first count that differs, and the equal counts before it."""
     same: list[str] = []
-    for (name, one), (_, other) in zip(
-        _counts(lost, theory.priorities), _counts(won, theory.priorities), strict=True
-    ):
+    counts = (_counts(cost, theory.priorities) for cost in (lost, won))
+    for (name, one), (_, other) in zip(*counts, strict=True):
+        said = f"{one:g} {_noun(name, one)}"
         if one != other:
-            return f"{one:g} {_noun(name, one)}, not {other:g}" + (
-                f", with {' and '.join(same)}" if same else ""
-            )
-        same.append(f"{one:g} {_noun(name, one)}")
+            return f"{said}, not {other:g}" + (f", with {' and '.join(same)}" if same else "")
+        same.append(said)
     return f"{_in_words(lost, theory.priorities)}, as many as the minimal maps"

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 import clingo
 
 from ssh_abduction.data.closure import match_in_words
+from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import why_apart
 from ssh_abduction.explain.piece import Piece
@@ -36,13 +37,10 @@ _WORDS = {
     "left": "step {0} {is} at a place to the left of {path1}",
     "turned": "steps {0} and {1} {are} at one place, and step {1} {faces} {turn} step {0}",
 }
-# What the user says of two steps, by the field of the theory.
-_SAID = {
-    "same": "are one dstate",
-    "different": "are different dstates",
-    "elsewhere": "are at different places",
-    "same_place": "are at one place",
-}
+# Conclusions about two steps that read the same in either order.
+_SYMMETRIC = frozenset(
+    ("one_dstate", "two_dstates", "one_place", "two_places", "one_course", "opposite", "two_paths")
+)
 # How a step faces relative to another step, if it is turned 0, 1, 2 or 3 quarters clockwise.
 _TURNED = (
     "the same way as",
@@ -81,32 +79,16 @@ class Words:
         "would be" instead of "is", for a conclusion that is only supposed.
         """
         name, steps = conclusion
-        if name in (
-            "one_dstate",
-            "one_place",
-            "two_places",
-            "two_dstates",
-            "one_course",
-            "opposite",
-            "two_paths",
-        ):
+        if name in _SYMMETRIC:
             steps = tuple(sorted(steps))
         turn = ""
         if name == "turned":
             steps, turn = steps[:2], _TURNED[steps[2]]
         shown = [str(self._piece.steps[t]) for t in steps]
         paths = {f"path{k}": self._path(t) for k, t in enumerate(steps)}
-        verbs = (
-            {"is": "would be", "are": "would be", "leaves": "would leave", "faces": "would face"}
-            if would
-            else {}
-        )
-        return _WORDS[name].format(
-            *shown,
-            turn=turn,
-            **paths,
-            **{verb: verbs.get(verb, verb) for verb in ("is", "are", "leaves", "faces")},
-        )
+        verbs = {"is": "be", "are": "be", "leaves": "leave", "faces": "face"}
+        said = {verb: f"would {bare}" if would else verb for verb, bare in verbs.items()}
+        return _WORDS[name].format(*shown, turn=turn, **paths, **said)
 
     def _path(self, t: int) -> str:
         """Name the path of step t of the piece, by a known travel along it if there is one."""
@@ -152,29 +134,23 @@ class Words:
         if axiom == "functional_view":
             seen = self._piece.trace.views
             named = (i, j) if t in (i, j) and seen[i] != seen[j] else (t,)
-            return (
-                f"{sentence}, and {', '.join(f'step {steps[k]} sees {seen[k]!r}' for k in named)}"
-            )
+            sights = ", ".join(f"step {steps[k]} sees {seen[k]!r}" for k in named)
+            return f"{sentence}, and {sights}"
         if axiom == "closure":
             ends = steps[i], steps[j]
             found = [c for c in self._trace.closures if (c.first, c.last) == ends]
             return "; ".join([sentence, *(match_in_words(match, *ends) for match in found)])
-        if axiom == "one_pose" and (
-            apart := why_apart(
-                self._trace,
-                steps[i],
-                steps[j],
-                self._piece.theory.replace(same=(), different=(), elsewhere=(), same_place=()),
-            )
-        ):
-            return f"{sentence}; {apart}"
+        if axiom == "one_pose":
+            theory = self._piece.theory.replace(**dict.fromkeys(ASSERTIONS, ()))
+            if apart := why_apart(self._trace, steps[i], steps[j], theory):
+                return f"{sentence}; {apart}"
         return sentence
 
     def _asserted(self, t: int, pair: tuple[int, ...]) -> list[str]:
         """List what the user says of a pair of steps or, if nothing, of step t and earlier ones."""
         said = [
             (tuple(sorted(steps)), words)
-            for kind, words in _SAID.items()
+            for kind, words in ASSERTED.items()
             for steps in getattr(self._piece.theory, kind)
             if t == max(steps)
         ]

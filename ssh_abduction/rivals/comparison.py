@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.groups import indices_of
-from ssh_abduction.data.words import attributes_of, counted
+from ssh_abduction.data.words import PlainData, attributes_of, counted
 from ssh_abduction.rivals.differences import Difference, difference
 from ssh_abduction.rivals.factors import deciding, independent, options_of
 from ssh_abduction.rivals.listing import Listing, Maps
@@ -65,7 +65,7 @@ class Option:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class Choice(PlainData):
     """Questions that depend on each other, but on no question of another choice.
 
     Attributes:
@@ -78,10 +78,6 @@ class Choice:
     questions: tuple[Question, ...]
     options: tuple[Option, ...]
     differing: dict[Matter, tuple[int, ...]] = field(hash=False)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the choice as plain data, as `compare --json` prints it."""
-        return attributes_of(self, "questions", "options", "differing")
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,17 +105,12 @@ class Others:
     def sentence(self) -> str:
         """A sentence: the number of maps in both lists, and in only one of them."""
         if not self.here and not self.there:
-            return (
-                f"the {self.count} maps are the same in both"
-                if self.count > 1
-                else "the map is the same in both"
-            )
-        parts = [
-            f"{len(self.both)} in both",
-            f"{len(self.here)} only in the first",
-            f"{len(self.there)} only in {printable(self.source)}",
-        ]
-        return "of the maps, " + ", ".join(parts[:-1]) + " and " + parts[-1]
+            maps = f"the {self.count} maps are" if self.count > 1 else "the map is"
+            return f"{maps} the same in both"
+        return (
+            f"of the maps, {len(self.both)} in both, {len(self.here)} only in the first and "
+            f"{len(self.there)} only in {printable(self.source)}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as plain data, as `compare --json` prints it."""

@@ -58,10 +58,8 @@ class Consequence:
         if not (self.is_sure and other.is_sure and self.seen and other.seen):
             return False
         one, two = self.seen, other.seen
-        views_differ = one.view is not None and two.view is not None and one.view != two.view
-        return views_differ or (
-            one.star is not None and two.star is not None and one.star != two.star
-        )
+        both = ((one.view, two.view), (one.star, two.star))
+        return any(None not in pair and pair[0] != pair[1] for pair in both)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the prediction as plain data, as `next --json` prints it."""
@@ -96,7 +94,6 @@ class Consequences:
             if theory is None
             else theory.star == "frame" and theory.hard >= OF_FRAMES
         )
-        has_courses = theory is None or theory.hard >= _OF_COURSES
         self._framed = {(s.place, s.heading): s.id for s in headed} if has_frames else {}
         self._seen_at = {s.place: s for s in headed} if has_frames else {}  # a dstate at each place
         self._at: dict[tuple[int | None, int | None, int | None], int] = {
@@ -104,7 +101,7 @@ class Consequences:
             for s in ssh_map.dstates
             if s.path is not None and s.place is not None
         }
-        self._turns_back = has_courses
+        self._turns_back = theory is None or theory.hard >= _OF_COURSES
         self._orders = {path.id: path.order for path in ssh_map.paths}
 
     def of(self, dstate: int, action: Action) -> Consequence:

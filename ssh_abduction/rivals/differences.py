@@ -128,14 +128,11 @@ class Difference:
         for name, links in zip(self.names, self.links, strict=True):
             some = [
                 f"{printable(action)} from the dstate of step {s} to that of step {x}"
-                for s, action, x in links[:LISTED]
+                for s, action, x in links
             ]
-            more = f", and {len(links) - LISTED} more" if len(links) > LISTED else ""
-            lines += [f"links: only in {name} {', '.join(some)}{more}"] if some else []
+            lines += [f"links: only in {name} {_listed(some)}"] if some else []
         for name, sides in zip(self.names, self.sides, strict=True):
-            more = f", and {len(sides) - LISTED} more" if len(sides) > LISTED else ""
-            some = [*map(str, sides[:LISTED])]
-            lines += [f"sides: only {name} knows that {', '.join(some)}{more}"] if some else []
+            lines += [f"sides: only {name} knows that {_listed(sides)}"] if sides else []
         if any(self.has_places) and not all(self.has_places):
             lines.append(f"places and paths: only in {self.names[self.has_places.index(True)]}")
         if self.chi2 and self.chi2[0] != self.chi2[1]:
@@ -305,3 +302,9 @@ def _groups_in_words(groups: Sequence[Steps], none: Steps) -> str:
 
 def _steps(count: int) -> str:
     return "step" if count == 1 else "steps"
+
+
+def _listed(parts: Sequence[object]) -> str:
+    """Join the first LISTED parts by commas, and say how many more there are."""
+    more = [f"and {len(parts) - LISTED} more"] if len(parts) > LISTED else []
+    return ", ".join([*map(str, parts[:LISTED]), *more])

@@ -14,15 +14,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import combinations, product
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.groups import firsts, gathered
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import PlainData, counted
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import probability_in_words
 
@@ -33,7 +33,7 @@ _Placing: TypeAlias = Sequence[int]  # the place of each step by one map; withou
 
 
 @dataclass(frozen=True, slots=True)
-class DriveJoin:
+class DriveJoin(PlainData):
     """A step of one drive and a step of another drive that are at one place in some map.
 
     Attributes:
@@ -49,7 +49,7 @@ class DriveJoin:
 
 
 @dataclass(frozen=True, slots=True)
-class DrivePair:
+class DrivePair(PlainData):
     """The places that two drives share.
 
     A join is two steps, one of each drive, at one place. Many joins may be about the same two
@@ -114,10 +114,6 @@ class DrivePair:
         more = len(joins) - SHOWN
         return "; ".join([*shown, *([f"and {more} more"] if more > 0 else [])])
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the pair as plain data, as `compare --json` prints it."""
-        return asdict(self)
-
 
 def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
     """Find what each pair of drives has in common in the maps of a joint trace.
@@ -146,17 +142,11 @@ def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
         at: list[_Placing] = [rival.places or rival.dstates for rival in weighed.rivals]
         weights = weighed.weights if weighed.doubt is None else [1 / len(at)] * len(at)
         return at, [*weights], weighed.within > 0
-    minimal = listing.maps[: listing.minimal]
-    placings: list[_Placing] = []
-    for ssh_map in minimal:
-        places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
-        placings.append(
-            [
-                label if place is None else place
-                for label, place in zip(ssh_map.dstate_at, places, strict=True)
-            ]
-        )
-    return placings, [1 / len(minimal)] * len(minimal), listing.complete is True
+    placings: list[_Placing] = [
+        [s if (place := ssh_map.dstates[s].place) is None else place for s in ssh_map.dstate_at]
+        for ssh_map in listing.maps[: listing.minimal]
+    ]
+    return placings, [1 / len(placings)] * len(placings), listing.complete is True
 
 
 def _pair(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.words import attributes_of
+from ssh_abduction.data.words import PlainData, attributes_of
 from ssh_abduction.rivals.consequences import Consequence
 from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.solver import Stop, stretches
@@ -31,7 +31,7 @@ class Expectation:
 
 
 @dataclass(frozen=True, slots=True)
-class Untried:
+class Untried(PlainData):
     """An action for which at least one rival has no link, and the way to it.
 
     Attributes:
@@ -47,10 +47,6 @@ class Untried:
     expects: tuple[Expectation, ...]
     worst: int
     pairs: int
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the action as plain data, as `next --json` prints it."""
-        return attributes_of(self, "way", "action", "worst", "pairs", "expects")
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +112,7 @@ class ExperimentPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
+class Prediction(PlainData):
     """The predictions of some rivals for the actions of an experiment.
 
     Attributes:
@@ -126,10 +122,6 @@ class Prediction:
 
     rivals: tuple[int, ...]
     seen: tuple[Seen, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the predictions as plain data, as `next --json` prints it."""
-        return {"rivals": list(self.rivals), "seen": [seen.to_dict() for seen in self.seen]}
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +174,29 @@ class Experiment:
     @property
     def sentence(self) -> str:
         """A sentence that describes the experiment and how many rivals it leaves."""
-        return _sentence(self)
+        plan, count = self.plan, self.count
+        if count == 1:
+            return f"1 map: there is nothing to tell apart; {_untried_in_words(plan.untried)}"
+        if plan.branches:
+            left = f"leaves {plan.worst} of them in the worst case, as known links do not tell them"
+            left = "leaves one of them" if plan.worst == 1 else f"{left} apart"
+            whole = "this"
+            if any(branch.plan.branches for branch in plan.branches):
+                whole = f"the whole plan takes {plan.longest} actions at most and"
+            text = f"{count} maps: after {_acts(plan.actions)} their predictions differ; "
+            is_greedy = len(self.alike) != 2
+            more = " (another plan may be shorter or leave fewer)" if is_greedy else ""
+            return f"{text}{whole} {left}{more}"
+        if self.stopped:
+            return f"{count} maps: no experiment was found in time"
+        links = "all links" if len(self.alike) == 1 else "all links that all of them know"
+        why = {
+            "dstates and places": ", as they have the same dstates and places and differ only in "
+            "paths",
+            "dstates": ", as they have the same dstates",
+        }.get(self.sharing, "")
+        untried = _untried_in_words(plan.untried)
+        return f"{count} maps predict the same along {links}{why}; {untried}"
 
     @property
     def warning(self) -> str | None:
@@ -209,35 +223,6 @@ class Experiment:
             "longest": self.plan.longest,
             **attributes_of(self, "predictions", "plan", *(["stopped"] if self.stopped else [])),
         }
-
-
-def _sentence(experiment: Experiment) -> str:
-    """Put an experiment into words, for `Experiment.sentence`."""
-    plan, count = experiment.plan, experiment.count
-    if count == 1:
-        return f"1 map: there is nothing to tell apart; {_untried_in_words(plan.untried)}"
-    if plan.branches:
-        left = (
-            "leaves one of them"
-            if plan.worst == 1
-            else f"leaves {plan.worst} of them in the worst case, as known links do not tell them "
-            "apart"
-        )
-        text = f"{count} maps: after {_acts(plan.actions)} their predictions differ; this {left}"
-        if any(branch.plan.branches for branch in plan.branches):
-            text = f"{count} maps: after {_acts(plan.actions)} their predictions differ; the whole "
-            text += f"plan takes {plan.longest} actions at most and {left}"
-        is_greedy = len(experiment.alike) != 2
-        return f"{text} (another plan may be shorter or leave fewer)" if is_greedy else text
-    if experiment.stopped:
-        return f"{count} maps: no experiment was found in time"
-    links = "all links" if len(experiment.alike) == 1 else "all links that all of them know"
-    why = {
-        "dstates and places": ", as they have the same dstates and places and differ only in paths",
-        "dstates": ", as they have the same dstates",
-    }.get(experiment.sharing, "")
-    untried = _untried_in_words(plan.untried)
-    return f"{count} maps predict the same along {links}{why}; {untried}"
 
 
 def _untried_in_words(untried: Untried | None) -> str:

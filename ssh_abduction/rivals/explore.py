@@ -52,6 +52,7 @@ import numpy as np
 
 from ssh_abduction.data.checks import a_flag, a_function, a_list, an_instance
 from ssh_abduction.data.errors import MapError, brief
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap, check_labels, checked_map
 from ssh_abduction.data.trace import Action, Trace, checked_trace
 from ssh_abduction.rivals.consequences import Consequence, Consequences, is_possible
@@ -222,6 +223,8 @@ class Laboratory:
 
         All rivals must have links for the actions. Without actions, there are no predictions.
         """
+        if not actions:
+            return ()
         names = [action.name for action in self._actions]
         found: dict[tuple[int, ...], list[int]] = {}
         for machine, group in enumerate(self._groups):
@@ -231,8 +234,6 @@ class Laboratory:
                 seen.append(int(self._table.sights[machine, state]))
             found.setdefault(tuple(seen), []).extend(group)
         looks = self._sights.seen
-        if not actions:
-            return ()
         return tuple(
             Prediction(_numbers(group), tuple(looks[k] for k in seen))
             for seen, group in found.items()
@@ -249,10 +250,9 @@ class Laboratory:
             self.stopped = limit.reason
             return ExperimentPlan(rivals)
         actions, parts = split
+        looks = self._sights.seen
         branches = tuple(
-            Branch(
-                self._sights.seen[seen], self._plan_for([machines[k] for k in part], tuple(states))
-            )
+            Branch(looks[seen], self._plan_for([machines[k] for k in part], tuple(states)))
             for seen, (part, states) in sorted(parts.items())
         )
         return ExperimentPlan(rivals, tuple(self._actions[a].name for a in actions), branches)
@@ -279,11 +279,8 @@ class Laboratory:
                     worst = int(np.bincount(seen[i], weights).max())
                     gain = math.log(total / worst) / (layer.depth + 1)
                     if best is None or gain > best[0]:
-                        best, end, sights = (
-                            (gain, first + i, action),
-                            there[i].tolist(),
-                            seen[i].tolist(),
-                        )
+                        best = gain, first + i, action
+                        end, sights = there[i].tolist(), seen[i].tolist()
         if best is None:
             return None
         parts: dict[int, tuple[list[int], list[int]]] = {}
@@ -328,18 +325,13 @@ class Laboratory:
             self._can is not None and done.name not in self._can(self._sights.seen[here])
         ):
             return None
-        said: dict[Consequence, list[int]] = {}
-        for machine, state in zip(machines, states, strict=True):
-            for rival in self._groups[machine]:
-                said.setdefault(
-                    self._consequence(rival, self._reached[rival][state], action), []
-                ).append(rival)
-        if (
-            all(consequence.is_sure and consequence.dstate is not None for consequence in said)
-            and len({c.seen for c in said}) == 1
-        ):
-            return None
-        return said
+        said = gathered(
+            (self._consequence(rival, self._reached[rival][state], action), rival)
+            for machine, state in zip(machines, states, strict=True)
+            for rival in self._groups[machine]
+        )
+        all_sure = all(c.is_sure and c.dstate is not None for c in said)
+        return None if all_sure and len({c.seen for c in said}) == 1 else said
 
     def _consequence(self, rival: int, dstate: int, action: int) -> Consequence:
         """Return the prediction of a rival for an action at a dstate of its map."""

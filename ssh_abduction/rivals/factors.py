@@ -33,7 +33,7 @@ from math import prod
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.rivals.table import Bools
+from ssh_abduction.rivals.table import Bools, columns_numbered
 
 
 def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] = ()) -> list[int]:
@@ -97,11 +97,7 @@ def options_of(columns: Sequence[Bools] | Bools, maps: int) -> NDArray[np.intp]:
     """
     if not len(columns):
         return np.zeros(maps, dtype=np.intp)
-    packed = np.packbits(np.asarray(columns, dtype=bool), axis=0)
-    _, first, inverse = np.unique(packed, axis=1, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), dtype=np.intp)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[inverse.reshape(-1)]
+    return columns_numbered(np.packbits(np.asarray(columns, dtype=bool), axis=0))
 
 
 def _split(column: Bools, groups: NDArray[np.intp]) -> int:

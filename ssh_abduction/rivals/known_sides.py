@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 from ssh_abduction.checker.moves import course_of
 from ssh_abduction.data.checks import an_instance
@@ -23,7 +23,7 @@ from ssh_abduction.data.drives import named_steps
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import right_of
-from ssh_abduction.data.words import attributes_of, counted
+from ssh_abduction.data.words import PlainData, counted
 from ssh_abduction.rivals.listing import Listing
 
 SHOWN = 2  # a sentence names at most this many sides
@@ -32,7 +32,7 @@ _Side: TypeAlias = Literal["right", "left"]
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class Beside(PlainData):
     """A place that lies right or left of a path.
 
     Right and left are as seen by the robot at the step `along`.
@@ -53,13 +53,9 @@ class Beside:
         where = f"the place of step {self.step} lies {self.side} of the path of step {self.along}"
         return where if self.share == 1 else f"{where} ({self.share:.0%})"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data, as `compare --json` prints it."""
-        return {name: getattr(self, name) for name in self.__slots__}
-
 
 @dataclass(frozen=True, slots=True)
-class SharedSides:
+class SharedSides(PlainData):
     """The places known to lie beside paths in minimal maps.
 
     Attributes:
@@ -83,10 +79,6 @@ class SharedSides:
         more = len(self.possible) - SHOWN
         some = [*map(str, self.possible[:SHOWN]), *([f"and {more} more"] if more > 0 else [])]
         return f"{forced}, and some maps in {len(self.possible)} more: {'; '.join(some)}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data, as `compare --json` prints it."""
-        return attributes_of(self, "forced", "possible", "proven")
 
 
 def shared_sides(listing: Listing) -> SharedSides | None:

@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.star import Frame, Star
+from ssh_abduction.data.star import Frame, Star, angle_between
 from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.rivals.consequences import OF_FRAMES, is_possible
 from ssh_abduction.rivals.machines import Can, Seen, leads_of
@@ -99,17 +99,12 @@ class Stances:
         """List all moves from all stances (place, heading). This adds stances never seen before."""
         for source, tried in self._links.items():
             for name, target in tried.items():
-                if (
-                    self._actions[name].kind == "travel"
-                    and self._frames[source]
-                    and self._frames[target]
-                ):
+                has_stars = self._frames[source] and self._frames[target]
+                if self._actions[name].kind == "travel" and has_stars:
                     self._back.setdefault(self._around(target), self._around(source))
         found: list[StanceMove] = []
-        n = 0
-        while n < len(self._at):
+        for n, _ in enumerate(self._at):  # the list grows
             found += (self._move(n, action) for action in self._possible(n))
-            n += 1
         return found
 
     def _rooms(self) -> list[tuple[int, float]]:
@@ -121,11 +116,8 @@ class Stances:
         turns: dict[int, list[tuple[int, float]]] = {n: [] for n in self._links}
         for n, tried in self._links.items():
             for name, target in tried.items():
-                degrees = (
-                    _degrees(self._actions[name], self._frames[n])
-                    if self._actions[name].kind == "turn"
-                    else None
-                )
+                action = self._actions[name]
+                degrees = _degrees(action, self._frames[n]) if action.kind == "turn" else None
                 if degrees is not None:
                     turns[n].append((target, degrees))
                     turns[target].append((n, -degrees))
@@ -148,24 +140,19 @@ class Stances:
         if n < len(self._looks):
             step = self._looks[n]
             seen = Seen(step.view, step.star if self._stars[n] else None)
-            names = (
-                self._actions.keys() if self._can is None else {*self._can(seen), *self._links[n]}
-            )
+            can = {*self._actions} if self._can is None else {*self._can(seen)}
             return [
                 action
                 for name, action in self._actions.items()
-                if name in names and (name in self._links[n] or is_possible(action, seen))
+                if name in self._links[n] or (name in can and is_possible(action, seen))
             ]
         frame = self._frames[n]
         assert frame is not None
         return [
             action
             for action in self._actions.values()
-            if (
-                _faces(frame) is not None
-                if action.kind == "travel"
-                else action.kind == "turn" and _degrees(action, frame) is not None
-            )
+            if (action.kind == "travel" and _faces(frame) is not None)
+            or (action.kind == "turn" and _degrees(action, frame) is not None)
         ]
 
     def _move(self, n: int, action: Action) -> StanceMove:
@@ -174,20 +161,14 @@ class Stances:
             return StanceMove(n, action, self._links[n][action.name], "known")
         frame = self._frames[n]
         if frame is not None and action.kind == "travel":
-            return (
-                StanceMove(n, action, self._back[n], "expected")
-                if n in self._back
-                else StanceMove(n, action, self._around(n), "unknown")
-            )
+            if n in self._back:
+                return StanceMove(n, action, self._back[n], "expected")
+            return StanceMove(n, action, self._around(n), "unknown")
         degrees = _degrees(action, frame) if action.kind == "turn" else None
         if degrees is None:
             return StanceMove(n, action, n, "unknown")
-        return StanceMove(
-            n,
-            action,
-            self._turned(n, degrees),
-            "implied" if self._implies and action.in_quarters else "expected",
-        )
+        how: How = "implied" if self._implies and action.in_quarters else "expected"
+        return StanceMove(n, action, self._turned(n, degrees), how)
 
     def _around(self, n: int) -> int:
         """Find the stance (place and heading) that a turn around leads to from stance n."""
@@ -205,17 +186,12 @@ class Stances:
         assert star is not None
         assert frame is not None
         goal = (before + degrees) % 360
-        near = min(self._in[room], key=lambda m: _apart(self._at[m][1], goal))
-        if _apart(self._at[near][1], goal) <= max(frame.spreads, default=0):
+        near = min(self._in[room], key=lambda m: angle_between(self._at[m][1], goal))
+        if angle_between(self._at[near][1], goal) <= max(frame.spreads, default=0):
             return near
         self._at.append((room, goal))
         self._in[room].append(len(self._at) - 1)
-        turned = Star(
-            tuple(
-                replace(gateway, bearing=(gateway.bearing - degrees) % 360)
-                for gateway in star.gateways
-            )
-        )
+        turned = Star(tuple(replace(g, bearing=(g.bearing - degrees) % 360) for g in star.gateways))
         self._stars.append(turned)
         self._frames.append(_frame(turned))
         return len(self._at) - 1
@@ -244,8 +220,3 @@ def _degrees(action: Action, frame: Frame | None) -> float | None:
         behind = next((slot for slot in range(frame.slots) if frame.has_behind(slot)), opposite)
         return 180.0 if behind is None else frame.bearings[behind if opposite is None else opposite]
     return 90.0 * QUARTERS[action.turn or "right"]
-
-
-def _apart(one: float, other: float) -> float:
-    """Compute the angle between two directions in degrees, 0 to 180."""
-    return abs((one - other + 180) % 360 - 180)

@@ -109,10 +109,16 @@ def _common_classes(labelings: Sequence[Ints]) -> Ints:
     classes = labelings[0].astype(np.int64)
     for labels in labelings[1:]:
         _, classes = np.unique(classes * (int(labels.max()) + 1) + labels, return_inverse=True)
-    _, first, inverse = np.unique(classes, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), dtype=np.int32)
-    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
-    return rank[inverse.reshape(-1)]
+    return columns_numbered(classes[None]).astype(np.int32)
+
+
+def columns_numbered(table: NDArray[np.generic]) -> NDArray[np.intp]:
+    """Number the different columns of a table (m, n) as they first occur. Return the shape (n,)."""
+    _, first, inverse = np.unique(table, axis=1, return_index=True, return_inverse=True)
+    rank: NDArray[np.intp] = np.empty(len(first), dtype=np.intp)
+    rank[np.argsort(first)] = np.arange(len(first))
+    numbers: NDArray[np.intp] = rank[inverse.reshape(-1)]
+    return numbers
 
 
 def _firsts_of(names: Sequence[Hashable]) -> Ints:
