@@ -178,10 +178,8 @@ class SolveQuestion(FileQuestion):
             line = json_line({"trace": path, **answer_opening(search), "maps": written, **ending})
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
-        warnings = tuple(
-            warning if warning.startswith(f"{named(path)}:") else f"{named(path)}: {warning}"
-            for warning in found
-        )
+        where = f"{named(path)}:"
+        warnings = tuple(text if text.startswith(where) else f"{where} {text}" for text in found)
         return FileAnswer(number, line, exit_code(solution), warnings)
 
     @property
@@ -192,11 +190,9 @@ class SolveQuestion(FileQuestion):
     def failed(self, number: int, path: str, error: Exception) -> FileAnswer:
         """Make the answer for a trace that could not be solved because of an error."""
         message = in_a_line(error)
-        line = (
-            json_line({"trace": path, "status": "error", "error": message})
-            if self.json
-            else f"{named(path)}: error: {message}"
-        )
+        line = f"{named(path)}: error: {message}"
+        if self.json:
+            line = json_line({"trace": path, "status": "error", "error": message})
         return FileAnswer(number, line, EXIT_ERROR)
 
 
@@ -208,15 +204,14 @@ def run(options: argparse.Namespace) -> int:
             "input; save the trace to a file"
         )
     check_jobs(options.jobs, "traces to solve at a time")
-    speedups = Speedups.without(options.without_speedups)
     question = SolveQuestion(
         theory_of(options),
-        options.time_limit,
-        options.maps,
-        options.memory_limit,
-        speedups,
-        options.json,
-        options.within,
+        limit=options.time_limit,
+        maps=options.maps,
+        memory=options.memory_limit,
+        speedups=Speedups.without(options.without_speedups),
+        json=options.json,
+        within=options.within,
     )
     stop = StopFlag()
     codes = _printed(answers_of(question, paths, options, stop), len(paths), stop)

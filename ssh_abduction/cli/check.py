@@ -148,13 +148,11 @@ def run(options: argparse.Namespace) -> int:
         holds &= _costs_hold(trace, data, maps, resolved, str(options.maps), said)
     if options.bound:
         _refuse_bound(data, resolved, solved)
-        broken, doubt = not holds, None
+        broken, doubt = not holds, why if other else None
         if broken:
             doubt = "some maps break axioms" if any(violations) else "a claim about costs is false"
         elif solved is None:
             doubt = "the file names no theory"
-        elif other:
-            doubt = why
         holds &= _bound(trace, data, maps, doubt, made_by, broken, said)
     found = _Judgement(violations, resolved, [*map(printable, said)], holds)
     print(json_line(found.to_dict()) if options.json else "\n".join(found.lines()))
@@ -209,10 +207,8 @@ def _costs_hold(
         # Files of earlier versions have no confidence in places.
         claimed = data["weighed"].get(name, right if name == "place_confidence" else None)
         if not (is_finite(claimed) and abs(claimed - right) <= ROUNDED):
-            false.append(
-                f"weighed.{name}: expected {right:.6f}, by the costs of the rivals, "
-                f"got {brief(claimed)}"
-            )
+            expected = f"{right:.6f}, by the costs of the rivals"
+            false.append(f"weighed.{name}: expected {expected}, got {brief(claimed)}")
     said += false
     rivals = len(data["weighed"]["rivals"])  # the first one is map 1
     checked = max(count_checked_rivals(len(trace), rivals, theory), 1)
@@ -224,9 +220,8 @@ def _costs_hold(
         said.append(f"the costs in nats of map 1{others} are right: they were computed anew")
     if rivals > checked:
         why = "as paths have a price" if theory.prices[2] else "as that would take long"
-        said.append(
-            f"the costs of {counted(rivals - checked, 'more rivals')} are not checked, {why}"
-        )
+        more = counted(rivals - checked, "more rivals")
+        said.append(f"the costs of {more} are not checked, {why}")
     return not false
 
 
@@ -268,12 +263,9 @@ def _bound_in_words(
 
     `doubt` is as for `_bound`.
     """
-    pairs = bound.dstates * (bound.dstates - 1) // 2
-    states = counted(bound.dstates, "dstates")
-    yield (
-        f"at least {states}: no two of {counted(bound.dstates, 'steps')} can be one dstate "
-        f"({counted(pairs, 'pairs')} checked)"
-    )
+    pairs = counted(bound.dstates * (bound.dstates - 1) // 2, "pairs")
+    states, steps = counted(bound.dstates, "dstates"), counted(bound.dstates, "steps")
+    yield f"at least {states}: no two of {steps} can be one dstate ({pairs} checked)"
     if bound.refuted and doubt:
         refuted = counted(bound.refuted[0], "dstates")
         yield f"clingo's verdict on {refuted} and more is left out: {doubt}"
@@ -293,25 +285,19 @@ def _false_of_maps(data: Mapping[str, Any], maps: Sequence[SSHMap], trace: Trace
     ranking = Ranking(trace)
     for i, (said, ssh_map) in enumerate(zip(data.get("maps", ()), maps, strict=False)):
         if "id" in said and said["id"] != ssh_map.id:
-            yield (
-                f"maps[{i}].id: expected {ssh_map.id}, the digest of the map, got "
-                f"{brief(said['id'])}"
-            )
+            digest = f"{ssh_map.id}, the digest of the map"
+            yield f"maps[{i}].id: expected {digest}, got {brief(said['id'])}"
         if ssh_map.fit is None and not {"fit", "poses", "spreads"} & set(said):
             continue
         if not trace.has_displacements:
-            yield (
-                f"maps[{i}].fit: expected none, as the trace has no displacements, got "
-                f"{brief(said.get('fit'))}"
-            )
+            none = "none, as the trace has no displacements"
+            yield f"maps[{i}].fit: expected {none}, got {brief(said.get('fit'))}"
             continue
         right = ranking.fitted(ssh_map).to_dict()
         for name in ("fit", "poses", "spreads"):
             if not _is_near(said.get(name), right[name]):
-                yield (
-                    f"maps[{i}].{name}: expected {brief(right[name])}, by the displacements of "
-                    f"the trace, got {brief(said.get(name))}"
-                )
+                expected = f"{brief(right[name])}, by the displacements of the trace"
+                yield f"maps[{i}].{name}: expected {expected}, got {brief(said.get(name))}"
 
 
 def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
@@ -325,10 +311,8 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
     if backbone and backbone.proven and solution.minimal_listed:
         right = Sharing(solution.minimal_maps or solution.maps).backbone(proven=True)
         if backbone.to_dict() != right.to_dict():
-            yield (
-                f"backbone: expected {right.sentence or 'the one map'}, as the maps show, got "
-                f"{backbone.sentence or 'something else'}"
-            )
+            expected = f"{right.sentence or 'the one map'}, as the maps show"
+            yield f"backbone: expected {expected}, got {backbone.sentence or 'something else'}"
         backbone = right
     summary = summary_of(solution, solution.count, backbone)
     if data.get("summary", summary) != summary:

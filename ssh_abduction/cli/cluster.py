@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import check_picture, output, picture_file, seed, write
 from ssh_abduction.cli.outcome import warn
@@ -85,11 +85,10 @@ def run(options: argparse.Namespace) -> int:
     traces = Traces(tuple(Trace.load(file) for file in files))
     sources = ", ".join(named(file) for file in files)
     logged, features = traces.images, traces.features
+    how: dict[str, Any] = {"k": options.k, "k_max": options.k_max, "by": options.by}
     try:
         images = features.fit_transform(logged)
-        clusterer = ViewClusterer(
-            k=options.k, k_max=options.k_max, random_state=options.seed, by=options.by
-        ).fit(images)
+        clusterer = ViewClusterer(**how, random_state=options.seed).fit(images)
     except AbductionError as error:
         raise AbductionError(f"{sources}: {error}") from None
     except ValueError as error:  # the message of scikit-learn says why it cannot cluster them
@@ -119,14 +118,11 @@ def _choice_of_k(clusterer: ViewClusterer, uncertainty: dict[int, float]) -> str
     columns = {"M": clusterer.quality_, "trimmed": clusterer.trimmed_}
     columns |= {"U": uncertainty} if uncertainty else {}
     words = {clusterer.k_: "chosen", clusterer.runner_up_: "runner-up"}
-    rows = [
-        [
-            k,
-            *("–" if math.isnan(m := column[k]) else f"{m:.3f}" for column in columns.values()),
-            words.get(k, ""),
-        ]
-        for k in clusterer.quality_
-    ]
+    rows = []
+    for k in clusterer.quality_:
+        measures = [column[k] for column in columns.values()]
+        cells = ("–" if math.isnan(m) else f"{m:.3f}" for m in measures)
+        rows.append([k, *cells, words.get(k, "")])
     return table(["k", *columns, ""], rows)
 
 

@@ -77,9 +77,8 @@ def answers_on_cluster(
             ) from None
         most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
         absence = Absence(lambda: len(client.ncores()), question.limit, address)
-        for answer in _answers(
-            question, paths, partial(_on_workers, question, client, most, absence)
-        ):
+        attempt = partial(_on_workers, question, client, most, absence)
+        for answer in _answers(question, paths, attempt):
             yield answer
             if stop.is_set():
                 return
@@ -196,9 +195,8 @@ def _on_workers(
                 raise SolverError(LOST)
             if absence.is_too_long():
                 raise SolverError(absence.sentence)
-            future = client.submit(
-                _on_worker, question, number, path, question.load(path), pure=False
-            )
+            work = question, number, path, question.load(path)
+            future = client.submit(_on_worker, *work, pure=False)
         except Exception as error:
             yield question.failed(number, path, error)
             continue
@@ -242,8 +240,6 @@ def _on_worker(question: FileQuestion, number: int, path: str, content: Any) -> 
         return question.answer(number, path, content, given_up)
     # A task that exceeds its limits is killed together with its process. So it gets its own
     # process, as other tasks may run in this one.
-    work = [(number, path, content)]
-    answer: Any = next(
-        workers.answers(question.answer, work, 1, given_up, question.overdue, question.patience)
-    )
+    work, limits = [(number, path, content)], (question.overdue, question.patience)
+    answer: Any = next(workers.answers(question.answer, work, 1, given_up, *limits))
     return question.lost(answer, path) if isinstance(answer, workers.Lost) else answer

@@ -13,6 +13,7 @@ from ssh_abduction.cli.text import compared, counted, depending
 from ssh_abduction.data.errors import brief, named, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.words import attributes_of
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison
@@ -101,35 +102,30 @@ def _record(
 ) -> dict[str, Any]:
     """Return what is known of the maps of a listing, as plain data for --json."""
     weighed = listing.weighed
-    record = {
-        "by_minimality": [join.to_dict() for join in listing.by_minimality if weighed is None],
-        "drives": [pair.to_dict() for pair in drives],
-        "sides": None if sides is None else sides.to_dict(),
-        "faults": [fault.to_dict() for fault in listing.faults],
-        "warnings": list(listing.warnings),
-    }
-    names = () if weighed is None else ("confidence", "place_confidence")
-    first = {name: getattr(weighed, name) for name in names}
-    return {**first, **{name: value for name, value in record.items() if value}}
+    record = attributes_of(listing, "by_minimality", "faults", "warnings")
+    record["drives"] = [pair.to_dict() for pair in drives]
+    record["sides"] = None if sides is None else sides.to_dict()
+    first = {}
+    if weighed is not None:
+        first = attributes_of(weighed, "confidence", "place_confidence")
+        del record["by_minimality"]
+    return first | {name: value for name, value in record.items() if value}
 
 
 def differences(first: str, other: str) -> dict[str, tuple[Any, Any]]:
     """Find the settings and results that differ between two runs of the verb `map`."""
     here, there = (_flat(read_json(Path(folder) / "run.json")) for folder in (first, other))
-    names = {**here, **there}
     return {
         name: (a, b)
-        for name in names
+        for name in {**here, **there}
         if (a := here.get(name)) != (b := there.get(name)) and not name.startswith(UNSTEADY)
     }
 
 
 def _runs(differing: dict[str, tuple[Any, Any]], first: str, other: str) -> Iterator[str]:
     """Yield a line for each setting and result that differs between two runs."""
-    yield from (
-        f"{name}: {brief(a)} in {named(first)}, {brief(b)} in {named(other)}"
-        for name, (a, b) in differing.items()
-    )
+    for name, (a, b) in differing.items():
+        yield f"{name}: {brief(a)} in {named(first)}, {brief(b)} in {named(other)}"
     if not differing:
         yield "the two runs have the same settings, and found the same"
 
@@ -147,9 +143,8 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 
 def _faults(listing: Listing) -> Iterator[str]:
     """Yield a line for each fault that all listed maps have."""
-    where = "the map" if len(listing.maps) == 1 else "all maps"
-    if len(listing.maps) > 1 and not listing.complete:
-        where += " listed"
+    where = "all maps" if listing.complete else "all maps listed"
+    where = "the map" if len(listing.maps) == 1 else where
     yield from (f"  in {where}, {printable(str(fault))}" for fault in listing.faults)
 
 

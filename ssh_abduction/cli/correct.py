@@ -82,12 +82,8 @@ def run(options: argparse.Namespace) -> int:
         return 0
     file = saved.save(said)
     if saved.star == "none" and {"open", "closed"} & {kind for kind, _ in options.said}:
-        warn(
-            [
-                "this map was made without stars, so a gateway that is open or closed changes no "
-                "map; to use stars, set star=auto when you map or solve again"
-            ]
-        )
+        without = "this map was made without stars, so a gateway that is open or closed changes no"
+        warn([f"{without} map; to use stars, set star=auto when you map or solve again"])
     sentences = counted(sum(1 for _ in sentences_of(said)), "corrections")
     print(printable(f"{named(file)}: {sentences}; {_how_to_obey(saved.file)}"))
     return 0

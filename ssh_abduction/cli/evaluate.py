@@ -129,17 +129,13 @@ def _doubts(found: VisitsEvaluation, relations: str | None) -> Iterator[str]:
 
 def _nothing_judged(found: VisitsEvaluation) -> str:
     """Explain why no pair of visits was judged."""
-    why = f"the trace has {counted(found.visits, 'visits')}"
-    if found.places.stayed:
-        why += (
-            f"; between the visits of {counted(found.places.stayed, 'pairs')} within "
-            f"{found.near:g} m, the robot made no visit farther away"
-        )
-    if found.places.unknown:
-        why += (
-            f"; for {counted(found.places.unknown, 'pairs')}, {found.judge} do not tell how far "
-            "apart the visits are"
-        )
+    why, places = f"the trace has {counted(found.visits, 'visits')}", found.places
+    if places.stayed:
+        near = f"{counted(places.stayed, 'pairs')} within {found.near:g} m"
+        why += f"; between the visits of {near}, the robot made no visit farther away"
+    if places.unknown:
+        pairs = counted(places.unknown, "pairs")
+        why += f"; for {pairs}, {found.judge} do not tell how far apart the visits are"
     return (
         f"judged by {found.judge}: expected pairs of visits to judge, got none: {why}; evaluate a "
         "longer drive, or with truth at more steps"
@@ -149,24 +145,22 @@ def _nothing_judged(found: VisitsEvaluation) -> str:
 def _visits_in_words(found: VisitsEvaluation) -> str:
     """Say how many pairs of visits and of steps were judged, and how many were left out."""
     places, dstates = found.places, found.dstates
-    stayed = "within this distance, as the robot made no visit farther away in between"
-    left_out = [f"{counted(places.stayed, 'pairs')} {stayed}"] if places.stayed else []
-    if places.unknown:
-        unknown = counted(places.unknown, "pairs")
-        left_out.append(f"{unknown}, as {found.judge} do not tell how far apart they are")
-    return (
+    lines = [
         f"judged by {found.judge}: {places.returns} of {counted(places.judged, 'pairs')} of visits "
         f"are returns to one place (within {found.near:g} m, and the robot was farther away in "
         f"between); {dstates.returns} of {counted(dstates.judged, 'pairs')} of steps are returns "
         f"to one dstate (headings also differ by at most {found.turned:g} degrees)"
-        + "".join(f"\nleft out: {text}" for text in left_out)
-        + (
-            f"\nposes and relations agree on {found.by_both[1]} of "
-            f"{counted(found.by_both[0], 'pairs')} of visits"
-            if found.by_both
-            else ""
-        )
-    )
+    ]
+    if places.stayed:
+        stayed = "within this distance, as the robot made no visit farther away in between"
+        lines.append(f"left out: {counted(places.stayed, 'pairs')} {stayed}")
+    if places.unknown:
+        unknown = counted(places.unknown, "pairs")
+        lines.append(f"left out: {unknown}, as {found.judge} do not tell how far apart they are")
+    if found.by_both:
+        pairs = counted(found.by_both[0], "pairs")
+        lines.append(f"poses and relations agree on {found.by_both[1]} of {pairs} of visits")
+    return "\n".join(lines)
 
 
 def _pairs(pairs: MapPairs | None) -> list[object]:

@@ -32,21 +32,15 @@ def run(options: argparse.Namespace) -> int:
         for path in sorted(shipped("examples").iterdir())
         if path.is_file()
     }
-    changed = [
-        path
-        for path, data in examples.items()
-        if path.exists() and not (path.is_file() and path.read_bytes() == data)
-    ]
-    if changed:
-        raise AbductionError(
-            f"{named(changed[0])}: expected no file, or the example of this name, got another one; "
-            "nothing was copied: move it away, or take another folder (-o FOLDER)"
-        )
+    for path, data in examples.items():
+        if path.exists() and not (path.is_file() and path.read_bytes() == data):
+            raise AbductionError(
+                f"{named(path)}: expected no file, or the example of this name, got another one; "
+                "nothing was copied: move it away, or take another folder (-o FOLDER)"
+            )
     folder.mkdir(parents=True, exist_ok=True)
     for path, data in examples.items():
         write_file(path, data)
-    print(
-        f"{counted(len(examples), 'examples')} in {named(folder)}: "
-        f"{', '.join(path.name for path in examples)}"
-    )
+    listed = ", ".join(path.name for path in examples)
+    print(f"{counted(len(examples), 'examples')} in {named(folder)}: {listed}")
     return 0

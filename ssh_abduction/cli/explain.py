@@ -128,14 +128,12 @@ def run(options: argparse.Namespace) -> int:
             from ssh_abduction.rivals.listing import PairInMap  # loads numpy
 
             pair = PairInMap.of(listing, first, second)
-        question = PairQuestion(
-            trace, first, second, theory, max_maps=options.maps or None, **limits
-        )
+        limits["max_maps"] = options.maps or None
+        question = PairQuestion(trace, first, second, theory, **limits)
     else:
         question = TraceQuestion(trace, theory, **limits)
-    written = (
-        partial(_as_json, pair) if options.json else partial(_as_text, pair, options.time_limit)
-    )
+    as_text = partial(_as_text, pair, options.time_limit)
+    written = partial(_as_json, pair) if options.json else as_text
 
     def last_words(why: Stop) -> tuple[str, int]:
         answer = question.known(why)

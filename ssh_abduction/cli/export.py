@@ -55,14 +55,9 @@ def add_parser(verbs: Verbs) -> None:
         "two neighbours (nav2 and tmap2 only; default: false)",
         default=False,
     )
-    parser.add_setting(
-        "name",
-        "the name of the map in nav2 and tmap2 files (default: ssh-abduction)",
-        "ssh-abduction",
-    )
-    parser.add_setting(
-        "frame", "the name of the coordinate frame in nav2 and tmap2 files (default: map)", "map"
-    )
+    said = "in nav2 and tmap2 files (default:"
+    parser.add_setting("name", f"the name of the map {said} ssh-abduction)", "ssh-abduction")
+    parser.add_setting("frame", f"the name of the coordinate frame {said} map)", "map")
 
 
 def run(options: argparse.Namespace) -> int:

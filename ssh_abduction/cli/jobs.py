@@ -121,15 +121,11 @@ def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> 
     `asked` is the number of files, and `files` the word for them in messages, such as "traces".
     """
     if stop.is_set():
-        missing = asked - sum(code <= SIGNALLED for code in codes)
-        print(
-            f"ssh-abduction: interrupted: {missing} of {asked} {files} not finished",
-            file=sys.stderr,
-        )
+        missing = f"{asked - sum(code <= SIGNALLED for code in codes)} of {asked} {files}"
+        print(f"ssh-abduction: interrupted: {missing} not finished", file=sys.stderr)
         return interrupted_code()
     if errors := codes.count(EXIT_ERROR):
-        print(
-            f"ssh-abduction: errors in {errors} of {asked} {files}, on their lines", file=sys.stderr
-        )
+        where = f"{errors} of {asked} {files}, on their lines"
+        print(f"ssh-abduction: errors in {where}", file=sys.stderr)
         return EXIT_ERROR
     return max(codes, default=0)

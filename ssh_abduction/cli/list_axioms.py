@@ -27,20 +27,13 @@ def run(options: argparse.Namespace) -> int:
     for level in encodings.levels():
         print(f"\n{level}")
         rows = [
-            [
-                axiom.name,
-                *(_state(axiom.name, preset) for preset in PRESETS),
-                axiom.sentence,
-                f"[{axiom.source}]",
-            ]
-            for axiom in encodings.axioms()
-            if axiom.level == level
+            [a.name, *(_state(a.name, preset) for preset in PRESETS), a.sentence, f"[{a.source}]"]
+            for a in encodings.axioms()
+            if a.level == level
         ]
         print(table(["axiom", *PRESETS, "sentence", "source"], rows))
     print("\nregions (derived from a map after the search)")
-    rows = [
-        [axiom.name, axiom.sentence, f"[{axiom.source}]"] for axiom in encodings.region_axioms()
-    ]
+    rows = [[a.name, a.sentence, f"[{a.source}]"] for a in encodings.region_axioms()]
     print(table(["axiom", "sentence", "source"], rows))
     print(f"\nThe encodings are in {encodings.folder()}")
     return 0

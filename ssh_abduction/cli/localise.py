@@ -103,14 +103,10 @@ def run(options: argparse.Namespace) -> int:
         print(_headline(beliefs))
         seen = ["image" if localiser.reads_images else step.view for step in trace]
         done = ["", *(action.name for action in trace.actions)]
+        told = zip(done, seen, beliefs, strict=True)
         rows = [
-            [
-                step,
-                done[step],
-                NOWHERE if seen[step] is None else seen[step],
-                *_found(belief, localiser.ssh_map),
-            ]
-            for step, belief in enumerate(beliefs)
+            [step, action, NOWHERE if view is None else view, *_found(belief, localiser.ssh_map)]
+            for step, (action, view, belief) in enumerate(told)
         ]
         place = ("place",) if localiser.ssh_map.places else ()
         print(table((*HEAD, *place, *NUMBERS), rows))

@@ -39,6 +39,7 @@ from ssh_abduction.cli.text import counted
 from ssh_abduction.data.corrections import ASSERTIONS, Corrections
 from ssh_abduction.data.corrections_file import beside, load_corrections, to_yaml
 from ssh_abduction.data.errors import AbductionError, MapError, brief, named
+from ssh_abduction.data.words import attributes_of
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, check_limit, workers
 from ssh_abduction.theory.theory import Theory
@@ -93,16 +94,11 @@ class MapQuestion(FileQuestion):
     @property
     def settings(self) -> dict[str, Any]:
         """All settings that a run depends on, as a dict for JSON, to recognise finished runs."""
-        theory = self.theory.to_dict() if self.theory else None
         laid_over = (self.theory or Theory.topological()).replace(**self.choices).to_dict()
         return {
-            "theory": theory,
+            "theory": self.theory.to_dict() if self.theory else None,
             "choices": {name: laid_over[name] for name in self.choices},
-            "reading": self.reading,
-            "width": self.width,
-            "limit": self.limit,
-            "maps": self.maps,
-            "ladder": self.ladder,
+            **attributes_of(self, "reading", "width", "limit", "maps", "ladder"),
             **({} if self.corrections is None else {"corrections": to_yaml(self.corrections)}),
         }
 
@@ -233,28 +229,20 @@ class MapQuestion(FileQuestion):
             drive["source"] = path = sources.get(drive["name"], path)
         files["run.json"] = (json.dumps(run, indent=2, ensure_ascii=False) + "\n").encode()
         cost, solution = done.solution.cost, done.solution
-        told_paths = (
-            f"{counted(cost.paths, 'paths')}, " if cost and paths_mean_something(solution) else ""
-        )
         found = "no map"
         if cost is not None:
-            dstates = counted(cost.dstates, "dstates")
-            found = f"{counted(cost.places, 'places')}, {told_paths}{dstates}"
-        how = (
-            f"{solution.status.value}, {solution.weighed.sentence}"
-            if solution.weighed
-            else f"{solution.status.value}, {counted(solution.count, 'minimal maps')}"
-            f"{'' if solution.complete else ' or more'}"
-        )
-        if joins := joins_in_words(solution.by_minimality, solution.count):
-            how += f"; {joins}"
-        if solution.joined:
-            how += f"; {solution.joined}"
-        total, visits = sum(done.seconds.values()), counted(len(done.imported.visits), "visits")
-        line = (
-            f"{' + '.join(map(named, paths))}: {found}; {how}; {visits} in "
-            f"{counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m; {total:.1f} s"
-        )
+            names = ["places", *(["paths"] if paths_mean_something(solution) else []), "dstates"]
+            found = ", ".join(counted(getattr(cost, name), name) for name in names)
+        how = f"{solution.status.value}, {counted(solution.count, 'minimal maps')}"
+        how += "" if solution.complete else " or more"
+        if solution.weighed:
+            how = f"{solution.status.value}, {solution.weighed.sentence}"
+        joins = joins_in_words(solution.by_minimality, solution.count)
+        visits = counted(len(done.imported.visits), "visits")
+        way = f"{counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m"
+        seconds = f"{sum(done.seconds.values()):.1f} s"
+        parts = [found, how, joins, solution.joined, f"{visits} in {way}", seconds]
+        line = f"{' + '.join(map(named, paths))}: {'; '.join(filter(None, parts))}"
         code = interrupted_code() if done.interrupted else exit_code(solution)
         notes = (*log.warnings, *done.notes, *solution.warnings)
         return FileAnswer(number, line, code, notes, tuple(files.items()))
@@ -288,11 +276,11 @@ def run(options: argparse.Namespace) -> int:
     check_folder(Path(options.output))
     question = MapQuestion(
         *_theory(options),
-        reading_of(options),
-        options.width or WIDTH,
-        options.time_limit,
-        options.maps,
-        options.ladder,
+        reading=reading_of(options),
+        width=options.width or WIDTH,
+        limit=options.time_limit,
+        maps=options.maps,
+        ladder=options.ladder,
     )
     if options.together:
         return _together(question, options)

@@ -108,14 +108,13 @@ def _lines(experiment: Experiment) -> Iterator[str]:
     if plan.branches:
         shown = experiment.predictions[:SHOWN_COLUMNS]
         more = len(experiment.predictions) - len(shown)
-        rows = [
-            [action, *(said.seen[i] for said in shown)] for i, action in enumerate(plan.actions)
-        ]
-        head = [
+        columns = zip(*(said.seen for said in shown), strict=True)
+        rows = [[act, *seen] for act, seen in zip(plan.actions, columns, strict=True)]
+        heads = (
             f"{_rivals_in_words(said.rivals)} predict{'s' * (len(said.rivals) == 1)}"
             for said in shown
-        ]
-        yield table(["action", *head], rows)
+        )
+        yield table(["action", *heads], rows)
         if more:
             yield f"  and {more} more predictions (--json has all)"
         lines = list(_tree(plan, "  "))
@@ -145,10 +144,8 @@ def _untried(plan: ExperimentPlan) -> str:
         return ""
     if plan.untried is None:
         return "; nothing distinguishes them"
-    return (
-        "; known links distinguish no more of them, try "
-        f"{printable(', '.join((*plan.untried.way, plan.untried.action)))}"
-    )
+    actions = printable(", ".join((*plan.untried.way, plan.untried.action)))
+    return f"; known links distinguish no more of them, try {actions}"
 
 
 def _expected(untried: Untried) -> Iterator[str]:

@@ -63,10 +63,8 @@ def as_corrected(
 
 def say_obeyed(said: Corrections, trace: Trace) -> None:
     """Print on stderr how many corrections are about drives of this trace."""
-    here, all_of_them = (
-        sum(1 for _ in sentences_of(some)) for some in (said.known_in(drives_of(trace)), said)
-    )
-    more = all_of_them - here
+    here = len([*sentences_of(said.known_in(drives_of(trace)))])
+    more = len([*sentences_of(said)]) - here
     aside = f"; {more} more {'is' if more == 1 else 'are'} about other drives" if more else ""
     text = f"obeying {counted(here, 'corrections')} of {named(said.source)}{aside}"
     print(printable(text), file=sys.stderr)

@@ -22,7 +22,7 @@ from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, bri
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import meant
+from ssh_abduction.data.words import meant, only_known
 from ssh_abduction.theory.fields import CHOICES
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
@@ -105,11 +105,9 @@ def helps() -> dict[str, str]:
 
 
 def add_limits(parser: Parser, printed: str, seconds: float | None = None) -> None:
-    """Add the options that limit a search.
+    """Add the options that limit a search. The command prints `printed` at a limit.
 
-    Args:
-        printed: What the command prints at a limit.
-        seconds: The default time limit; None for no limit.
+    `seconds` is the default time limit; None for no limit.
     """
     default = "" if seconds is None else f" (default: {seconds:g}; inf for no limit)"
     parser.add(
@@ -144,12 +142,8 @@ def add_jobs(parser: Parser, act: str, things: str, said: str | None = None) -> 
 
 def add_output(parser: Parser) -> None:
     """Add the option -o TRACE, which names the trace file to write."""
-    parser.add(
-        "-o --output TRACE",
-        "trace file to write, or - for standard output",
-        type=output,
-        required=True,
-    )
+    said = "trace file to write, or - for standard output"
+    parser.add("-o --output TRACE", said, type=output, required=True)
 
 
 def check_output(target: str, what: str) -> None:
@@ -157,15 +151,15 @@ def check_output(target: str, what: str) -> None:
     folder, path = Path(target).absolute().parent, Path(target)
     if target == "-" or not (path.is_dir() or path.is_file() or not path.exists()):
         return  # a device such as /dev/null is written directly, not by a temporary file beside it
+    why = ""
     if path.is_dir():
         why = "it is a folder; name a file in it"
     elif not folder.is_dir():
         why = "its folder is not there; make it first"
     elif not os.access(folder, os.W_OK):
         why = "its folder may not be written; name another one"
-    else:
-        return
-    raise AbductionError(f"{named(target)}: cannot write {what}: {why}")
+    if why:
+        raise AbductionError(f"{named(target)}: cannot write {what}: {why}")
 
 
 def check_inputs_are_kept(options: argparse.Namespace) -> None:
@@ -451,11 +445,7 @@ def at_comma(pair: str, read: Callable[[str], Step]) -> list[Step]:
 
 def choices_of(options: argparse.Namespace) -> dict[str, Any]:
     """Collect the fields of a theory that the user set, by name."""
-    chosen = {
-        f.name: getattr(options, f.name)
-        for f in fields(Theory)
-        if getattr(options, f.name, None) is not None
-    }
+    chosen = only_known(**{f.name: getattr(options, f.name, None) for f in fields(Theory)})
     if "prefer" in chosen and not chosen["prefer"]:
         chosen["prefer"] = ()
     return chosen

@@ -40,11 +40,9 @@ EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, 
 
 def exit_code(solution: Solution) -> int:
     """Find the exit code for a solution."""
-    return (
-        program.interrupted_code()
-        if solution.stopped == "interrupted"
-        else EXIT_CODES[solution.status]
-    )
+    if solution.stopped == "interrupted":
+        return program.interrupted_code()
+    return EXIT_CODES[solution.status]
 
 
 def why_no_map(search: Search) -> Explanation | None:
@@ -90,11 +88,11 @@ def answer_ending(
     """
     end = written_ending(solution, maps, backbone)
     end.pop("warnings", None)
-    return (
-        end
-        | ({"warnings": found} if found else {})
-        | ({"explanation": explanation.to_dict()} if explanation else {})
-    )
+    if found:
+        end["warnings"] = found
+    if explanation:
+        end["explanation"] = explanation.to_dict()
+    return end
 
 
 class Warnings:
@@ -138,12 +136,8 @@ def save_solution(solution: Solution, file: str | None) -> None:
     A solution without a map does not replace a file of maps. A warning says so.
     """
     if file is not None and solution.cost is None and _has_maps(file):
-        warn(
-            [
-                f"{named(file)}: keeps the maps that it had, as this search found none; delete it "
-                "first to write the new answer, or name another file"
-            ]
-        )
+        keeps = f"{named(file)}: keeps the maps that it had, as this search found none"
+        warn([f"{keeps}; delete it first to write the new answer, or name another file"])
     elif file is not None:
         solution.save(file)
 

@@ -47,30 +47,22 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.evaluation.paper.report import reproduce, steps
 
-    seeds = _seeds(options.seeds)
+    seeds, name = _seeds(options.seeds), options.experiment
     check_jobs(options.jobs, "processes", default=2)
-    folder = Path(options.output or f"out/{options.experiment}")
+    folder = Path(options.output or f"out/{name}")
     with progress_bar() as progress:
-        task = progress.add_task(
-            options.experiment, total=steps(options.experiment, seeds, options.outcomes)
-        )
+        task = progress.add_task(name, total=steps(name, seeds, options.outcomes))
+
+        def done(what: str) -> None:
+            progress.update(task, advance=1, description=f"{name}: {what}")
 
         def show(rows: list[dict[str, Any]]) -> None:
             progress.stop()  # or the bar would be drawn into the table
             _print(options, rows)
             progress.start()
 
-        reproduce(
-            options.experiment,
-            seeds,
-            folder,
-            options.jobs,
-            options.outcomes,
-            on_done=lambda what: progress.update(
-                task, advance=1, description=f"{options.experiment}: {what}"
-            ),
-            on_table=show,
-        )
+        shown: dict[str, Any] = {"on_done": done, "on_table": show}
+        reproduce(name, seeds, folder, options.jobs, options.outcomes, **shown)
     if not options.json:
         print(f"\nThe page with the figures is {named(folder / 'report.html')}")
     return 0
@@ -80,12 +72,8 @@ def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
     from ssh_abduction.evaluation.paper.report import claimed, spread_of
 
     if options.json:
-        print(
-            json.dumps(
-                {"experiment": options.experiment, "claims": rows}, ensure_ascii=False, indent=1
-            ),
-            flush=True,
-        )
+        record = {"experiment": options.experiment, "claims": rows}
+        print(json.dumps(record, ensure_ascii=False, indent=1), flush=True)
         return
     cells = [[claimed(r), r["paper"], spread_of(r), f"{r['holds']} of {r['seeds']}"] for r in rows]
     print(table(["claim", "paper", "here", "holds"], cells), flush=True)

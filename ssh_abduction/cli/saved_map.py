@@ -28,16 +28,8 @@ from ssh_abduction.data.words import meant
 from ssh_abduction.rivals.listing import Listing
 
 # Directions on the map as it is drawn, in degrees counterclockwise from east.
-COMPASS = {
-    "east": 0.0,
-    "northeast": 45.0,
-    "north": 90.0,
-    "northwest": 135.0,
-    "west": 180.0,
-    "southwest": 225.0,
-    "south": 270.0,
-    "southeast": 315.0,
-}
+_WINDS = ("east", "northeast", "north", "northwest", "west", "southwest", "south", "southeast")
+COMPASS = {name: 45.0 * k for k, name in enumerate(_WINDS)}
 
 
 @dataclass(frozen=True)
@@ -138,11 +130,9 @@ class SavedMap:
         kind, number = thing_named(text, self.map.names) or ("", -1)
         if kind not in NAMED:
             return None
-        here = (
-            t for t, s in enumerate(self.map.dstate_at) if number_at(self.map, kind, s) == number
-        )
-        if (first := next(here, None)) is not None:
-            return kind, step_name(self.drives, first)
+        for t, label in enumerate(self.map.dstate_at):
+            if number_at(self.map, kind, label) == number:
+                return kind, step_name(self.drives, t)
         region = next((r for r in self.map.regions or () if r.id == number), None)
         if kind == "region" and region is not None:
             others = {f"region{region_of(self.map.regions, place)}" for place in region.places}
@@ -229,11 +219,8 @@ class SavedMap:
         if label in drawn:  # as in maps of logs
             ways = {s: round(way + drawn[s] - drawn[label]) % 360.0 for s in drawn}
         ways = ways or {label: way}
-        return tuple(
-            (step_name(self.drives, t), ways[s])
-            for t, s in enumerate(self.map.dstate_at)
-            if s in ways
-        )
+        steps = [(t, s) for t, s in enumerate(self.map.dstate_at) if s in ways]
+        return tuple((step_name(self.drives, t), ways[s]) for t, s in steps)
 
     def _drawn(self, place: int | None) -> dict[int, float]:
         """The drawn headings of the dstates at a place, in degrees counterclockwise from east."""

@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 ENDINGS = (".log", ".clf", ".bag", ".mcap")
 SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").glob("*.json"))
 
-METRES: dict[str, Any] = {"type": float, "metavar": "METRES"}
-SHARE: dict[str, Any] = {"type": float, "metavar": "SHARE"}
-
 
 def add_parser(verbs: Verbs) -> None:
     text = (
@@ -58,78 +55,63 @@ def add_parser(verbs: Verbs) -> None:
         "drive this route instead of the world's own: actions (travel, right, left, around, or the "
         "name of a lift) or, with --format, names of places, separated by commas",
     )
-    for name, text, default, details in (
-        (
-            "images",
-            "log laser ranges, or panoramas of a 360-degree camera, which are written to an .npz "
-            "file beside the trace (default: ranges)",
-            "ranges",
-            {"choices": ("ranges", "panoramas")},
-        ),
-        ("stars", "whether to log the openings seen at each place (default: true)", True, {}),
-        (
-            "every",
-            "log an image each time that the robot has driven this far, instead of an image at "
-            "each dstate; with --format, metres from one scan to the next (default: 0.25)",
-            None,
-            METRES,
-        ),
-        (
-            "start",
-            "start here instead of at the world's own start: x and y in metres, and the heading "
-            "in degrees counterclockwise from the x axis",
-            None,
-            {"metavar": "X,Y,DEGREES"},
-        ),
-        (
-            "reach",
-            "half the width of a corridor: the distance that the robot keeps from a wall that it "
-            "follows (default: the world's own)",
-            None,
-            METRES,
-        ),
-        (
-            "odometry_noise",
-            "standard deviation of the odometry, as a share of each motion (default: 0.02); with "
-            "--format, standard deviation in metres after one metre (default: 0.05); the errors "
-            "of headings grow with it",
-            None,
-            SHARE,
-        ),
-        (
-            "scale_error",
-            "the odometry reports distances that are too long by this share (default: 0)",
-            0.0,
-            SHARE,
-        ),
-        (
-            "bend_error",
-            "drift of the reported heading to the left, in degrees per metre (default: 0)",
-            0.0,
-            {"type": float, "metavar": "DEGREES"},
-        ),
-        (
-            "textures",
-            "whether each wall has its own texture in panoramas, or parallel walls share one "
-            "(default: unique)",
-            None,
-            {"choices": ("unique", "repeated")},
-        ),
-        (
-            "paint_seed",
-            "random seed of the textures in panoramas (default: 0)",
-            None,
-            {"type": seed, "metavar": "SEED"},
-        ),
-        (
-            "hours",
-            "hours of the day at which the drive begins and ends, which decide the light in "
-            "panoramas (default: 12,12)",
-            None,
-            {"metavar": "FROM,TO"},
-        ),
-    ):
-        parser.add_setting(name, text, default, **details)
+    add = parser.add_setting
+    add(
+        "images",
+        "log laser ranges, or panoramas of a 360-degree camera, which are written to an .npz "
+        "file beside the trace (default: ranges)",
+        "ranges",
+        choices=("ranges", "panoramas"),
+    )
+    add("stars", "whether to log the openings seen at each place (default: true)", True)
+    add(
+        "every METRES",
+        "log an image each time that the robot has driven this far, instead of an image at "
+        "each dstate; with --format, metres from one scan to the next (default: 0.25)",
+        type=float,
+    )
+    add(
+        "start X,Y,DEGREES",
+        "start here instead of at the world's own start: x and y in metres, and the heading "
+        "in degrees counterclockwise from the x axis",
+    )
+    add(
+        "reach METRES",
+        "half the width of a corridor: the distance that the robot keeps from a wall that it "
+        "follows (default: the world's own)",
+        type=float,
+    )
+    add(
+        "odometry_noise SHARE",
+        "standard deviation of the odometry, as a share of each motion (default: 0.02); with "
+        "--format, standard deviation in metres after one metre (default: 0.05); the errors "
+        "of headings grow with it",
+        type=float,
+    )
+    add(
+        "scale_error SHARE",
+        "the odometry reports distances that are too long by this share (default: 0)",
+        0.0,
+        type=float,
+    )
+    add(
+        "bend_error DEGREES",
+        "drift of the reported heading to the left, in degrees per metre (default: 0)",
+        0.0,
+        type=float,
+    )
+    add(
+        "textures",
+        "whether each wall has its own texture in panoramas, or parallel walls share one "
+        "(default: unique)",
+        choices=("unique", "repeated"),
+    )
+    add("paint_seed SEED", "random seed of the textures in panoramas (default: 0)", type=seed)
+    add(
+        "hours FROM,TO",
+        "hours of the day at which the drive begins and ends, which decide the light in "
+        "panoramas (default: 12,12)",
+    )
     add_output(parser)
 
 
@@ -149,15 +131,8 @@ def run(options: argparse.Namespace) -> int:
     body = Body(odometry=noise, scale=options.scale_error, bend=math.radians(options.bend_error))
     world = World.named(options.world).with_choices(options.start, options.route, options.reach)
     camera = _camera(options)
-    trace = simulate(
-        world,
-        options.tours,
-        options.seed,
-        body=body,
-        stars=options.stars,
-        every=options.every,
-        camera=camera,
-    )
+    how: dict[str, Any] = {"stars": options.stars, "every": options.every, "camera": camera}
+    trace = simulate(world, options.tours, options.seed, body=body, **how)
     if camera and options.output != "-":
         trace = _with_table(trace, options.output)
     write(trace, options.output, f"{counted(len(trace), 'images')} of {printable(world.name)}")
@@ -190,18 +165,17 @@ def _drive(options: argparse.Namespace) -> RecordedDrive:
     if options.odometry_noise is not None:
         odometer = odometer.as_noisy_as(options.odometry_noise)
     every = EVERY if options.every is None else options.every
+    how: dict[str, Any] = {"odometer": odometer, "every": every}
     if not options.world.endswith(".xml"):
         world = World.named(options.world).with_choices(options.start, options.route, options.reach)
-        return record(world, options.tours, options.seed, odometer=odometer, every=every)
+        return record(world, options.tours, options.seed, **how)
     for name in ("start", "route", "reach"):
         if getattr(options, name) is not None:
             raise AbductionError(
                 f"--{name}: expected no such option with a floor plan, whose rounds are drawn by "
                 "--seed; leave it out"
             )
-    return record_plan(
-        Plan.load(options.world), options.tours, options.seed, odometer=odometer, every=every
-    )
+    return record_plan(Plan.load(options.world), options.tours, options.seed, **how)
 
 
 def _write_log(options: argparse.Namespace, drive: RecordedDrive) -> int:
@@ -210,17 +184,13 @@ def _write_log(options: argparse.Namespace, drive: RecordedDrive) -> int:
 
     target = Path(options.output)
     if options.log == "carmen":
-        noise = {
-            f"simulator_odometry_{name}": value
-            for name, value in drive.odometer.parameters().items()
-        }
+        numbers = drive.odometer.parameters().items()
+        noise = {f"simulator_odometry_{name}": value for name, value in numbers}
         write_carmen(target, scans_of(drive), noise)
     else:
         write_bag(target, scans_of(drive), drive.odometer.covariances(drive.odometry))
-    name = target.name.removesuffix(".gz")
-    truth = target.with_name(
-        f"{name if Path(name).suffix not in ENDINGS else Path(name).stem}.truth.json"
-    )
+    name = Path(target.name.removesuffix(".gz"))
+    truth = target.with_name(f"{name.stem if name.suffix in ENDINGS else name}.truth.json")
     save_file(truth, json.dumps(drive.truth).encode() + b"\n", "truth", AbductionError)
     print(
         f"{counted(len(drive), 'scans')} along {drive.metres:.0f} m of {printable(drive.name)} in "
@@ -234,9 +204,8 @@ def scans_of(drive: RecordedDrive) -> Iterator[Scan]:
     from perception.readers.scans import LaserScanner, Scan
     from simulator.laser import BEAMS, BEARINGS
 
-    laser = LaserScanner(
-        float(BEARINGS[0]), float(BEARINGS[1] - BEARINGS[0]), BEAMS, drive.laser.reach
-    )
+    first, step = float(BEARINGS[0]), float(BEARINGS[1] - BEARINGS[0])
+    laser = LaserScanner(first, step, BEAMS, drive.laser.reach)
     told = (drive.odometry.tolist(), drive.poses.tolist(), drive.times.tolist())
     rows = zip(drive.ranges, *told, strict=True)
     for line, (ranges, odometry, pose, time) in enumerate(rows, 1):

@@ -58,7 +58,6 @@ from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.loggers import PROGRESS
 from ssh_abduction.solver import (
     Backbone,
-    Progress,
     Search,
     Solution,
     Start,
@@ -318,11 +317,7 @@ class _Json:
         """Return a function that makes the rest of the JSON: the maps in memory, and the fields."""
         given = all_given(solution)
         fields = self._fields(solution, explanation, self._search.backbone, len(given))
-
-        def text() -> str:
-            return self._opening() + "".join(map(self._line, given)) + fields
-
-        return text
+        return lambda: self._opening() + "".join(map(self._line, given)) + fields
 
     def _fields(
         self,
@@ -386,11 +381,9 @@ def _lines(
             yield f"look at what was seen and done {where}, or {mend}"
         return
     if solution.cost is None:
-        if solution.partial:
-            yield (
-                f"\nbest map of the first {len(solution.partial.dstate_at)} "
-                f"steps\n{describe(solution.partial)}"
-            )
+        if partial_map := solution.partial:
+            steps = len(partial_map.dstate_at)
+            yield f"\nbest map of the first {steps} steps\n{describe(partial_map)}"
         return
     yield first_map(solution, search.count)
     if backbone and (search.count > 1 or not solution.complete):
@@ -420,15 +413,6 @@ def _progress(prints_meanwhile: bool) -> Iterator[Any]:
 
     status = Spinner("dots", "solving")
     # By default rich also redirects stdout to stderr and wraps it to the terminal's width.
-    with Live(
-        status,
-        console=Console(stderr=True),
-        transient=True,
-        redirect_stdout=False,
-        redirect_stderr=False,
-    ):
-
-        def show(p: Progress) -> None:
-            status.update(text=p.sentence)
-
-        yield show
+    as_is = {"redirect_stdout": False, "redirect_stderr": False}
+    with Live(status, console=Console(stderr=True), transient=True, **as_is):
+        yield lambda progress: status.update(text=progress.sentence)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from textwrap import indent
 from typing import TYPE_CHECKING
 
 from ssh_abduction.data.drives import drives_of, named_steps
@@ -47,26 +48,20 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         return f"{solution.status.value}: {explanation}"
     if solution.status is Status.UNSATISFIABLE:
         kinds = ", ".join(evidence.name for evidence in evidence_of(solution.theory))
-        reason = (
-            f"; the reason was not found in time ({solution.stopped})"
-            if solution.stopped
-            else f": the evidence rejects each map that clingo found ({kinds})"
-        )
+        reason = f": the evidence rejects each map that clingo found ({kinds})"
+        if solution.stopped:
+            reason = f"; the reason was not found in time ({solution.stopped})"
         return f"unsatisfiable: no map satisfies the axioms{reason}"
     why = f" ({solution.stopped})" if solution.stopped else ""
-    seconds = (
-        f"{solution.seconds.total:.2f} s, {solution.effort.prefix} of {solution.steps} steps "
-        "given to clingo"
-    )
+    given = f"{solution.effort.prefix} of {solution.steps} steps given to clingo"
+    seconds = f"{solution.seconds.total:.2f} s, {given}"
     bound = ", ".join(
         f"at least {counted(v, k)}" if k != "cost" else f"a cost of at least {v:g} dstates"
         for k, v in solution.bound.to_dict().items()
     )
     if solution.cost is None:
-        return (
-            f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; "
-            f"{_proven(bound)}; {seconds}"
-        )
+        none = f"no map of all {solution.steps} steps yet"
+        return f"{solution.status.value}{why}: {none}; {_proven(bound)}; {seconds}"
     counts = ", ".join(
         counted(v, k) if k != "faults" else f"faults that cost {v:g} dstates"
         for k, v in _counts_of(solution.cost, solution.theory).items()
@@ -91,11 +86,9 @@ def _proven(bound: str) -> str:
 def _number_of_maps(solution: Solution, count: int) -> str:
     """Say how many minimal maps there are, how many of each further level, and if all are found."""
     least = solution.levels[0].count if solution.levels else count
-    found = (
-        counted(least, "minimal maps")
-        if solution.weighed is None
-        else f"{counted(least, 'maps')} of least cost"
-    )
+    found = counted(least, "minimal maps")
+    if solution.weighed is not None:
+        found = f"{counted(least, 'maps')} of least cost"
     for level in solution.levels[1:]:
         parts = (counted(v, k) for k, v in _counts_of(level.cost, solution.theory).items())
         found += f"; {level.count} with {', '.join(parts)}"
@@ -190,29 +183,23 @@ def by_displacements(solution: Solution) -> Iterator[str]:
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Write a table with aligned columns. Control characters are escaped."""
     cells = [[*head], *([printable(str(cell)) for cell in row] for row in rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    return "\n".join(
-        "  "
-        + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in cells
-    )
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = ([cell.ljust(w) for cell, w in zip(row, widths, strict=True)] for row in cells)
+    return "\n".join(f"  {'  '.join(line)}".rstrip() for line in lines)
 
 
 def describe(ssh_map: SSHMap) -> str:
     """Write a map as text: each path with its places in order, and each dstate with its links."""
     parts = []
     if ssh_map.faults:
-        parts.append(
-            f"  {counted(len(ssh_map.dstates), 'dstates')}, and "
-            f"{'; '.join(printable(str(fault)) for fault in ssh_map.faults)}"
-        )
+        faults = "; ".join(printable(str(fault)) for fault in ssh_map.faults)
+        parts.append(f"  {counted(len(ssh_map.dstates), 'dstates')}, and {faults}")
     for p in ssh_map.paths:
         order = " – ".join(ssh_map.numbered("place", place) for place in p.order)
         parts.append(printable(f"  {ssh_map.called('path', p.id)}: places {order}"))
     if ssh_map.excused:
-        parts += [
-            f"  side_of_branch is not applied to paths {h} and {g}" for h, g in ssh_map.excused
-        ]
+        said = "  side_of_branch is not applied to paths"
+        parts += [f"{said} {h} and {g}" for h, g in ssh_map.excused]
     return "\n".join([*parts, table(*table_of_dstates(ssh_map))])
 
 
@@ -256,16 +243,12 @@ def compared(found: Comparison) -> Iterator[str]:
     if not found.deciding:
         return
     causes = sum(question.sort in ("faults", "dstates") for question in found.deciding)
-    questions = (
-        "question 1 tells"
-        if len(found.deciding) == 1
-        else f"questions 1 to {len(found.deciding)}, asked in this order, tell"
-    )
-    some = (
-        f", and 1{f' to {causes}' * (causes > 1)} the {found.variants['dstates']} labelings"
-        if 0 < causes < len(found.deciding)
-        else ""
-    )
+    questions, some = "question 1 tells", ""
+    if len(found.deciding) > 1:
+        questions = f"questions 1 to {len(found.deciding)}, asked in this order, tell"
+    if 0 < causes < len(found.deciding):
+        first = f"1{f' to {causes}' * (causes > 1)}"
+        some = f", and {first} the {found.variants['dstates']} labelings"
     maps = "both maps" if len(found.ids) == 2 else f"all {counted(len(found.ids), 'maps')}"
     yield f"  {questions} {maps} apart{some}"
 
@@ -290,8 +273,8 @@ def _choice_in_words(choice: Choice, number: Mapping[Question, int], maps: int) 
             [*("yes" if option.answers[index[q]] else "no" for q in asked), stretches(option.maps)]
             for option in choice.options
         ]
-        lines = table([*(f"{number[q]}." for q in asked), "maps"], rows).splitlines()
-        yield from (f"    {line}" for line in lines)
+        head = [*(f"{number[q]}." for q in asked), "maps"]
+        yield indent(table(head, rows), "    ")
 
 
 def depending(differing: Mapping[Matter, Sequence[int]]) -> str:

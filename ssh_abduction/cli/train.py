@@ -94,14 +94,6 @@ def pair(text: str) -> tuple[int, int]:
     return int(first), int(second)
 
 
-def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
-    """Return the images of labelled steps, n x d, their dstates, and a new recogniser."""
-    from perception.recognition import recogniser
-
-    images, labels, _, features = _mapped(options)
-    return images, labels, recogniser(features=features)
-
-
 def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
     """Return the images of labelled steps, their dstates, the map, and a transformer of images."""
     from perception.appearance import features_of
@@ -113,11 +105,12 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
     data = read_json(options.maps)
     maps = maps_of(data, str(options.maps))
     check_number(options.map, maps, options.maps)
+    answer = data if isinstance(data, dict) else {}
     labels = labels_of(
         maps,
         None if options.map is None else options.map - 1,
-        bool(data.get("complete", True)) if isinstance(data, dict) else True,
-        data.get("status", "optimal") == "optimal" if isinstance(data, dict) else True,
+        bool(answer.get("complete", True)),
+        answer.get("status", "optimal") == "optimal",
     )
     chosen = maps[(options.map or 1) - 1]
     check_labels(chosen, trace, named(options.maps))
@@ -127,10 +120,11 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
 
 def run_train(options: argparse.Namespace) -> int:
     """Run the verb `train`: train a recogniser, and write it to a file."""
+    from perception.recognition import recogniser
     from perception.store import save
 
-    images, labels, recogniser = _labelled(options)
-    save(recogniser.fit(images, labels), options.output)
+    images, labels, _, features = _mapped(options)
+    save(recogniser(features=features).fit(images, labels), options.output)
     print(
         f"{counted(len(set(labels.tolist())), 'dstates')} learnt from "
         f"{counted(len(images), 'images')} in {named(options.output)}"
@@ -140,14 +134,13 @@ def run_train(options: argparse.Namespace) -> int:
 
 def run_learning_curve(options: argparse.Namespace) -> int:
     """Run the verb `learning-curve`: print recognition rates by the number of training images."""
-    from perception.recognition import learning_curve
+    from perception.recognition import learning_curve, recogniser
 
     check_picture(options.plot)
-    images, labels, recogniser = _labelled(options)
+    images, labels, _, features = _mapped(options)
     sizes = sorted({len(images) * tenth // 10 for tenth in range(1, 11)} - {0})
-    curve = learning_curve(
-        images, labels, sizes, folds=options.folds, random_state=options.seed, estimator=recogniser
-    )
+    how: dict[str, Any] = {"folds": options.folds, "random_state": options.seed}
+    curve = learning_curve(images, labels, sizes, estimator=recogniser(features=features), **how)
     if options.json:
         print(json.dumps(attributes_of(curve, "sizes", "mean", "lowest", "highest", "folds")))
     else:

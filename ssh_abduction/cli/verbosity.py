@@ -47,10 +47,8 @@ def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
     """
     verbose = getattr(options, "verbose", 0)
     if getattr(options, "quiet", False):
-        with (
-            open(os.devnull, "w", encoding="utf-8") as nowhere,
-            contextlib.redirect_stderr(nowhere),
-        ):
+        nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - closed below
+        with nowhere, contextlib.redirect_stderr(nowhere):
             yield
     elif verbose:
         with _handled(logging.getLogger(PACKAGE), _StderrHandler(), LEVELS[min(verbose, 2)]):

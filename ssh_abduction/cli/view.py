@@ -230,8 +230,8 @@ def _serve(
     from ssh_abduction.runtime import program
     from ssh_abduction.solver import end_all
 
+    where: dict[str, Any] = {"port": options.port, "time_limit": options.time_limit}
     try:
-        where: dict[str, Any] = {"port": options.port, "time_limit": options.time_limit}
         server = PageServer(listing, trace, theory, run=localised, called=called, **where)
     except OSError as error:
         raise AbductionError(
