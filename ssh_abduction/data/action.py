@@ -77,17 +77,11 @@ class Action:
                 f"action.gateway: expected 1 or more, for a turn right or left, "
                 f"got {brief(self.gateway)}; give the number of the gateway on that side, from 1 on"
             )
-        self._keep_plain_values()
-
-    def _keep_plain_values(self) -> None:
-        """Replace texts and numbers of numpy by Python's own. The fields are checked before."""
-        for plain, names in (
-            (plain_text, ("name", "kind", "turn")),
-            (plain_number, ("gateway", "bearing")),
-        ):
-            for name in names:
-                if (value := getattr(self, name)) is not None:
-                    object.__setattr__(self, name, plain(value))
+        # Replace texts and numbers of numpy by Python's own.
+        for name in _FIELDS:
+            if (value := getattr(self, name)) is not None:
+                plain = plain_text(value) if isinstance(value, str) else plain_number(value)
+                object.__setattr__(self, name, plain)
 
     def _turn_of_bearing(self) -> TurnDirection:
         """Return the direction of a turn by `bearing` degrees, or raise TraceError."""
@@ -98,9 +92,9 @@ class Action:
             )
         assert self.bearing is not None
         degrees = self.bearing % 360
-        turn: TurnDirection = (
-            "around" if abs(degrees - 180) <= SPREAD else "right" if degrees < 180 else "left"
-        )
+        turn: TurnDirection = "right" if degrees < 180 else "left"
+        if abs(degrees - 180) <= SPREAD:
+            turn = "around"
         is_no_turn = min(degrees, 360 - degrees) <= SPREAD
         if is_no_turn or self.turn not in (None, turn):
             raise TraceError(

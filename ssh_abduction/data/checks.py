@@ -88,10 +88,9 @@ def a_whole_number(
 
 def a_count_of_maps(value: object, error: Kind) -> int | None:
     """Return the largest number of maps to list: 1 or more, or None for all. Or raise `error`."""
-    mend = "None lists all (--maps 0)"
-    return (
-        None if value is None else a_whole_number("max_maps (--maps)", value, error, 1, mend=mend)
-    )
+    if value is None:
+        return None
+    return a_whole_number("max_maps (--maps)", value, error, 1, mend="None lists all (--maps 0)")
 
 
 def numbers(

@@ -54,12 +54,8 @@ class Closure:
             )
         moved = checked_displacement(self.displacement)
         noise = checked_covariance(self.covariance)
-        for name, value in (
-            ("first", first),
-            ("last", last),
-            ("displacement", moved),
-            ("covariance", noise),
-        ):
+        names = ("first", "last", "displacement", "covariance")
+        for name, value in zip(names, (first, last, moved, noise), strict=True):
             object.__setattr__(self, name, value)
 
     def __str__(self) -> str:
@@ -149,9 +145,9 @@ def checked_closures(value: Any, steps: int, source: str | None) -> tuple[Closur
 def closures_among(closures: Sequence[Closure], steps: Sequence[int]) -> tuple[Closure, ...]:
     """Return the closures between these ascending steps. The steps are renumbered from 0."""
     number = {step: k for k, step in enumerate(steps)}
-    kept = [c for c in closures if c.first in number and c.last in number]
     return tuple(
         # Reuse a closure whose steps keep their numbers: making one checks its covariance.
         c if number[c.last] == c.last else replace(c, first=number[c.first], last=number[c.last])
-        for c in kept
+        for c in closures
+        if c.first in number and c.last in number
     )

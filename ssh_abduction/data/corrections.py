@@ -134,9 +134,6 @@ class Corrections:
     gateways: tuple[Passage, ...] = ()
     source: str | None = field(default=None, compare=False)
 
-    def __post_init__(self) -> None:
-        self._check_names()
-
     def __bool__(self) -> bool:
         """Whether anything is said."""
         return bool(self.names or self.pairs or self.gateways)
@@ -311,14 +308,11 @@ class Corrections:
                 or a step that its drive does not have.
         """
         drives = drives_of(checked_trace(trace))
-        return {
-            kind: tuple(
-                (self._number(drives, said.steps[0]), self._number(drives, said.steps[1]))
-                for said in self.known_in(drives).pairs
-                if said.kind == kind
-            )
-            for kind in ASSERTIONS
-        }
+        found: dict[str, tuple[tuple[int, int], ...]] = dict.fromkeys(ASSERTIONS, ())
+        for said in self.known_in(drives).pairs:
+            first, second = (self._number(drives, step) for step in said.steps)
+            found[said.kind] += ((first, second),)
+        return found
 
     def corrected(self, trace: Trace) -> Trace:
         """Return a trace whose stars have the gateways that a person said are open or closed.
@@ -381,7 +375,7 @@ class Corrections:
             gateways=tuple(said for said in self.gateways if said != sentence),
         )
 
-    def _check_names(self) -> None:
+    def __post_init__(self) -> None:
         """Raise MapError if a name is a number or given twice, or a thing is named twice."""
         where = self.source or "corrections"
         first: dict[tuple[str, ...], int] = {}

@@ -122,26 +122,19 @@ def to_yaml(corrections: Corrections) -> str:
         "names": [{"name": n.name, n.kind: n.step, **_note(n)} for n in corrections.names],
     }
     for kind in ASSERTIONS:
-        pairs = [said for said in corrections.pairs if said.kind == kind]
         data[kind] = [
             {"steps": [*said.steps], "note": said.note} if said.note else [*said.steps]
-            for said in pairs
+            for said in corrections.pairs
+            if said.kind == kind
         ]
-    data["gateways"] = [
-        {
-            ("open" if said.is_open else "closed"): {
-                step: direction_in_words(way) for step, way in said.seen
-            },
-            **_note(said),
-        }
-        for said in corrections.gateways
-    ]
+    data["gateways"] = []
+    for gateway in corrections.gateways:
+        seen = {step: direction_in_words(way) for step, way in gateway.seen}
+        data["gateways"].append({"open" if gateway.is_open else "closed": seen, **_note(gateway)})
     kept = {name: value for name, value in data.items() if value or name == "drives"}
     kept = json.loads(json_line(kept))  # YAML knows no texts of numpy
-    text: str = yaml.safe_dump(
-        kept, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
-    )
-    return text
+    how: dict[str, Any] = {"sort_keys": False, "allow_unicode": True, "default_flow_style": None}
+    return str(yaml.safe_dump(kept, width=100, **how))
 
 
 def _note(said: Naming | Passage) -> dict[str, str]:
@@ -210,16 +203,12 @@ class _CorrectionsReader(FieldReader):
         record = self._object(value, where, ("open", "closed", "note"))
         if ("open" in record) == ("closed" in record):
             raise self.wrong(where, "one of open, closed", value)
-        is_open = "open" in record
-        field = f"{where}.{'open' if is_open else 'closed'}"
-        seen = record["open" if is_open else "closed"]
+        state = "open" if "open" in record else "closed"
+        field, seen = f"{where}.{state}", record[state]
         if not seen or not isinstance(seen, Mapping):
             raise self.wrong(field, "steps and directions, such as monday:12: left", seen)
-        return Passage(
-            is_open,
-            tuple((self._step(s, field), self._way(w, f"{field}.{s}")) for s, w in seen.items()),
-            self._note(record, where),
-        )
+        ways = ((self._step(s, field), self._way(w, f"{field}.{s}")) for s, w in seen.items())
+        return Passage(state == "open", tuple(ways), self._note(record, where))
 
     def _way(self, value: object, where: str) -> float:
         text = self._text(value, where)

@@ -22,6 +22,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from itertools import accumulate, pairwise
 from pathlib import Path
 from statistics import median
@@ -266,11 +267,7 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
         odometry=next((trace.odometry for trace in parts if trace.odometry), None),
         drive=called[0],
         closures=tuple(closures),
-        extra={
-            name: value
-            for name, value in parts[0].extra.items()
-            if all(trace.extra.get(name) == value for trace in parts)
-        },
+        extra={k: v for k, v in parts[0].extra.items() if all(t.extra.get(k) == v for t in parts)},
     )
 
 
@@ -379,13 +376,12 @@ def _warn_of_other_names(traces: Sequence[Trace]) -> None:
 
 def travels_of(trace: Trace) -> list[float]:
     """The lengths of the displacements of all travels that moved the robot."""
-    moved = zip(trace.actions, trace.steps[1:], strict=True)
-    lengths = (
-        math.hypot(*step.displacement[:2])
-        for action, step in moved
+    return [
+        length
+        for action, step in zip(trace.actions, trace.steps[1:], strict=True)
         if action.kind == "travel" and step.displacement is not None
-    )
-    return [length for length in lengths if length > 0]
+        if (length := math.hypot(*step.displacement[:2])) > 0
+    ]
 
 
 def _warn_of_other_units(traces: Sequence[Trace]) -> None:
@@ -470,14 +466,10 @@ def _with_covariances(trace: Trace) -> Trace:
     return replace(trace, steps=tuple(steps))
 
 
-def _header(name: str) -> Callable[[Trace], object]:
-    """Make a function that reads a field about images from the header; None without images."""
-
-    def read(trace: Trace) -> object:
-        has_images = any(step.image is not None for step in trace.steps)
-        return trace.extra.get(name, "none") if has_images else None
-
-    return read
+def _header(name: str, trace: Trace) -> object:
+    """Read a field about images from the header; None without images."""
+    has_images = any(step.image is not None for step in trace.steps)
+    return trace.extra.get(name, "none") if has_images else None
 
 
 def _sidecar(trace: Trace) -> str | None:
@@ -493,6 +485,6 @@ _RECORDED: tuple[tuple[str, Callable[[Trace], object], str], ...] = (
     ("displacement", _displacements, "add them, or leave them out (Trace.without_displacements)"),
     ("odometry", _systematic, "give all traces one odometry"),
     ("images", _sidecar, "put them into one file (the command 'cluster --together' does so)"),
-    ("beams", _header("beams"), "take images of one laser"),
-    ("panorama", _header("panorama"), "take images of one camera"),
+    ("beams", partial(_header, "beams"), "take images of one laser"),
+    ("panorama", partial(_header, "panorama"), "take images of one camera"),
 )

@@ -78,11 +78,9 @@ def brief(value: object, width: int = 60) -> str:
 
 def printable(text: str) -> str:
     """Return a text on one line, with all unprintable characters escaped."""
-    return (
-        text
-        if text.isprintable()
-        else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-    )
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def xml_text(text: str) -> str:
@@ -100,11 +98,8 @@ def checked_index(index: object, count: int, what: str) -> int:
         raise TypeError(f"{what}: expected a whole number or a slice, got {brief(index)}; give one")
     found = int(index)
     if not -count <= found < count:
-        there = (
-            f"0 to {count - 1}, or {-count} to -1 from the end"
-            if count
-            else "none, as there are none"
-        )
+        some = f"0 to {count - 1}, or {-count} to -1 from the end"
+        there = some if count else "none, as there are none"
         raise RangeError(f"{what}: expected {there}, got {brief(found)}; take one of them")
     return found % count
 

@@ -9,6 +9,7 @@ import os
 import re
 import stat
 import threading
+from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
@@ -34,15 +35,12 @@ _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 _UNSEEN = re.compile("[\x7f-\x9f\u2028\u2029]")
 # What to do if a file cannot be written, by the number of the error.
 _MENDS = {
-    errno.ENOSPC: "make room",
     errno.ENOENT: "make the folder first",
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "take a place that you may write to"),
-    errno.EDQUOT: "make room",
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "make room"),
     errno.EFBIG: "allow larger files (ulimit -f), or take another disk",
     errno.ENAMETOOLONG: "take a shorter name",
-    errno.EEXIST: "take another name",
-    errno.EISDIR: "take another name",
-    errno.ENOTDIR: "take another name",
+    **dict.fromkeys((errno.EEXIST, errno.EISDIR, errno.ENOTDIR), "take another name"),
 }
 
 
@@ -213,9 +211,8 @@ def save_file(
     try:
         write_file(path, data)
     except OSError as found:
-        why = found.strerror or found
-        mend = mend_of(found)
-        raise error(f"{named(path)}: cannot write the {what}: {why}; {mend}") from None
+        why = f"{found.strerror or found}; {mend_of(found)}"
+        raise error(f"{named(path)}: cannot write the {what}: {why}") from None
     except ValueError as found:
         where = brief(str(path))
         raise error(f"{where}: cannot write the {what}: {found}; name a file") from None
@@ -225,8 +222,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Make a JSON object from pairs. Raise ValueError if a field is given twice."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in fields if names.count(name) > 1)
+        (twice, _), *_ = Counter(name for name, _ in pairs).most_common(1)
         raise ValueError(f"the field {twice[:60]!r} twice; keep one of them")
     return fields
 

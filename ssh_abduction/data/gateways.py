@@ -204,9 +204,8 @@ def facing(
                 for towards in (0, 180)
                 if not changes and not any(leads(frame, towards) for frame in sight.star.frames)
             )
-        found.opposite.extend(
-            (seen[i].dstate.id, seen[j].dstate.id) for i, j in _opposite_sights(tuple(fitted))
-        )
+        pairs = _opposite_sights(tuple(fitted))
+        found.opposite.extend((seen[i].dstate.id, seen[j].dstate.id) for i, j in pairs)
     return found
 
 

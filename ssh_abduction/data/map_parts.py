@@ -143,22 +143,18 @@ class Fault:
     bearing: int | None = None
 
     def __str__(self) -> str:
-        if self.kind == "changed" and self.bearing is not None:
-            return (
-                f"the gateway at {self.bearing} degrees of place {self.place} was {self.expected} "
-                f"and {self.seen}"
-            )
         if self.kind == "changed":
-            way = self.towards or SLOTS[self.gateway or 0]
-            of = "of" if self.towards else "at the first dstate of"
-            return f"the gateway {way} {of} place {self.place} was {self.expected} and {self.seen}"
-        if self.kind == "misread":
-            return f"the view at step {self.step} is misread: {self.seen}, expected {self.expected}"
-        if self.kind == "misseen":
-            return f"the star at step {self.step} is misread"
-        if self.kind == "jumped":
-            return f"the displacement that leads to step {self.step} is wrong: {self.seen}"
-        return f"the action at step {self.step} slipped: {self.seen}"
+            way = f"{self.towards or SLOTS[self.gateway or 0]}"
+            way += " of" if self.towards else " at the first dstate of"
+            way = way if self.bearing is None else f"at {self.bearing} degrees of"
+            return f"the gateway {way} place {self.place} was {self.expected} and {self.seen}"
+        return {
+            "misread": f"the view at step {self.step} is misread: {self.seen}, expected "
+            f"{self.expected}",
+            "misseen": f"the star at step {self.step} is misread",
+            "jumped": f"the displacement that leads to step {self.step} is wrong: {self.seen}",
+            "slipped": f"the action at step {self.step} slipped: {self.seen}",
+        }[self.kind]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fault as plain data, without what is None."""

@@ -45,8 +45,6 @@ class MapSequence:
 
     def __getitem__(self, index: int | slice) -> SSHMap | tuple[SSHMap, ...]:
         """The map at a position, or a tuple of maps for a slice. Raises RangeError."""
-        return (
-            self.maps[index]
-            if isinstance(index, slice)
-            else self.maps[checked_index(index, len(self.maps), "maps")]
-        )
+        if isinstance(index, slice):
+            return self.maps[index]
+        return self.maps[checked_index(index, len(self.maps), "maps")]

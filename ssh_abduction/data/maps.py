@@ -257,9 +257,8 @@ class SSHMap:
 
         Direction +1 of a path becomes the direction that the robot faced when it was first there.
         """
-        visited = [
-            self.dstates[s] for s in dict.fromkeys([*self.dstate_at, *range(len(self.dstates))])
-        ]
+        order = dict.fromkeys([*self.dstate_at, *range(len(self.dstates))])
+        visited = [self.dstates[s] for s in order]
         number = {s.id: i for i, s in enumerate(visited)}
         place = _numbered([*(s.place for s in visited), *self.places])
         path = _numbered([*(s.path for s in visited), *(p.id for p in self.paths)])
@@ -389,16 +388,14 @@ def _numbered(ids: Iterable[int | None]) -> dict[int | None, int]:
 
 def checked_map(value: object, name: str = "map") -> SSHMap:
     """Return a value if it is a map, or raise MapError."""
-    return an_instance(
-        name, value, SSHMap, MapError, mend="take one of solution.maps, or SSHMap.load"
-    )
+    mend = "take one of solution.maps, or SSHMap.load"
+    return an_instance(name, value, SSHMap, MapError, mend=mend)
 
 
 def checked_maps(values: object) -> tuple[SSHMap, ...]:
     """Return the values of an iterable if all are maps, or raise MapError."""
-    return all_instances(
-        "maps", values, SSHMap, MapError, mend="take the maps of a solution, or SSHMap.load"
-    )
+    mend = "take the maps of a solution, or SSHMap.load"
+    return all_instances("maps", values, SSHMap, MapError, mend=mend)
 
 
 def maps_of(data: Any, where: str) -> list[SSHMap]:

@@ -60,24 +60,17 @@ def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
     # the bearing or the gateway of a turn is more precise than right, left and around
     if action.bearing is not None:
         return any(angle_between(r, round(action.bearing)) <= SPREAD for r in found)
+    gateways = list(zip(before.bearings, before.spreads, strict=True))
+    is_ahead = [angle_between(bearing, 0) <= spread + ROUNDING for bearing, spread in gateways]
     if action.gateway is not None:
-        beside = [
-            (bearing, spread)
-            for bearing, spread in zip(before.bearings, before.spreads, strict=True)
-            if angle_between(bearing, 0) > spread + ROUNDING
-        ]
+        beside = [gateways[k] for k in range(before.slots) if not is_ahead[k]]
         if action.turn == "left":
             beside.reverse()
         return action.gateway <= len(beside) and bool(found & arc(*beside[action.gateway - 1]))
     if action.turn == "around":
-        behind = [
-            (before.bearings[other], before.spreads[other])
-            for bearing, spread, other in zip(
-                before.bearings, before.spreads, before.opposite, strict=True
-            )
-            if other is not None and angle_between(bearing, 0) <= spread + ROUNDING
-        ][:1]
-        return any(found & arc(*gateway) for gateway in [(180, 0), *behind])
+        others = zip(is_ahead, before.opposite, strict=True)
+        behind = [gateways[k] for ahead, k in others if ahead and k is not None]
+        return any(found & arc(*gateway) for gateway in [(180, 0), *behind[:1]])
     sides = (r if action.turn == "right" else 360 - r for r in found)
     return any(2 * SPREAD < side < 180 - 2 * SPREAD for side in sides)
 

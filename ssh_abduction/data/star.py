@@ -162,20 +162,9 @@ class Star:
                 number of bearings in degrees and Gateways.
         """
         if is_four(entries):
-            quarters = ((90.0 * k, entry) for k, entry in enumerate(entries))
-            return cls(
-                tuple(
-                    Gateway(bearing, open=True if entry else None)
-                    for bearing, entry in quarters
-                    if entry != 0
-                )
-            )
-        return cls(
-            tuple(
-                entry if isinstance(entry, Gateway) else Gateway(float(entry or 0))
-                for entry in entries
-            )
-        )
+            quarters = [(90.0 * k, entry) for k, entry in enumerate(entries) if entry != 0]
+            return cls(tuple(Gateway(way, open=True if seen else None) for way, seen in quarters))
+        return cls(tuple(e if isinstance(e, Gateway) else Gateway(float(e or 0)) for e in entries))
 
     @property
     def openings(self) -> Openings | None:
@@ -189,12 +178,10 @@ class Star:
             slot = near_quarter(gateway.bearing)
             if slot is None or not gateway.open or found.setdefault(slot, k) != k:
                 return None
-        if any(
-            g.opposite is not None and found.get((slot + 2) % 4) != g.opposite
-            for slot, k in found.items()
-            if (g := self.gateways[k])
-        ):
-            return None
+        for slot, k in found.items():
+            opposite = self.gateways[k].opposite
+            if opposite is not None and found.get((slot + 2) % 4) != opposite:
+                return None
         return 0 in found, 1 in found, 2 in found, 3 in found
 
     @property
@@ -212,11 +199,10 @@ class Star:
 
     def frame(self, kept: list[int]) -> Frame:
         """Make a frame from the gateways with these indices."""
-        clockwise = sorted(
-            kept, key=lambda k: (self.gateways[k].bearing + self.gateways[k].spread) % 360
-        )
+        of = self.gateways
+        clockwise = sorted(kept, key=lambda k: (of[k].bearing + of[k].spread) % 360)
         slot = {k: i for i, k in enumerate(clockwise)}
-        gateways = [self.gateways[k] for k in clockwise]
+        gateways = [of[k] for k in clockwise]
         return Frame(
             tuple(g.bearing % 360 for g in gateways),
             tuple(g.spread for g in gateways),

@@ -66,9 +66,8 @@ class Step:
         if self.view is not None:
             object.__setattr__(self, "view", checked_view(self.view, "view"))
         if self.action is not None:
-            an_instance(
-                "action", self.action, Action, TraceError, mend='make one with Action.of("travel")'
-            )
+            mend = 'make one with Action.of("travel")'
+            an_instance("action", self.action, Action, TraceError, mend=mend)
         an_object("extra", self.extra, TraceError)
         if self.image is not None:
             object.__setattr__(self, "image", frozen_image(self.image))
@@ -79,16 +78,14 @@ class Step:
             object.__setattr__(self, "star", parse_star(self.star, "star"))
         object.__setattr__(self, "gateways", None if self.star is None else Star.of(self.star))
         if self.displacement is not None:
-            moved = checked_displacement(self.displacement)
-            object.__setattr__(self, "displacement", moved)
+            object.__setattr__(self, "displacement", checked_displacement(self.displacement))
         if self.covariance is not None:
             if self.displacement is None:
                 raise TraceError(
                     "covariance: expected a displacement at the same step, got none; add the "
                     "displacement, or leave the covariance out"
                 )
-            noise = checked_covariance(self.covariance)
-            object.__setattr__(self, "covariance", noise)
+            object.__setattr__(self, "covariance", checked_covariance(self.covariance))
 
     def __repr__(self) -> str:
         texts = that_differ(self)

@@ -15,6 +15,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -305,8 +306,7 @@ class Trace:
         if len(openings) != len(seen):
             raise TraceError(
                 f"trace: expected one star per view, got {len(openings)} stars and {len(seen)} "
-                "views; "
-                f"give None where none was seen"
+                "views; give None where none was seen"
             )
         moved = of_actions(displacements, "displacements", len(done))
         noise = of_actions(covariances, "covariances", len(done))
@@ -339,13 +339,11 @@ class Trace:
         }
         if not unknown:
             return self
-        return replace(
-            self,
-            steps=tuple(
-                replace(step, displacement=None, covariance=None) if t in unknown else step
-                for t, step in enumerate(self.steps)
-            ),
-        )
+        kept = [
+            replace(step, displacement=None, covariance=None) if t in unknown else step
+            for t, step in enumerate(self.steps)
+        ]
+        return replace(self, steps=tuple(kept))
 
     def with_views(
         self, views: Iterable[View | None], confidences: Iterable[float | None] | None = None
@@ -363,24 +361,14 @@ class Trace:
         sure = [None] * len(seen) if confidences is None else as_list(confidences, "confidences")
         for name, values in (("views", seen), ("confidences", sure)):
             if len(values) != len(self):
-                told = (
-                    f"expected one per step, {len(self)}, got {len(values)}; add or leave out some"
-                )
-                raise TraceError(f"{name}: {told}")
-        checked = [
-            (
-                None if view is None else checked_view(view, f"views[{i}]"),
-                None if c is None else checked_probability(c, f"confidences[{i}]"),
-            )
-            for i, (view, c) in enumerate(zip(seen, sure, strict=True))
-        ]
-        return replace(
-            self,
-            steps=tuple(
-                replace(step, view=view, confidence=c)
-                for step, (view, c) in zip(self.steps, checked, strict=True)
-            ),
-        )
+                told = f"expected one per step, {len(self)}, got {len(values)}"
+                raise TraceError(f"{name}: {told}; add or leave out some")
+        steps = []
+        for i, (step, v, c) in enumerate(zip(self.steps, seen, sure, strict=True)):
+            view = None if v is None else checked_view(v, f"views[{i}]")
+            share = None if c is None else checked_probability(c, f"confidences[{i}]")
+            steps.append(replace(step, view=view, confidence=share))
+        return replace(self, steps=tuple(steps))
 
     def prefix(self, steps: int) -> Trace:
         """Return the trace of the first `steps` steps, or the whole trace if it has fewer."""
@@ -400,14 +388,10 @@ class Trace:
         path = a_path("path", path, TraceError)
         source = "standard input" if path == "-" else named(path)
         try:
-            if path == "-":
-                if sys.stdin is None:
-                    raise TraceError(
-                        "standard input: expected a trace, got a closed stream; name a file"
-                    )
-                return cls(**read_trace(sys.stdin.buffer, source), source=source)
-            with Path(path).open("rb") as file:
-                return cls(**read_trace(file, source), source=path)
+            if path == "-" and sys.stdin is None:
+                raise TraceError(f"{source}: expected a trace, got a closed stream; name a file")
+            with nullcontext(sys.stdin.buffer) if path == "-" else Path(path).open("rb") as file:
+                return cls(**read_trace(file, source), source=source if path == "-" else path)
         except TraceError:
             raise
         except OSError as error:
@@ -438,9 +422,8 @@ class Trace:
     @property
     def digest(self) -> str:
         """A digest of the trace's file, 16 hexadecimal digits. Reports name the trace by it."""
-        return hashlib.sha256(
-            "\n".join(self.to_lines()).encode("utf-8", "backslashreplace")
-        ).hexdigest()[:16]
+        whole = "\n".join(self.to_lines()).encode("utf-8", "backslashreplace")
+        return hashlib.sha256(whole).hexdigest()[:16]
 
     def to_lines(self) -> Iterator[str]:
         """Yield the lines of the trace as a file: the header, then one line for each step."""
@@ -477,9 +460,8 @@ def _check_frame(trace: Trace, i: int, action: Action) -> None:
 
 def checked_trace(value: object) -> Trace:
     """Return a value if it is a trace, or raise TraceError."""
-    return an_instance(
-        "trace", value, Trace, TraceError, mend="make one with Trace.load or Trace.from_steps"
-    )
+    mend = "make one with Trace.load or Trace.from_steps"
+    return an_instance("trace", value, Trace, TraceError, mend=mend)
 
 
 def _dump(value: Mapping[str, Any]) -> str:

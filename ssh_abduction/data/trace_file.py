@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any, BinaryIO
 
 from ssh_abduction.data.action import Action, parse_action
@@ -29,16 +30,7 @@ _LOGS = {
     b"\x89MCAP0": "MCAP",
     b"# message formats defined": "a log of CARMEN",
 }
-_STEP_FIELDS = (
-    "view",
-    "image",
-    "action",
-    "star",
-    "displacement",
-    "covariance",
-    "truth",
-    "confidence",
-)
+_STEP_FIELDS = tuple(f.name for f in fields(Step) if f.name not in ("extra", "gateways"))
 _HEADER_FIELDS = ("format", "version", "name", "images", "odometry", "drive", "closures")
 
 
@@ -150,11 +142,8 @@ def _refuse_other_files(raw: bytes, where: str) -> None:
 def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Check the header and return it as a dict, its odometry and closures as objects."""
     if record.get("format") != FORMAT:
-        came = (
-            brief(record["format"])
-            if "format" in record
-            else f"a line without it: {brief(dict(record))}"
-        )
+        came = f"a line without it: {brief(dict(record))}"
+        came = brief(record["format"]) if "format" in record else came
         raise TraceError(
             f'{where}: format: expected "{FORMAT}" in a header, got {came}; '
             f'put {{"format": "{FORMAT}", "version": {VERSION}}} on the first line'
