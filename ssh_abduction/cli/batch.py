@@ -53,25 +53,15 @@ GUARDED, OVERDUE = 1.2, 10.0
 
 @dataclass(frozen=True, slots=True)
 class SolveQuestion(FileQuestion):
-    """The settings for solving each of many traces.
-
-    Attributes:
-        theory: The theory.
-        limit: Seconds for each trace; None for no limit.
-        maps: The largest number of maps to list; 0 for all.
-        memory: MiB that the process may use; None for no limit.
-        speedups: Flags that say which speed-ups to use.
-        json: Whether lines are JSON.
-        within: The number of dstates by which a listed map may exceed the minimum.
-    """
+    """The settings for solving each of many traces."""
 
     theory: Theory
-    limit: float | None
-    maps: int
-    memory: int | None
-    speedups: Speedups
-    json: bool
-    within: int = 0
+    limit: float | None  # seconds for each trace; None for no limit
+    maps: int  # the largest number of maps to list; 0 for all
+    memory: int | None  # MiB that the process may use; None for no limit
+    speedups: Speedups  # flags that say which speed-ups to use
+    json: bool  # whether lines are JSON
+    within: int = 0  # the number of dstates by which a listed map may exceed the minimum
 
     patience: ClassVar = 3.0
     killed: ClassVar = (

@@ -40,19 +40,13 @@ SHOWN = 20  # violations that are printed for each map
 
 @dataclass(frozen=True)
 class _Judgement:
-    """What `check` found.
+    """What `check` found."""
 
-    Attributes:
-        violations: The violations of each map.
-        theory: The theory, in which no field is "auto".
-        said: Sentences about everything else that was checked, such as bounds and costs.
-        holds: Whether all maps and claims hold.
-    """
-
-    violations: Sequence[Sequence[Violation]]
-    theory: Theory
+    violations: Sequence[Sequence[Violation]]  # the violations of each map
+    theory: Theory  # the theory, in which no field is "auto"
+    # Sentences about everything else that was checked, such as bounds and costs.
     said: Sequence[str]
-    holds: bool
+    holds: bool  # whether all maps and claims hold
 
     @property
     def not_checked(self) -> list[str]:

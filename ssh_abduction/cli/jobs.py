@@ -26,40 +26,26 @@ def in_a_line(error: Exception) -> str:
 
 @dataclass(frozen=True, slots=True)
 class FileAnswer:
-    """The answer for one file, as plain data.
+    """The answer for one file, as plain data."""
 
-    Attributes:
-        number: The number of the file in the command line, from 0.
-        line: The line to print.
-        code: The exit code.
-        warnings: The warnings to print.
-        files: Names and contents of the files to write.
-    """
-
-    number: int
-    line: str
-    code: int
-    warnings: tuple[str, ...] = ()
-    files: tuple[tuple[str, bytes], ...] = ()
+    number: int  # the number of the file in the command line, from 0
+    line: str  # the line to print
+    code: int  # the exit code
+    warnings: tuple[str, ...] = ()  # the warnings to print
+    files: tuple[tuple[str, bytes], ...] = ()  # names and contents of the files to write
 
 
 class FileQuestion(Protocol):
     """A question to be answered for each of many files.
 
     Questions and answers are plain data, because they are sent to other processes and machines.
-
-    Attributes:
-        limit: The seconds for each file; None for no limit.
-        patience: The seconds to wait for unfinished answers after Ctrl-C.
-        killed: The message for a file whose process was killed.
-        late: The message for a file whose process was given up.
     """
 
     __slots__ = ()
-    limit: float | None
-    patience: ClassVar[float]
-    killed: ClassVar[str]
-    late: ClassVar[str] = ""
+    limit: float | None  # the seconds for each file; None for no limit
+    patience: ClassVar[float]  # the seconds to wait for unfinished answers after Ctrl-C
+    killed: ClassVar[str]  # the message for a file whose process was killed
+    late: ClassVar[str] = ""  # the message for a file whose process was given up
 
     @property
     def overdue(self) -> float | None:

@@ -58,26 +58,17 @@ class UnwrittenError(AbductionError):
 
 @dataclass(frozen=True, slots=True)
 class MapQuestion(FileQuestion):
-    """The settings for mapping each of many logs.
+    """The settings for mapping each of many logs."""
 
-    Attributes:
-        theory: The theory; None to choose it for each log.
-        choices: The fields of the theory that the user set, by name.
-        reading: The arguments of `read_log`, by name.
-        width: The width of the robot, in metres.
-        limit: Seconds for the search for minimal maps; None for the default of `map_log`.
-        maps: The largest number of maps to list; 0 for all.
-        ladder: Whether to compute what each kind of evidence contributes.
-        corrections: Names and corrections of a person, to be obeyed; None for none.
-    """
-
-    theory: Theory | None
-    choices: dict[str, Any]
-    reading: dict[str, Any]
-    width: float
+    theory: Theory | None  # the theory; None to choose it for each log
+    choices: dict[str, Any]  # the fields of the theory that the user set, by name
+    reading: dict[str, Any]  # the arguments of `read_log`, by name
+    width: float  # the width of the robot, in metres
+    # Seconds for the search for minimal maps; None for the default of `map_log`.
     limit: float | None
-    maps: int
-    ladder: bool
+    maps: int  # the largest number of maps to list; 0 for all
+    ladder: bool  # whether to compute what each kind of evidence contributes
+    # Names and corrections of a person, to be obeyed; None for none.
     corrections: Corrections | None = None
 
     patience: ClassVar = 10.0

@@ -80,21 +80,13 @@ def keep_corrections(said: Corrections | None, output: str | None) -> None:
 
 @dataclass(frozen=True)
 class Obeying:
-    """The corrections that a search obeys.
-
-    Attributes:
-        corrections: The corrections.
-        trace: The trace, with its stars corrected.
-        theory: The theory, with the pairs of steps that a person asserts.
-        as_seen: The trace as it was recorded.
-        without: The theory without these pairs.
-    """
+    """The corrections that a search obeys."""
 
     corrections: Corrections
-    trace: Trace
-    theory: Theory
-    as_seen: Trace
-    without: Theory
+    trace: Trace  # the trace, with its stars corrected
+    theory: Theory  # the theory, with the pairs of steps that a person asserts
+    as_seen: Trace  # the trace as it was recorded
+    without: Theory  # the theory without these pairs
 
     @classmethod
     def of(cls, options: argparse.Namespace, trace: Trace, theory: Theory) -> Obeying:

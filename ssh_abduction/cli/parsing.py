@@ -29,22 +29,15 @@ DRAWN = ("dot", "graphml", "svg")  # options of `show` in version 0.1.0, now `ex
 
 @dataclass(frozen=True)
 class Setting:
-    """An option that the user gives as --set NAME=VALUE.
+    """An option that the user gives as --set NAME=VALUE."""
 
-    Attributes:
-        name: The name, with underscores.
-        help: The help text.
-        type: Converts the text of the value. Raises ValueError or argparse.ArgumentTypeError.
-        choices: The texts that are allowed; None if `type` decides.
-        metavar: The word for the value in the help.
-        many: Whether the setting may be given several times. Its value is then a list.
-    """
-
-    name: str
-    help: str
+    name: str  # the name, with underscores
+    help: str  # the help text
+    # Converts the text of the value. Raises ValueError or argparse.ArgumentTypeError.
     type: Callable[[str], Any] = str
-    choices: tuple[str, ...] | None = None
-    metavar: str = "TEXT"
+    choices: tuple[str, ...] | None = None  # the texts that are allowed; None if `type` decides
+    metavar: str = "TEXT"  # the word for the value in the help
+    # Whether the setting may be given several times. Its value is then a list.
     many: bool = False
 
     @property

@@ -34,21 +34,13 @@ COMPASS = {name: 45.0 * k for k, name in enumerate(_WINDS)}
 
 @dataclass(frozen=True)
 class SavedMap:
-    """A map and the drives that it was made of.
-
-    Attributes:
-        map: The map.
-        drives: Its drives.
-        file: The file of maps.
-        corrections: What a person said about it.
-        star: How its theory uses stars; None if the file does not say.
-    """
+    """A map and the drives that it was made of."""
 
     map: SSHMap
     drives: tuple[Drive, ...]
-    file: Path
-    corrections: Corrections
-    star: str | None
+    file: Path  # the file of maps
+    corrections: Corrections  # what a person said about it
+    star: str | None  # how its theory uses stars; None if the file does not say
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], number: int | str = 1) -> SavedMap:

@@ -75,10 +75,6 @@ class DriveStep(int):
     >>> step = DriveStep(14, "tuesday", 9)
     >>> f"step {step}", step + 1
     ('step tuesday:5', 15)
-
-    Attributes:
-        drive: The name of the drive.
-        first: The number of its first step.
     """
 
     def __new__(cls, number: int, drive: str = "", first: int = 0) -> DriveStep:
@@ -86,8 +82,8 @@ class DriveStep(int):
         step.drive, step.first = drive, first
         return step
 
-    drive: str
-    first: int
+    drive: str  # the name of the drive
+    first: int  # the number of its first step
 
     def __str__(self) -> str:
         return f"{self.drive}:{self - self.first}"

@@ -30,26 +30,19 @@ COURSE = "course"
 
 @dataclass(frozen=True)
 class Sight:
-    """A dstate (a place and a heading) and a star (all gateways) seen there.
-
-    Attributes:
-        dstate: The dstate.
-        star: The star.
-        step: The first step with this dstate and star, on this drive.
-        shows: Whether this is the first sight of its dstate. That sight fixes the dstate's heading.
-        first: Whether this is the first sight at its place. That sight has heading 0.
-        onward: The directions in which the dstate's path goes on, in degrees: 0 (ahead), 180
-            (behind), both or neither.
-        drive: The number of the drive; 0 for all if gateways cannot change between drives.
-    """
+    """A dstate (a place and a heading) and a star (all gateways) seen there."""
 
     dstate: DState
     star: Star
-    step: int
+    step: int  # the first step with this dstate and star, on this drive
+    # Whether this is the first sight of its dstate. That sight fixes the dstate's heading.
     shows: bool
+    # Whether this is the first sight at its place. That sight has heading 0.
     first: bool
+    # The directions in which the dstate's path goes on, in degrees: 0 (ahead), 180 (behind), both
+    # or neither.
     onward: tuple[int, ...] = ()
-    drive: int = 0
+    drive: int = 0  # the number of the drive; 0 for all if gateways cannot change between drives
 
     def __hash__(self) -> int:
         """Hash few fields, to be fast. Few sights of a map are equal in these."""
@@ -168,17 +161,11 @@ def allowed_headings(
 
 @dataclass(frozen=True)
 class Facing:
-    """How the dstates of a map face in the frames of their places.
+    """How the dstates of a map face in the frames of their places."""
 
-    Attributes:
-        headings: For each dstate, its heading, if it is known.
-        opposite: Pairs of dstates at one place that face opposite ways.
-        ends: Pairs of a dstate and a direction, 0 (ahead) or 180 (behind), in which no gateway
-            leads on.
-    """
-
-    headings: dict[int, int]
-    opposite: list[tuple[int, int]]
+    headings: dict[int, int]  # for each dstate, its heading, if it is known
+    opposite: list[tuple[int, int]]  # pairs of dstates at one place that face opposite ways
+    # Pairs of a dstate and a direction, 0 (ahead) or 180 (behind), in which no gateway leads on.
     ends: list[tuple[int, int]]
 
 
@@ -350,21 +337,13 @@ def _changes(closed: Mapping[int, frozenset[int]]) -> float:
 
 @dataclass(frozen=True)
 class GatewayChange:
-    """A gateway that is open on one drive and closed on the drive that came there before or after.
-
-    Attributes:
-        place: The place.
-        bearing: Its direction in degrees, clockwise from the heading of the first dstate there.
-        step: The first step of the later drive there.
-        drives: The numbers of the earlier drive and of the later one.
-        is_open: Whether it is open on the later drive.
-    """
+    """A gateway that is open on one drive and closed on the one that came there before or after."""
 
     place: int
-    bearing: int
-    step: int
-    drives: tuple[int, int]
-    is_open: bool
+    bearing: int  # its direction in degrees, clockwise from the heading of the first dstate there
+    step: int  # the first step of the later drive there
+    drives: tuple[int, int]  # the numbers of the earlier drive and of the later one
+    is_open: bool  # whether it is open on the later drive
 
 
 def changes_in(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> Iterator[GatewayChange]:

@@ -20,14 +20,10 @@ class FieldReader:
 
     Args:
         where: The name of the file in error messages.
-
-    Attributes:
-        error: The class of the errors that are raised.
-        mend: What messages advise the user to do.
     """
 
-    error: ClassVar[type[AbductionError]] = MapError
-    mend: ClassVar = "write the file with solve --json"
+    error: ClassVar[type[AbductionError]] = MapError  # the class of the errors that are raised
+    mend: ClassVar = "write the file with solve --json"  # what messages advise the user to do
 
     def __init__(self, where: str) -> None:
         self.where = a_text("where", where, self.error)

@@ -79,17 +79,14 @@ class Frame:
 
     Each gateway is a slot. Slots are numbered clockwise from the gateway ahead or, if there is none
     ahead, from the first one to the right of it.
-
-    Attributes:
-        bearings: The bearing of each slot, in degrees clockwise from straight ahead.
-        spreads: How many degrees each bearing may be off.
-        opposite: For each slot, the slot where the same path goes on; None if the star gives none.
-        hashed: The hash of the bearings, stored because frames are often hashed.
     """
 
+    # The bearing of each slot, in degrees clockwise from straight ahead.
     bearings: tuple[float, ...]
-    spreads: tuple[float, ...]
+    spreads: tuple[float, ...]  # how many degrees each bearing may be off
+    # For each slot, the slot where the same path goes on; None if the star gives none.
     opposite: tuple[int | None, ...]
+    # The hash of the bearings, stored because frames are often hashed.
     hashed: int = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -19,38 +19,27 @@ BRIEF = 3
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """An axiom at one step that an argument needs.
+    """An axiom at one step that an argument needs."""
 
-    Attributes:
-        axiom: The name of the axiom.
-        step: The step. If the axiom is about several steps at once, this is the last of them.
-        without: A map of the steps of the argument in which all other links hold, but not the
-            conclusion.
-        violations: The violations of axioms of the argument that the checker finds in this map.
-    """
-
-    axiom: str
+    axiom: str  # the name of the axiom
+    # The step. If the axiom is about several steps at once, this is the last of them.
     step: int
+    # A map of the steps of the argument in which all other links hold, but not the conclusion.
     without: SSHMap
+    # The violations of axioms of the argument that the checker finds in this map.
     violations: tuple[Violation, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Inference(PlainData):
-    """One line of an argument.
+    """One line of an argument."""
 
-    Attributes:
-        says: The conclusions, each as a clause.
-        because: The axioms that the conclusions follow from, each as a clause.
-        links: The same axioms by name, each with its steps.
-        premises: The indices (from 0) of the earlier lines that the conclusions follow from.
-        supposed: Whether the line holds only under the supposition that leads to a contradiction.
-    """
-
-    says: tuple[str, ...]
-    because: tuple[str, ...]
-    links: tuple[ClashingAxiom, ...]
+    says: tuple[str, ...]  # the conclusions, each as a clause
+    because: tuple[str, ...]  # the axioms that the conclusions follow from, each as a clause
+    links: tuple[ClashingAxiom, ...]  # the same axioms by name, each with its steps
+    # The indices (from 0) of the earlier lines that the conclusions follow from.
     premises: tuple[int, ...]
+    # Whether the line holds only under the supposition that leads to a contradiction.
     supposed: bool
 
 

@@ -35,14 +35,10 @@ STRETCH = 8
 
 @dataclass(frozen=True, slots=True)
 class ClashingAxiom(PlainData):
-    """An axiom that cannot hold at all these steps together with the other axioms of a clash.
+    """An axiom that cannot hold at all these steps together with the other axioms of a clash."""
 
-    Attributes:
-        axiom: The name of the axiom.
-        steps: The steps. If the axiom is about several steps at once, the last one is listed.
-    """
-
-    axiom: str
+    axiom: str  # the name of the axiom
+    # The steps. If the axiom is about several steps at once, the last one is listed.
     steps: tuple[int, ...]
 
 

@@ -19,19 +19,17 @@ class Piece:
 
     A map of the whole trace, restricted to these steps, satisfies the axioms at these steps. So if
     the piece has no map, the whole trace has none.
-
-    Attributes:
-        problem: A trace of these steps, numbered from 0, and the theory. Where steps are left out,
-            the action and the displacement are unknown. The pairs of steps that a user asserted to
-            be the same or different are renumbered in the theory.
-        steps: The steps by their numbers in the whole trace, ascending. In sentences, steps
-            of several drives have the names of their drives.
-        facts: Clingo facts for the pairs of steps that displacements exclude from being at one
-            dstate, or at one place. Empty if no steps are left out between the first and the last.
     """
 
+    # A trace of these steps, numbered from 0, and the theory. Where steps are left out, the action
+    # and the displacement are unknown. The pairs of steps that a user asserted to be the same or
+    # different are renumbered in the theory.
     problem: Problem
+    # The steps by their numbers in the whole trace, ascending. In sentences, steps of several
+    # drives have the names of their drives.
     steps: tuple[int, ...]
+    # Clingo facts for the pairs of steps that displacements exclude from being at one dstate, or at
+    # one place. Empty if no steps are left out between the first and the last.
     facts: str = ""
 
     @property

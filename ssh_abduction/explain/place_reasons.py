@@ -71,22 +71,16 @@ def explain_place(
 
 @dataclass(frozen=True, slots=True)
 class PathSide(PlainData):
-    """The side of a path on which a place lies, and why.
+    """The side of a path on which a place lies, and why."""
 
-    Attributes:
-        path: The id of the path.
-        side: "right" or "left" of the path in direction +1; "on" if the place is on the path; None
-            if unknown.
-        steps: The step of the turn that shows the side, and the next step; empty if no turn does.
-        sentence: The side and its reason in words.
-        agree: The number of listed minimal maps that have the same side.
-    """
-
-    path: int
+    path: int  # the id of the path
+    # "right" or "left" of the path in direction +1; "on" if the place is on the path; None if
+    # unknown.
     side: _Side
+    # The step of the turn that shows the side, and the next step; empty if no turn does.
     steps: tuple[int, ...]
-    sentence: str
-    agree: int
+    sentence: str  # the side and its reason in words
+    agree: int  # the number of listed minimal maps that have the same side
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,19 +42,12 @@ SURE, GUESSED = 1.0, 0.2
 
 
 class Turn(NamedTuple):
-    """The angle between two dstates.
+    """The angle between two dstates."""
 
-    Attributes:
-        a: The first dstate.
-        b: The second dstate.
-        angle: Radians counterclockwise from the heading of a to the heading of b.
-        weight: SURE if the angle is known, GUESSED if only the side is known.
-    """
-
-    a: DState
-    b: DState
-    angle: float
-    weight: float
+    a: DState  # the first dstate
+    b: DState  # the second dstate
+    angle: float  # radians counterclockwise from the heading of a to the heading of b
+    weight: float  # SURE if the angle is known, GUESSED if only the side is known
 
 
 def turns_between(

@@ -38,17 +38,13 @@ FLOOR_GAP = 0.25  # distance between two floors, as a share of the extent of the
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The positions at which a map is drawn, with x to the right and y up.
+    """The positions at which a map is drawn, with x to the right and y up."""
 
-    Attributes:
-        places: The position (x, y) of each place, by id.
-        dstates: The position and heading (x, y, heading) of each dstate, by id. The heading is in
-            radians counterclockwise from x; None if it is unknown.
-        metric: Whether positions are metres. Otherwise the shortest street has about length 1.
-    """
-
-    places: Mapping[int, Point]
+    places: Mapping[int, Point]  # the position (x, y) of each place, by id
+    # The position and heading (x, y, heading) of each dstate, by id. The heading is in radians
+    # counterclockwise from x; None if it is unknown.
     dstates: tuple[tuple[float, float, float | None], ...] = field(repr=False)
+    # Whether positions are metres. Otherwise the shortest street has about length 1.
     metric: bool = False
 
 

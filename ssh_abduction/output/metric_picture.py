@@ -59,21 +59,15 @@ class _Picture:
     """The page while it is drawn.
 
     Points of the page have x to the right and y down. Sites are those of `DState.site`.
-
-    Attributes:
-        map: The map.
-        poses: The pose of each dstate.
-        scale: Units of the page for each metre.
-        unit: A factor for the size of all marks, at most 1. It is smaller if there is little room.
-        points: Points that the page has to include.
-        boxes: Boxes (left, top, right, bottom) that labels must not overlap.
     """
 
     map: SSHMap
-    poses: Sequence[Pose]
-    scale: float
+    poses: Sequence[Pose]  # the pose of each dstate
+    scale: float  # units of the page for each metre
+    # A factor for the size of all marks, at most 1. It is smaller if there is little room.
     unit: float
-    points: list[Point] = field(default_factory=list)
+    points: list[Point] = field(default_factory=list)  # points that the page has to include
+    # Boxes (left, top, right, bottom) that labels must not overlap.
     boxes: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     @classmethod

@@ -38,17 +38,11 @@ CUT = 0.5  # the largest standard deviation of an ellipse, as a share of the ext
 
 @dataclass(frozen=True, slots=True)
 class Called:
-    """File names and flags for the commands that the page shows.
+    """File names and flags for the commands that the page shows."""
 
-    Attributes:
-        maps: The name of the file of maps.
-        trace: The name of the file of the trace.
-        flags: The flags that choose the theory.
-    """
-
-    maps: str = "maps.json"
-    trace: str = "TRACE"
-    flags: str = ""
+    maps: str = "maps.json"  # the name of the file of maps
+    trace: str = "TRACE"  # the name of the file of the trace
+    flags: str = ""  # the flags that choose the theory
 
 
 def content_of(

@@ -44,16 +44,12 @@ HALF = 180.0
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """The trace of a robot that is localised in the maps, to be replayed with its beliefs.
+    """The trace of a robot that is localised in the maps, to be replayed with its beliefs."""
 
-    Attributes:
-        trace: The trace of the robot. It may be the trace that was mapped.
-        beliefs: A function that takes a map and returns the belief at each step, as Belief objects
-            or as dicts from `Belief.to_dict`. It returns None for a map in which the robot was not
-            localised.
-    """
-
+    # The trace of the robot. It may be the trace that was mapped.
     trace: Trace
+    # A function that takes a map and returns the belief at each step, as Belief objects or as dicts
+    # from `Belief.to_dict`. It returns None for a map in which the robot was not localised.
     beliefs: Callable[[SSHMap], Iterable[Any] | None] = field(repr=False)
 
 

@@ -49,14 +49,10 @@ from ssh_abduction.solver import Backbone, Shared, Sharing
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """One way to answer the questions of a choice.
+    """One way to answer the questions of a choice."""
 
-    Attributes:
-        answers: The answers, in the order of the questions of the choice.
-        maps: The numbers of the maps with these answers, counted from 1.
-    """
-
-    answers: tuple[bool, ...]
+    answers: tuple[bool, ...]  # the answers, in the order of the questions of the choice
+    # The numbers of the maps with these answers, counted from 1.
     maps: tuple[int, ...] = field(repr=False)
 
     def to_dict(self) -> dict[str, Any]:
@@ -82,24 +78,16 @@ class Choice(PlainData):
 
 @dataclass(frozen=True, slots=True)
 class Others:
-    """A comparison of one list of maps with another list. Maps are numbered from 1.
+    """A comparison of one list of maps with another list. Maps are numbered from 1."""
 
-    Attributes:
-        count: The number of maps in the other list.
-        both: The maps that both lists have, up to renaming: pairs of the number in this list and
-            the number in the other list.
-        here: The numbers of the maps that only this list has.
-        there: The numbers of the maps that only the other list has.
-        best: The difference between the first maps of both lists.
-        source: The name of the other list, for messages.
-    """
-
-    count: int
+    count: int  # the number of maps in the other list
+    # The maps that both lists have, up to renaming: pairs of the number in this list and the number
+    # in the other list.
     both: tuple[tuple[int, int], ...]
-    here: tuple[int, ...]
-    there: tuple[int, ...]
-    best: Difference
-    source: str = "the other file"
+    here: tuple[int, ...]  # the numbers of the maps that only this list has
+    there: tuple[int, ...]  # the numbers of the maps that only the other list has
+    best: Difference  # the difference between the first maps of both lists
+    source: str = "the other file"  # the name of the other list, for messages
 
     @property
     def sentence(self) -> str:

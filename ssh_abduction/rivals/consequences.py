@@ -35,17 +35,13 @@ _OF_COURSES = frozenset({"turn_around_reverses", "one_dstate_per_course"})
 
 @dataclass(frozen=True, slots=True)
 class Consequence:
-    """The prediction of a map for an action at a dstate.
+    """The prediction of a map for an action at a dstate."""
 
-    Attributes:
-        how: "link" if the action was tried; "implied" if the axioms imply where it leads;
-            "expected" if the order of a path suggests it; "open" if nothing is known.
-        dstate: The dstate that the action leads to; None if unknown.
-        seen: The view and star there, as far as they are known; None if nothing is known.
-    """
-
+    # "link" if the action was tried; "implied" if the axioms imply where it leads; "expected" if
+    # the order of a path suggests it; "open" if nothing is known.
     how: How
-    dstate: int | None = None
+    dstate: int | None = None  # the dstate that the action leads to; None if unknown
+    # The view and star there, as far as they are known; None if nothing is known.
     seen: Seen | None = None
 
     @property

@@ -46,22 +46,15 @@ LISTED = 12
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Steps that two maps group differently, by dstate, place, path or course.
+    """Steps that two maps group differently, by dstate, place, path or course."""
 
-    Attributes:
-        sort: What the steps are grouped by: "dstates", "places", "paths" or "courses" (a path and
-            the direction along it).
-        first: The groups of steps in the first map, sorted by first step.
-        other: The groups of the same steps in the other map.
-        first_none: The steps that are at no place, or along no path, in the first map.
-        other_none: The steps that are at no place, or along no path, in the other map.
-    """
-
+    # What the steps are grouped by: "dstates", "places", "paths" or "courses" (a path and the
+    # direction along it).
     sort: Sort
-    first: tuple[Steps, ...]
-    other: tuple[Steps, ...]
-    first_none: Steps = ()
-    other_none: Steps = ()
+    first: tuple[Steps, ...]  # the groups of steps in the first map, sorted by first step
+    other: tuple[Steps, ...]  # the groups of the same steps in the other map
+    first_none: Steps = ()  # the steps that are at no place, or along no path, in the first map
+    other_none: Steps = ()  # the steps that are at no place, or along no path, in the other map
 
     def in_words(self, names: tuple[str, str]) -> str:
         """Put the change into words, with these names for the two maps."""

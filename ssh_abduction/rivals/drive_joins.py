@@ -34,17 +34,12 @@ _Placing: TypeAlias = Sequence[int]  # the place of each step by one map; withou
 
 @dataclass(frozen=True, slots=True)
 class DriveJoin(PlainData):
-    """A step of one drive and a step of another drive that are at one place in some map.
+    """A step of one drive and a step of another drive that are at one place in some map."""
 
-    Attributes:
-        first: The number of the step in its own drive.
-        second: The number of the other step in its own drive.
-        share: The share of the maps, 0 to 1, in which both are at one place. If maps were compared
-            by cost in nats, and these costs can be trusted, this is the probability that they are.
-    """
-
-    first: int
-    second: int
+    first: int  # the number of the step in its own drive
+    second: int  # the number of the other step in its own drive
+    # The share of the maps, 0 to 1, in which both are at one place. If maps were compared by cost
+    # in nats, and these costs can be trusted, this is the probability that they are.
     share: float
 
 

@@ -15,15 +15,10 @@ from ssh_abduction.solver import Stop, stretches
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """The prediction of some rivals for an untried action.
+    """The prediction of some rivals for an untried action."""
 
-    Attributes:
-        rivals: The rivals with this prediction, numbered from 1.
-        says: The prediction.
-    """
-
-    rivals: tuple[int, ...]
-    says: Consequence
+    rivals: tuple[int, ...]  # the rivals with this prediction, numbered from 1
+    says: Consequence  # the prediction
 
     def to_dict(self) -> dict[str, Any]:
         """Return the prediction as plain data, as `next --json` prints it."""
@@ -32,34 +27,22 @@ class Expectation:
 
 @dataclass(frozen=True, slots=True)
 class Untried(PlainData):
-    """An action for which at least one rival has no link, and the way to it.
+    """An action for which at least one rival has no link, and the way to it."""
 
-    Attributes:
-        way: The actions that lead there, along links that all rivals have.
-        action: The untried action, to be done after these.
-        expects: The different predictions of the rivals.
-        worst: The number of rivals that are left in the worst case. All others are refuted.
-        pairs: The number of pairs of rivals with different predictions.
-    """
-
-    way: tuple[str, ...]
-    action: str
-    expects: tuple[Expectation, ...]
+    way: tuple[str, ...]  # the actions that lead there, along links that all rivals have
+    action: str  # the untried action, to be done after these
+    expects: tuple[Expectation, ...]  # the different predictions of the rivals
+    # The number of rivals that are left in the worst case. All others are refuted.
     worst: int
-    pairs: int
+    pairs: int  # the number of pairs of rivals with different predictions
 
 
 @dataclass(frozen=True, slots=True)
 class Branch:
-    """The rest of a plan after an observation.
+    """The rest of a plan after an observation."""
 
-    Attributes:
-        seen: The observation.
-        plan: The plan for the rivals that predict this observation.
-    """
-
-    seen: Seen
-    plan: ExperimentPlan
+    seen: Seen  # the observation
+    plan: ExperimentPlan  # the plan for the rivals that predict this observation
 
     def to_dict(self) -> dict[str, Any]:
         """Return the branch as plain data, as `next --json` prints it."""
@@ -113,15 +96,10 @@ class ExperimentPlan:
 
 @dataclass(frozen=True, slots=True)
 class Prediction(PlainData):
-    """The predictions of some rivals for the actions of an experiment.
+    """The predictions of some rivals for the actions of an experiment."""
 
-    Attributes:
-        rivals: The rivals with these predictions, numbered from 1.
-        seen: The predicted observation after each action.
-    """
-
-    rivals: tuple[int, ...]
-    seen: tuple[Seen, ...]
+    rivals: tuple[int, ...]  # the rivals with these predictions, numbered from 1
+    seen: tuple[Seen, ...]  # the predicted observation after each action
 
 
 @dataclass(frozen=True, slots=True)

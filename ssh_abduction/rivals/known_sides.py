@@ -36,18 +36,12 @@ class Beside(PlainData):
     """A place that lies right or left of a path.
 
     Right and left are as seen by the robot at the step `along`.
-
-    Attributes:
-        step: The first step at the place.
-        along: The first step along the path.
-        side: The side of the path on which the place lies.
-        share: The share of the compared maps in which this is known, 0 to 1.
     """
 
-    step: int
-    along: int
-    side: _Side
-    share: float = 1.0
+    step: int  # the first step at the place
+    along: int  # the first step along the path
+    side: _Side  # the side of the path on which the place lies
+    share: float = 1.0  # the share of the compared maps in which this is known, 0 to 1
 
     def __str__(self) -> str:
         where = f"the place of step {self.step} lies {self.side} of the path of step {self.along}"

@@ -357,14 +357,10 @@ def _seen(ssh_map: SSHMap) -> tuple[View | None, ...]:
 
 @dataclass(frozen=True, slots=True)
 class PairInMap:
-    """What the first map of a list says about the places of two steps.
+    """What the first map of a list says about the places of two steps."""
 
-    Attributes:
-        is_one_place: Whether the two steps are at one place.
-        probability: The probability that they are; None if it is unknown, as without costs in nats.
-    """
-
-    is_one_place: bool
+    is_one_place: bool  # whether the two steps are at one place
+    # The probability that they are; None if it is unknown, as without costs in nats.
     probability: float | None
 
     @classmethod

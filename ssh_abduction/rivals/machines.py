@@ -36,15 +36,10 @@ CHUNK = 2**21
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """The observation at a dstate.
+    """The observation at a dstate."""
 
-    Attributes:
-        view: The view; None if unknown.
-        star: All openings that are seen there, in the format of the trace; None if stars are not
-            used.
-    """
-
-    view: View | None
+    view: View | None  # the view; None if unknown
+    # All openings that are seen there, in the format of the trace; None if stars are not used.
     star: tuple[Any, ...] | None = None
 
     def __str__(self) -> str:
@@ -198,13 +193,11 @@ class Machine:
     """The predictions of a map from the current dstate on, as a finite-state machine.
 
     States are the dstates that links reach, numbered breadth first. The current dstate is 0.
-
-    Attributes:
-        sights: For each state, the number that `Observations` gives to what is seen there.
-        ends: For each state, pairs of an action and the state that it leads to.
     """
 
+    # For each state, the number that `Observations` gives to what is seen there.
     sights: tuple[int, ...]
+    # For each state, pairs of an action and the state that it leads to.
     ends: tuple[tuple[tuple[str, int], ...], ...]
 
 
@@ -281,16 +274,11 @@ class Layer:
     """The joint states that are reached first after `depth` actions.
 
     On the way there all machines predict the same observations.
-
-    Attributes:
-        depth: The number of actions.
-        first: The number of the first row, counted over all layers.
-        rows: The joint states, shape (n, m): the state of each machine.
     """
 
-    depth: int
-    first: int
-    rows: Array
+    depth: int  # the number of actions
+    first: int  # the number of the first row, counted over all layers
+    rows: Array  # the joint states, shape (n, m): the state of each machine
 
 
 class Walk:

@@ -93,18 +93,13 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class AnsweredQuestion:
-    """A question with its answers.
-
-    Attributes:
-        question: The question.
-        column: The answer of each map.
-        steps: For each sort of question, the later steps of the equivalent questions of this sort.
-            A question is equivalent if all maps give it the same answers as this one, or all give
-            it the opposite answers.
-    """
+    """A question with its answers."""
 
     question: Question
-    column: Bools
+    column: Bools  # the answer of each map
+    # For each sort of question, the later steps of the equivalent questions of this sort. A
+    # question is equivalent if all maps give it the same answers as this one, or all give it the
+    # opposite answers.
     steps: dict[Matter, set[int]]
 
 

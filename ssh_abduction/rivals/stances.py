@@ -23,21 +23,16 @@ AROUND = Action.of("around")
 
 @dataclass(frozen=True, slots=True)
 class StanceMove:
-    """An action that leads from one stance to another.
+    """An action that leads from one stance to another."""
 
-    Attributes:
-        source: The number of the stance before the action.
-        action: The action.
-        target: The number of the stance after the action. If `how` is "unknown", this is a guess: a
-            travel comes back through the same gateway, and any other action changes nothing.
-        how: How the target is known. "known": the action was tried. "implied": the axioms imply it,
-            for a turn at a place with a frame. "expected": a turn by the angle that the star shows,
-            or a travel back the way that the robot came. "unknown": anything else.
-    """
-
-    source: int
+    source: int  # the number of the stance before the action
     action: Action
+    # The number of the stance after the action. If `how` is "unknown", this is a guess: a travel
+    # comes back through the same gateway, and any other action changes nothing.
     target: int
+    # How the target is known. "known": the action was tried. "implied": the axioms imply it, for a
+    # turn at a place with a frame. "expected": a turn by the angle that the star shows, or a travel
+    # back the way that the robot came. "unknown": anything else.
     how: How
 
     @property
