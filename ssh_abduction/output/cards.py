@@ -29,11 +29,9 @@ def map_card(ssh_map: SSHMap) -> str:
     """Make a card of a map as HTML: picture, faults, fit of displacements, and table of dstates."""
     from ssh_abduction.output.picture import to_svg  # loads scipy
 
-    parts = [
-        picture(to_svg(ssh_map))
-        if len(ssh_map.dstates) <= DRAWN
-        else paragraph(f"not drawn, as it has more than {DRAWN} dstates")
-    ]
+    parts = [paragraph(f"not drawn, as it has more than {DRAWN} dstates")]
+    if len(ssh_map.dstates) <= DRAWN:
+        parts = [picture(to_svg(ssh_map))]
     if ssh_map.faults:
         parts.append(paragraph("; ".join(map(str, ssh_map.faults))))
     if fit := ssh_map.fit:

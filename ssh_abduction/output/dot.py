@@ -36,10 +36,8 @@ def _clusters(ssh_map: SSHMap, places: set[int], after: int, indent: str = "  ")
     lines, left = [], set(places)
     for region in (ssh_map.regions or ())[after:]:
         if region.door is not None and left >= {*region.places}:
-            label = _quoted(
-                f"{ssh_map.called('region', region.id)}, behind "
-                f"{ssh_map.called('place', region.door)}"
-            )
+            door = ssh_map.called("place", region.door)
+            label = _quoted(f"{ssh_map.called('region', region.id)}, behind {door}")
             lines.append(f"{indent}subgraph cluster_region_{region.id} {{ label={label};")
             lines += _clusters(ssh_map, {*region.places}, region.id + 1, f"{indent}  ")
             lines.append(f"{indent}}}")

@@ -71,9 +71,8 @@ def to_networkx(
         graph = _topological(ssh_map)
         place_of = {("place", p): p for p in ssh_map.places}
     if ssh_map.regions is not None:
-        names = {region.id: ssh_map.name_of("region", region.id) for region in ssh_map.regions}
         graph.graph["regions"] = [
-            region.to_dict() | ({"name": name} if (name := names[region.id]) else {})
+            region.to_dict() | only_known(name=ssh_map.name_of("region", region.id))
             for region in ssh_map.regions
         ]
         for node, place in place_of.items():
@@ -91,12 +90,8 @@ def to_graphml(ssh_map: SSHMap) -> str:
     causal = in_text(to_networkx(ssh_map))
     graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph(**causal.graph)
     for s, data in causal.nodes(data=True):
-        texts = {
-            name: xml_text(str(data[name]))
-            for name in ("view", "place_name", "path_name")
-            if name in data
-        }
-        graph.add_node(s, **{**data, **texts})
+        said = {"view", "place_name", "path_name"} & data.keys()
+        graph.add_node(s, **{**data, **{name: xml_text(str(data[name])) for name in said}})
     for source, target, action in causal.edges(data="action"):
         name = key = xml_text(action)
         if graph.has_edge(source, target, name):  # XML lacks the characters in which names differ
@@ -138,7 +133,6 @@ def _topological(ssh_map: SSHMap) -> nx.Graph[Any]:
         graph.add_node(("place", place), bipartite=0, **_named(ssh_map, "place", place))
     for path in ssh_map.paths:
         graph.add_node(("path", path.id), bipartite=1, **_named(ssh_map, "path", path.id))
-    for path in ssh_map.paths:
         for index, place in enumerate(path.order):
             graph.add_edge(("place", place), ("path", path.id), index=index)
     return graph
@@ -158,15 +152,10 @@ def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
     for path in ssh_map.paths:
         streets = travelled(ssh_map, path)
         for index, (p, q) in enumerate(pairwise(path.order)):
-            facts: dict[str, Any] = {
-                **_named(ssh_map, "path", path.id),
-                "path": path.id,
-                "order": index,
-                "travelled": (min(p, q), max(p, q)) in streets,
-            }
-            if found.metric:
-                facts["metres"] = math.dist(found.places[p], found.places[q])
-            graph.add_edge(p, q, key=path.id, **facts)
+            metres = math.dist(found.places[p], found.places[q]) if found.metric else None
+            more = only_known(metres=metres) | _named(ssh_map, "path", path.id)
+            went = (min(p, q), max(p, q)) in streets
+            graph.add_edge(p, q, key=path.id, path=path.id, order=index, travelled=went, **more)
     return graph
 
 

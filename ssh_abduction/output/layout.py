@@ -57,12 +57,9 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
     poses = drawable_poses(ssh_map)
     if poses is None:
         return _floor_by_floor(ssh_map, _Drawing(ssh_map, degrees).layout())
+    at = [(pose.x, pose.y, pose.heading) for pose in poses]
     first = {s.place: s.id for s in reversed(ssh_map.dstates)}  # the first dstate of each place
-    return Layout(
-        {p: (poses[first[p]].x, poses[first[p]].y) for p in ssh_map.places},
-        tuple((pose.x, pose.y, pose.heading) for pose in poses),
-        True,
-    )
+    return Layout({p: at[first[p]][:2] for p in ssh_map.places}, tuple(at), True)
 
 
 def drawable_poses(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
@@ -74,9 +71,8 @@ def drawable_poses(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
     displacements between its parts are missing.
     """
     poses = ssh_map.fit.poses if ssh_map.fit else ()
-    if not poses or any(
-        abs(number) > FARTHEST for pose in poses for number in (pose.x, pose.y, *pose.spread)
-    ):
+    numbers = (number for pose in poses for number in (pose.x, pose.y, *pose.spread))
+    if not poses or any(abs(number) > FARTHEST for number in numbers):
         return None
     if set(ssh_map.places) - {s.place for s in ssh_map.dstates}:
         return None
@@ -118,9 +114,8 @@ def fitted_motion(source: Sequence[complex], target: Sequence[complex]) -> tuple
     turned.
     """
     middle, goal = (sum(points) / max(1, len(points)) for points in (source, target))
-    turn = sum(
-        ((y - goal) * (x - middle).conjugate() for x, y in zip(source, target, strict=True)), 0j
-    )
+    pairs = zip(source, target, strict=True)
+    turn = sum(((y - goal) * (x - middle).conjugate() for x, y in pairs), 0j)
     turn = turn / abs(turn) if abs(turn) > SAME else 1 + 0j
     return turn, goal - turn * middle
 
@@ -311,15 +306,8 @@ class _Drawing:
             pairs = list(pairwise(path.order))
             if not whole:
                 index = {place: i for i, place in enumerate(path.order)}
-                ends = [
-                    (p, q)
-                    for known, p, q in self.travels
-                    if known == path.id and p in index and q in index
-                ]
-                pairs = [
-                    *sorted((p, q) if index[p] < index[q] else (q, p) for p, q in ends),
-                    *pairs,
-                ]
+                ends = [(p, q) for h, p, q in self.travels if h == path.id and {p, q} <= {*index}]
+                pairs[:0] = sorted((p, q) if index[p] < index[q] else (q, p) for p, q in ends)
             for p, q in pairs:
                 is_travelled = whole or (path.id, *sorted((p, q))) in self.travels
                 way = facing.get((path.id, p), facing.get((path.id, q), 0.0))

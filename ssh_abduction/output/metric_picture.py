@@ -159,9 +159,8 @@ class _Picture:
         head = f"M{END * u:.1f},0 l{-9 * u:.1f},{-5 * u:.1f} v{10 * u:.1f} Z"
         style = {"fill": colour, "stroke": colour, "stroke_width": f"{2.2 * u:.1f}"}
         turned = placed(self.on_page(pose), -degrees)
-        mark = element(
-            "path", d=f"{shaft} {head}", **style, stroke_linejoin="round", transform=turned
-        )
+        style |= {"stroke_linejoin": "round", "transform": turned}
+        mark = element("path", d=f"{shaft} {head}", **style)
         where = f"at {pose.x:.1f}, {pose.y:.1f} m, heading {degrees:.0f}°"
         return titled(f"dstate {s.id}: {s.shown}, {where}", mark)
 
@@ -269,8 +268,7 @@ class _Picture:
                 (x + (far + wide) * math.cos(angle), y + far * math.sin(angle))
                 for far, angle in ways
             ]
-            style = ("#000", 15, "bold")
-            marks += self.label(label, around, *style, always=name is not None)
+            marks += self.label(label, around, "#000", 15, "bold", always=name is not None)
         return marks
 
     def dstate_labels(self) -> list[str]:

@@ -77,9 +77,8 @@ def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]
         marks += _path_name(ssh_map, path, spots)
     for place, (x, y) in spots.items():
         number = svg_text(x, y, str(place), "#222", size=15, weight="bold")
-        marks.append(
-            titled(place_title(ssh_map, place), circle(x, y, RADIUS, "white", "#222"), number)
-        )
+        dot = circle(x, y, RADIUS, "white", "#222")
+        marks.append(titled(place_title(ssh_map, place), dot, number))
         if (name := ssh_map.name_of("place", place)) is not None:
             marks.append(svg_text(x, y + NAME, name, "#222", size=12, weight="bold"))
         marks += _dstates(ssh_map, place, (x, y), found)
@@ -148,11 +147,11 @@ def _dstates(ssh_map: SSHMap, place: int, spot: Point, found: Layout) -> list[st
 
 def _freest(taken: list[float]) -> float:
     """Choose the one of 16 bearings that is farthest from those taken, in radians."""
-    bearings = [k * math.pi / 8 for k in range(16)]
-    return max(
-        bearings,
-        key=lambda b: min((abs(math.remainder(b - t, math.tau)) for t in taken), default=0.0),
-    )
+
+    def room(bearing: float) -> float:
+        return min((abs(math.remainder(bearing - t, math.tau)) for t in taken), default=0.0)
+
+    return max((k * math.pi / 8 for k in range(16)), key=room)
 
 
 def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:

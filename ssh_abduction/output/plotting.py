@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from typing import Any
 
 from ssh_abduction.data.checks import needed
@@ -105,10 +106,8 @@ def _draw_dstate(
 
 def _nearest(spots: list[tuple[float, float]]) -> float:
     """Compute the distance of the two nearest different spots; 1 if there are no two."""
-    return min(
-        (far for i, p in enumerate(spots) for q in spots[:i] if (far := math.dist(p, q)) > 1e-6),
-        default=1.0,
-    )
+    far = (math.dist(p, q) for p, q in combinations(spots, 2))
+    return min((metres for metres in far if metres > 1e-6), default=1.0)
 
 
 def _new_axes(spots: list[tuple[float, float]], unit: float) -> Any:

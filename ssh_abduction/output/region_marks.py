@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import Region, course_named, ids_at, list_in_words
+from ssh_abduction.data.regions import Region, course_named, list_in_words
 from ssh_abduction.output.drawing import Point, element, line, svg_text, titled
 
 # The colour and the opacity of bands. Each band around another one is wider by WIDER times the
@@ -77,10 +77,9 @@ def place_title(ssh_map: SSHMap, place: int) -> str:
     regions = [r for r in ssh_map.regions or () if place in r.places]
     bounds = sorted({course for region in regions for course in region.bounds})
     beside = f", right of {list_in_words(map(course_named, bounds))}" if bounds else ""
-    around = [ssh_map.numbered("region", region) for region in ids_at(ssh_map.regions, place)]
-    within = (
-        f", in region{'' if len(around) == 1 else 's'} {list_in_words(around)}" if around else ""
-    )
+    around = [ssh_map.numbered("region", region.id) for region in regions]
+    plural = "" if len(around) == 1 else "s"
+    within = f", in region{plural} {list_in_words(around)}" if around else ""
     return f"{ssh_map.called('place', place)}{beside}{within}"
 
 

@@ -86,9 +86,8 @@ class StreetProgram:
     def bent(self) -> int:
         """The number of travelled streets that deviate from their headings or are too short."""
         way = self.at[self.ends[:, 1]] - self.at[self.ends[:, 0]]
-        astray = np.maximum(
-            np.abs(np.sum(way * self.across, axis=1)), 1 - np.sum(way * self.along, axis=1)
-        )
+        aside, ahead = np.sum(way * self.across, axis=1), np.sum(way * self.along, axis=1)
+        astray = np.maximum(np.abs(aside), 1 - ahead)
         return int(np.sum((astray > CROOKED) & (self.share == 1.0)))
 
     def put_apart(self) -> dict[int, Point]:

@@ -10,8 +10,7 @@ from ssh_abduction.data.maps import SSHMap
 
 def place_of_steps(ssh_map: SSHMap) -> list[int | None]:
     """Return the place of each step of a map."""
-    place = {state.id: state.place for state in ssh_map.dstates}
-    return [place[label] for label in ssh_map.dstate_at]
+    return [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
 
 
 def undecided_places(ssh_map: SSHMap) -> frozenset[int]:

@@ -19,12 +19,12 @@ from typing import Any
 
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.output.layout import Layout, drawable_poses, layout
 from ssh_abduction.output.metric_picture import axes
 from ssh_abduction.page.overview import Spot, overview
 from ssh_abduction.page.replays import Run, replays
-from ssh_abduction.rivals.comparison import compare
+from ssh_abduction.rivals.comparison import Choice, compare
 from ssh_abduction.rivals.drive_joins import DrivePair, joins_of_drives
 from ssh_abduction.rivals.listing import Listing, Maps
 from ssh_abduction.solver import probability_in_words
@@ -80,7 +80,7 @@ def content_of(
         "minimal": found.minimal,
         "complete": found.complete,
         "shared": _shared(listing),
-        "choices": [_choice(choice.to_dict()) for choice in found.choices],
+        "choices": [_choice(choice) for choice in found.choices],
         "replays": replays(maps, [one["labeling"] for one in entries], trace, run),
         "maps": entries,
         "labelings": [{"labels": labels, "views": views} for labels, views in shared.labelings],
@@ -181,21 +181,18 @@ def _drives(listing: Listing) -> dict[str, Any]:
 
 def _shared_by(pair: DrivePair) -> str:
     """Say how many places two drives share."""
-    if not pair.forced and not pair.possible:
-        return f"no {pair.of} in common in any map"
-    parts = [f"{counted(len(pair.forced), f'{pair.of}s')} in common in all maps"]
-    parts += [pair.not_forced]
-    return "; ".join(parts[not pair.forced : 1 + bool(pair.possible)])
+    parts = []
+    if pair.forced:
+        parts.append(f"{counted(len(pair.forced), f'{pair.of}s')} in common in all maps")
+    if pair.possible:
+        parts.append(pair.not_forced)
+    return "; ".join(parts) or f"no {pair.of} in common in any map"
 
 
-def _choice(data: dict[str, Any]) -> dict[str, Any]:
-    """Reduce the dict of a choice to the sentences of its questions and to its options."""
-    return {
-        "questions": [question["sentence"] for question in data["questions"]],
-        "options": [
-            {"answers": option["answers"], "maps": option["maps"]} for option in data["options"]
-        ],
-    }
+def _choice(choice: Choice) -> dict[str, Any]:
+    """Make a dict of the sentences of a choice's questions, and of its options."""
+    options = [attributes_of(option, "answers", "maps") for option in choice.options]
+    return {"questions": [str(question) for question in choice.questions], "options": options}
 
 
 def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
@@ -207,11 +204,8 @@ def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
     first = items[0]
     entries: list[Any] = [first]
     for item in items[1:]:
-        differing = {
-            str(i): value
-            for i, (value, other) in enumerate(zip(item, first, strict=False))
-            if value != other
-        }
+        pairs = enumerate(zip(item, first, strict=False))
+        differing = {str(i): value for i, (value, other) in pairs if value != other}
         is_shorter = len(item) == len(first) and 2 * len(differing) < len(item)
         entries.append(differing if is_shorter else item)
     return entries

@@ -118,9 +118,8 @@ def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:
     """Make the text of the HTML file. If `served`, a server answers the questions of the page."""
     style = _file("page.css")
     script = "\n".join(_file(f"script/{name}.js") for name in SCRIPTS)
-    text = json.dumps(
-        {**content, "served": served}, ensure_ascii=False, separators=(",", ":"), allow_nan=False
-    )
+    shape: dict[str, Any] = {"ensure_ascii": False, "separators": (",", ":"), "allow_nan": False}
+    text = json.dumps({**content, "served": served}, **shape)
     for character, escape in ESCAPED.items():
         text = text.replace(character, escape)
     asked = "self" if served else "none"

@@ -80,18 +80,10 @@ def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
     nodes = counts.places or counts.dstates
     number = {steps: i for i, steps in enumerate(nodes)}
     return {
-        "nodes": [
-            {"steps": steps, "maps": count, **_middle(steps, spots)}
-            for steps, count in nodes.items()
-        ],
+        "nodes": [{"steps": s, "maps": n, **_middle(s, spots)} for s, n in nodes.items()],
         "dstates": [
-            {
-                "steps": steps,
-                "maps": count,
-                "path": agreed.get(steps, count),
-                **_middle(steps, spots),
-            }
-            for steps, count in counts.dstates.items()
+            {"steps": s, "maps": count, "path": agreed.get(s, count), **_middle(s, spots)}
+            for s, count in counts.dstates.items()
             if counts.places
         ],
         "streets": [

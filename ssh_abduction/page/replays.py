@@ -118,10 +118,8 @@ def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
     for fault in first.faults:
         if fault.kind == "misread" and fault.seen is not None:
             views[fault.step] = fault.seen
-    return [
-        {"view": str(view), "action": action}
-        for view, action in zip(views, [*names, None], strict=True)
-    ]
+    told = zip(views, [*names, None], strict=True)
+    return [{"view": str(view), "action": action} for view, action in told]
 
 
 def _beliefs(maps: Sequence[SSHMap], labelings: Sequence[int], run: Run) -> dict[str, Any]:
@@ -164,11 +162,8 @@ def _belief(belief: dict[str, Any], count: int) -> list[Any]:
             f"beliefs: expected verdict, nowhere and probabilities of dstates 0 to {count - 1}, as "
             f"localise --json prints them, got something else; run localise with these maps"
         ) from None
-    return [
-        verdict,
-        round(nowhere, 3),
-        [[s, round(p, 3)] for s, p in likely[:BELIEVED] if p >= LEAST],
-    ]
+    shown = [[s, round(p, 3)] for s, p in likely[:BELIEVED] if p >= LEAST]
+    return [verdict, round(nowhere, 3), shown]
 
 
 def beams_of(trace: Trace, count: int) -> tuple[float, float]:
@@ -184,13 +179,10 @@ def beams_of(trace: Trace, count: int) -> tuple[float, float]:
     if beams is None:
         usual = HALF / (count - 1) if count % 2 and count > 1 else HALF / count
         return -usual * (count - 1) / 2, usual
-    first = beams.get("first") if isinstance(beams, dict) else None
-    step = beams.get("step") if isinstance(beams, dict) else None
-    if (
-        not is_finite(first)
-        or not is_finite(step)
-        or step == 0
-        or abs(step) * (count - 1) > 360 + 1e-6
+    given = beams if isinstance(beams, dict) else {}
+    first, step = given.get("first"), given.get("step")
+    if not (is_finite(first) and is_finite(step) and step != 0) or (
+        abs(step) * (count - 1) > 360 + 1e-6
     ):
         raise TraceError(
             f'{named(trace.source or "trace")}: beams: expected {{"first": degrees, "step": '
@@ -251,11 +243,8 @@ def _panoramas(
     held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
 ) -> dict[str, Any] | None:
     """Encode panoramas at a lower resolution. None for a wrong shape, or for too many images."""
-    if (
-        not isinstance(shape, list)
-        or len(shape) != 3
-        or any(not isinstance(n, int) or n < 1 for n in shape)
-    ):
+    is_shape = isinstance(shape, list) and all(isinstance(n, int) and n > 0 for n in shape)
+    if not is_shape or len(shape) != 3:
         return None
     if any(image is not None and len(image) != math.prod(shape) for image in held):
         return None

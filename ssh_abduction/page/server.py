@@ -80,7 +80,7 @@ class PageServer(ThreadingHTTPServer):
         self._trace, self._theory, self._maps, self._limit = trace, theory, max_maps, time_limit
         self._listing = listing
         self._run, self._called = run, called or Called(listing.source)
-        self._page = html_of(content_of(listing, trace, run, self._called), served=True).encode()
+        self.page = html_of(content_of(listing, trace, run, self._called), served=True).encode()
         self._token = secrets.token_urlsafe(24)
         self._one_at_a_time = threading.Lock()
         super().__init__(("127.0.0.1", port), _Handler)
@@ -100,10 +100,6 @@ class PageServer(ThreadingHTTPServer):
         token, _, rest = path.partition("?")[0].lstrip("/").partition("/")
         return rest if hmac.compare_digest(token.encode(), self._token.encode()) else None
 
-    def page(self) -> bytes:
-        """Return the page as the bytes of an HTML file."""
-        return self._page
-
     def answer(self, question: str, data: Mapping[str, Any], watch: Watch) -> dict[str, Any]:
         """Answer "explain", why two steps are one dstate or not, or "solve", to find maps.
 
@@ -122,16 +118,12 @@ class PageServer(ThreadingHTTPServer):
                 why = in_process(answers.pair_explained, *asked, watch=watch)
                 text = "\n".join([*self._in_map(pair, theory), str(why)])
                 return {"text": text, "assuming": why.assuming}
-            limits = self._maps, self._limit
-            found = in_process(
-                answers.solved_with, self._trace, theory, known, *limits, watch=watch
-            )
+            search = self._trace, theory, known, self._maps, self._limit
+            found = in_process(answers.solved_with, *search, watch=watch)
         if not found.maps:
             return {"text": found.headline}
-        return {
-            "text": found.headline,
-            "content": content_of(found, self._trace, self._run, self._called),
-        }
+        content = content_of(found, self._trace, self._run, self._called)
+        return {"text": found.headline, "content": content}
 
     def _in_map(self, pair: tuple[int, int], theory: Theory) -> Iterator[str]:
         """Yield what the maps of the page say about two steps, unless the user assumes more."""
@@ -197,7 +189,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Send the page."""
         if self._asked() == "":
-            self._send(HTTPStatus.OK, self.server.page(), "text/html; charset=utf-8")
+            self._send(HTTPStatus.OK, self.server.page, "text/html; charset=utf-8")
         else:
             self._refuse()
 

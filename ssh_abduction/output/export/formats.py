@@ -79,11 +79,9 @@ def export_map(
             f"hide_undecided: expected nav2 or tmap2 with places, got {to} with {nodes}; "
             "export places for navigation, or show all"
         )
+    if to == "svg" and level is not None:
+        raise MapError("level: expected none for svg, which shows places and dstates; leave it out")
     if to == "svg":
-        if level is not None:
-            raise MapError(
-                "level: expected none for svg, which shows places and dstates; leave it out"
-            )
         return to_svg(ssh_map, turns)
     level = one_of("level", nodes, LEVELS, MapError, mend="say what nodes are")
     for field, text in (("name", name), ("frame", frame)):
@@ -155,11 +153,8 @@ def export_doubts(
             "says how they lie relative to each other; log a drive that joins them"
         )
     if together := roads.together:
-        mend = (
-            "export places (export --set level=places)"
-            if ssh_map.places
-            else "solve with places (solve --theory topological)"
-        )
+        mend = "solve with places (solve --theory topological)"
+        mend = "export places (export --set level=places)" if ssh_map.places else mend
         found.append(
             f"{together} of {len(roads.stops)} {level} share their position with others: "
             f"programs that look nodes up by position may take a wrong one; {mend}"
