@@ -202,6 +202,11 @@ def test_visit_gets_a_nearer_middle_of_other_visits(
     every, closed = with_partings(track, visits, closings)
     assert tuple(every[-1].middle) == pytest.approx((9.0 if moves else 10.2, 0.0))
     assert closed[1].match.shift == pytest.approx((0.0 if moves else 1.2, 0.0))
+    # Between cuts less than PACE metres apart, nothing shows which middle is nearer.
+    scan = visits[-1].scan - 1  # no point lies between this scan and the next one
+    visits[-1] = replace(visits[-1], scan=scan)
+    every, _ = with_partings(replace(track, cuts=(scan, scan + 1)), visits, closings)
+    assert tuple(every[-1].middle) == pytest.approx((10.2, 0.0))
 
 
 def test_stretches_are_compared_after_a_closure_or_short_way() -> None:

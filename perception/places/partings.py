@@ -262,7 +262,7 @@ def _nearer(drive: _DrivePoints, relations: Sequence[_Alignment]) -> Array:
         ours = drive.points[part.start : part.stop] - drive.middles[k]
         others = [off for n, _, off in links[k] if n in shared]
         inside = [off for off in others if math.hypot(*off) <= drive.visits[k].radius]
-        far = [np.hypot(*(ours - off).T).min() for off in (np.zeros(2), *inside)]
+        far = [np.hypot(*(ours - off).T).min(initial=np.inf) for off in (np.zeros(2), *inside)]
         if min(far) < far[0] - CLEARLY:
             moves[k] = inside[int(np.argmin(far)) - 1]
     return moves
