@@ -28,6 +28,9 @@ from ssh_abduction.theory.speedups import TABLE
 CORRIDOR = ["end", "hall", "end", "end", "hall", "end", "end"]
 HEAD = '{"format": "ssh-trace", "version": 1}\n'
 DRIVEN = ["travel", "travel", "around", "travel", "travel", "around"]
+TOUR = drive(*TOURS["comb"])
+# With stars, the axioms force steps 0 and 2, and 1 and 3, to be one dstate.
+TURNED = Trace.from_steps("abab", ["around"] * 3, stars=[(1, 0, 0, 0), (0, 0, 1, 0)] * 2)
 
 
 def hidden(trace: Trace, steps: set[int]) -> Trace:
@@ -151,11 +154,17 @@ def test_solve_names_corrections_that_steps_without_views_contradict(
 
 
 @pytest.mark.parametrize(
-    "theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()]
+    ("theory", "driven"),
+    [
+        (Theory.causal(), TOUR),
+        (Theory.topological(), TOUR),
+        (Theory.circumscriptive(), TOUR),
+        (Theory.topological(), TURNED),
+        (Theory(star="gateways"), TURNED),
+    ],
 )
-def test_unknown_views_at_the_time_limit_give_a_map(theory: Theory) -> None:
-    trace = drive(*TOURS["comb"])
-    trace = hidden(trace, set(range(1, len(trace), 3)))
+def test_unknown_views_at_the_time_limit_give_a_map(theory: Theory, driven: Trace) -> None:
+    trace = hidden(driven, set(range(1, len(driven), 3)))
     found = solve(trace, theory, time_limit=1e-9)
     assert found.maps
     assert check(trace, found.maps[0], theory) == ()

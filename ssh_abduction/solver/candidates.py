@@ -327,24 +327,30 @@ class Candidates:
 def has_quick_map(trace: Trace, theory: Theory) -> bool:
     """Whether the checker accepts one of the surest maps that are made without a search."""
     maps = [separate_map(trace, theory)] if has_no_frames(theory) else []
-    sketches = [] if theory.unknown_views else sketches_of(trace.steps[0], theory)[-2:]
+    sketches = sketches_of(trace.steps[0], theory)[-2:]
     maps += [sketch.map() for sketch in sketches if first_contradiction(sketch, trace) is None]
     return any(m is not None and next(violations(trace, m, theory), None) is None for m in maps)
 
 
 def _with_all_views(task: Task) -> Task:
-    """Return the same task, with one new view for all steps of unknown view.
+    """Return the same task, in which each step has a view.
 
-    Each map of the changed trace is also a map of the trace itself. The new view only prevents
-    steps of unknown view from sharing a dstate with other steps.
+    A step of unknown view gets the view of a step that must be at the same dstate, by a sketch. If
+    there is none, it gets one new view. Each map of the changed trace is also a map of the trace
+    itself. The new view only prevents steps of unknown view from sharing a dstate with other steps.
     """
     if not task.theory.unknown_views:
         return task
-    known, new = set(task.trace.views), "?"
+    views = task.trace.views
+    surest = sketches_of(task.trace.steps[0], task.theory)[-1]
+    if first_contradiction(surest, task.trace) is None:
+        ssh_map = surest.map()
+        views = tuple(ssh_map.dstates[label].view for label in ssh_map.dstate_at)
+    known, new = set(views), "?"
     while new in known:
         new += "?"
     trace = task.trace.with_views(
-        [new if view is None else view for view in task.trace.views],
+        [new if view is None else view for view in views],
         [s.confidence for s in task.trace.steps],
     )
     theory = replace(task.theory, unknown_views=False)

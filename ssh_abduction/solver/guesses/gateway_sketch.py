@@ -36,7 +36,6 @@ from ssh_abduction.data.rotations import leads
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.solver.guesses.sketch import Contradiction, KnownDState, Sketch
-from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
 
 # A dstate, and a star that is seen there.
@@ -185,8 +184,7 @@ class GatewaySketch(Sketch):
 
     def _first_of(self, known: Iterable[int], step: Step) -> int | None:
         """Return the first known dstate that fits a step; None if none does."""
-        seen = observation(step, self._theory)
-        return next((x for x in known if self._states[x].seen == seen and self._may_show(x)), None)
+        return next((x for x in known if self._may_be_at(x, step) and self._may_show(x)), None)
 
     def _course_through(self, here: int) -> tuple[int, int] | None:
         s = self._states[here]

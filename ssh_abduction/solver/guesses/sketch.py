@@ -57,15 +57,16 @@ class KnownDState:
     """A dstate of a sketch (a map made without a search), as far as it is known.
 
     Attributes:
-        seen: The observation: the view, and the star if the theory uses stars.
+        seen: The observation: the view, and the star if the theory uses stars. The view is None
+            until a step at this dstate has a known view.
         heading: The heading in the frame of the place, in quarters clockwise.
         path: The number of the path; None if it is unknown.
         direction: The direction along the path, 1 or -1.
         reverse: The dstates that a turn around links with this one.
     """
 
-    view: View
-    seen: object
+    view: View | None
+    seen: tuple[object, object]
     place: int
     heading: int
     path: int | None = None
@@ -223,8 +224,7 @@ class Sketch:
             return None
         if s.path is not None:
             return self._along.get((s.place, s.path, -s.direction))
-        seen = observation(step, self._theory)
-        return next((x for x in s.reverse if self._states[x].seen == seen), None)
+        return next((x for x in s.reverse if self._may_be_at(x, step)), None)
 
     def _turned_around(self, here: int, there: int) -> None:
         """Link two dstates by a turn around. They get opposite directions of one path."""
@@ -265,7 +265,7 @@ class Sketch:
             if self._star(step, heading) != self._stars[place]:
                 return None
             there = self._new(step, place, heading)
-        elif self._states[there].seen != observation(step, self._theory):
+        elif not self._may_be_at(there, step):
             return None
         else:
             self._doubt_if_grown_from_map()
@@ -328,7 +328,6 @@ class Sketch:
 
     def _new(self, step: Step, place: int, heading: int) -> int:
         """Add a dstate for a step at a place, and return the dstate."""
-        assert step.view is not None
         if self._star(step, heading) != self._stars[place]:
             raise Contradiction
         self._states.append(KnownDState(step.view, observation(step, self._theory), place, heading))
@@ -348,8 +347,16 @@ class Sketch:
 
     def _must_show(self, there: int, step: Step) -> None:
         """Raise `Contradiction` if a step differs from the observation of its dstate."""
-        if self._states[there].seen != observation(step, self._theory):
+        if not self._may_be_at(there, step):
             raise Contradiction
+        s = self._states[there]
+        if s.view is None:
+            s.view, s.seen = step.view, observation(step, self._theory)
+
+    def _may_be_at(self, there: int, step: Step) -> bool:
+        """Whether a step fits the observation of a dstate. An unknown view fits every view."""
+        (known, star), (view, seen) = self._states[there].seen, observation(step, self._theory)
+        return star == seen and (known == view or known is None or view is None)
 
     def _made(self, labels: tuple[int, ...]) -> SSHMap:
         """Build the map of all steps, with the dstate of each step as `labels`."""
