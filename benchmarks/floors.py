@@ -142,11 +142,11 @@ def main() -> None:
         if options.folder:
             star = "alike" if known.trace.has_stars else "none"
             theory = Theory.causal().replace(star=star, weigh="cost")
-        ssh_map = (
-            solve(known.trace, theory, time_limit=options.limit).maps[0]
-            if options.beam is None
-            else with_floors(cheapest(known.trace, theory, options.beam), known.trace)
-        )
+        if options.beam is None:
+            ssh_map = solve(known.trace, theory, time_limit=options.limit).maps[0]
+        else:
+            found = cheapest(known.trace, theory, {1, options.beam}, joins=False)
+            ssh_map = with_floors(found, known.trace)
         right, there = right_floors(ssh_map, known)
         print(
             f"| {known.name} | {len(known.trace)} | {len(set(known.dstates))} | "

@@ -200,6 +200,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
                 continue
             if "other_floor" in on and not _lifts_lead_away(trace, labels, where):
                 continue
+            if "one_landing" in on and not _lifts_land_once(trace, where):
+                continue
             headings = (
                 list(_headings(labels, places, trace.actions, stars, on))
                 if theory.star == "frame"
@@ -254,6 +256,13 @@ def _lifts_lead_away(trace: Trace, labels: Labels, where: Sequence[int]) -> bool
     floor = _floors(trace, labels, where)
     lifts = [t for t, action in enumerate(trace.actions) if action.kind in ("lift", "stairs")]
     return all(floor[t] != floor[t + 1] for t in lifts)
+
+
+def _lifts_land_once(trace: Trace, where: Sequence[int]) -> bool:
+    """Whether each lift leads from one place to one place."""
+    lifts = [t for t, action in enumerate(trace.actions) if action.kind in ("lift", "stairs")]
+    landings = {(where[t], trace.actions[t].name, where[t + 1]) for t in lifts}
+    return len({(place, name) for place, name, _ in landings}) == len(landings)
 
 
 def _paths_stay(trace: Trace, labels: Labels, places: tuple[int, ...], courses: Courses) -> bool:

@@ -95,6 +95,7 @@ CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
         ((1, 0, 0), 1),
     ),
     "other_floor": (PLAIN, "a U a", "", ((2, 2, 0), 1), ((1, 1, 0), 1)),
+    "one_landing": (PLAIN, "a U b T f S a R c U f", "", ((5, 3, 1), 1), ((4, 3, 1), 1)),
     "path_in_one_piece": (PLAIN, "a T b U c T d", "", ((4, 4, 2), 1), ((4, 4, 1), 2)),
     "one_pose": (PLAIN, "a R a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "closure": (PLAIN, "a R a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),

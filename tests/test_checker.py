@@ -181,6 +181,9 @@ BROKEN = {
     "one_pose": case(TOPOLOGICAL, SPUN, "0 0", "0"),
     "closure": case(TOPOLOGICAL, SHIFTED, "0 0", "0"),
     "other_floor": case(TOPOLOGICAL, written("a U b"), "0 1", "0 0"),
+    "one_landing": case(
+        TOPOLOGICAL, written("a U b T f S a R c U f"), "0 1 2 0 3 2", "0 1:0+ 2:0+ 0", "12"
+    ),
     "path_in_one_piece": case(
         TOPOLOGICAL, written("a T b U c T d"), "0 1 2 3", "0:0+ 1:0+ 2:0+ 3:0+", "0123"
     ),

@@ -14,6 +14,7 @@ ACTIONS = {
     "L": "left",
     "A": "around",
     "U": {"name": "up", "kind": "lift"},
+    "S": {"name": "stairs", "kind": "stairs"},
 }
 # Options of `solve` by which short traces have maps without end.
 ENDLESS = ["--set=boundary=none", "--set=path_order=partial", "--set=prefer=", "-n", "0"]

@@ -50,6 +50,20 @@ def other_floor(m: Reading) -> Found:
             )
 
 
+def one_landing(m: Reading) -> Found:
+    """Check that a lift leads from one place to one place."""
+    landings: dict[tuple[int, str], MapLink] = {}
+    for t in m.moves:
+        if t.action.kind in _LIFTS and t.source.place is not None:
+            other = landings.setdefault((t.source.place, t.action.name), t)
+            if other.target.place != t.target.place:
+                yield (
+                    sorted({*other.steps, *t.steps}),
+                    f"{other} and {t} lead from one place to places {other.target.place} and "
+                    f"{t.target.place}.",
+                )
+
+
 def path_in_one_piece(m: Reading) -> Found:
     """Check that each path is on one floor, and in one piece of the map."""
     floor = m.once(floors_of)
@@ -269,5 +283,14 @@ def _may_show_the_same(one: Star, other: Star) -> bool:
 
 AXIOMS: dict[str, Check] = {
     check.__name__: check
-    for check in (one_star, asserted, closure, one_pose, other_floor, path_in_one_piece, planar)
+    for check in (
+        one_star,
+        asserted,
+        closure,
+        one_pose,
+        other_floor,
+        one_landing,
+        path_in_one_piece,
+        planar,
+    )
 }

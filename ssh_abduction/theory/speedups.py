@@ -204,7 +204,15 @@ LIFTS = "the field lifts"
 OF_TRACES = (DRIVES, LIFTS)
 # The axioms of evidence about steps only. Such evidence says which steps are different dstates or
 # at different places, and which labels contradict each other.
-PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "closure", "planar", "other_floor")
+PAIRS_OF_STEPS = (
+    "asserted",
+    "one_star",
+    "one_pose",
+    "closure",
+    "planar",
+    "other_floor",
+    "one_landing",
+)
 # Axioms about links, observations and pairs of steps only. If a map satisfies them, so does the map
 # of its first steps. Two drives may be cut apart, too, because no link joins them.
 SURVIVE_A_CUT = FRAMES | {

@@ -54,6 +54,7 @@ class Extending:
         self._has_places = theory.level == "topological"
         self._stays = self._has_places and "turn_stays" in theory.hard
         self._leaves = self._has_places and "travel_leaves" in theory.hard
+        self._lands = "one_landing" in theory.hard
         self.prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
         self.reckoning, self._frames = HypothesisPoses(trace), frames_of(trace)
         self.sights = Sights(trace, self.bare, log, misreads=theory.misread > 0)
@@ -106,11 +107,13 @@ class Extending:
         if known is not None:
             return self._along_link(moved, known, t)
         stays = self._stays and self._trace.actions[t - 1].kind == "turn" and not slips
+        landing = self._landing(moved, t)
         dstate, new_place = self.prices if joins else (0.0, 0.0)
         options = []
-        if not stays:
+        if not stays and landing is None:
             options.append(Extension(moved.nats + dstate + new_place, None, None, moved))
-        for place, square, near in self._near(moved, t, self._possible(moved, t, stays=stays)):
+        possible = [p for p in self._possible(moved, t, stays=stays) if landing in (None, p)]
+        for place, square, near in self._near(moved, t, possible):
             if stays or square / 2 <= DEAREST:
                 nats = moved.nats + (0.0 if stays else self.sights.changes(moved, place, t))
                 if self._has_places:
@@ -138,6 +141,20 @@ class Extending:
             for place in range(len(moved.sights))
             if (place != there or not leaves) and self.sights.changes(moved, place, t) < math.inf
         ]
+
+    def _landing(self, moved: Hypothesis, t: int) -> int | None:
+        """Return the place to which the lift to step t led before, from the same place."""
+        if not self._lands or not self._trace.actions[t - 1].changes_floor:
+            return None
+        there, lift = moved.places[moved.labels[-1]], self._log.actions[t - 1]
+        return next(
+            (
+                moved.places[target]
+                for (source, action), target in moved.links.items()
+                if action == lift and moved.places[source] == there
+            ),
+            None,
+        )
 
     def _at_known_dstates(
         self, moved: Hypothesis, nats: float, place: int, t: int

@@ -23,6 +23,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.alike import Alike
 from ssh_abduction.theory.evidence.asserted import Asserted
 from ssh_abduction.theory.evidence.displacement import Displacement
+from ssh_abduction.theory.evidence.landings import Landings
 from ssh_abduction.theory.evidence.lifts import Floors
 from ssh_abduction.theory.evidence.matched_maps import Closures
 from ssh_abduction.theory.evidence.planar import Planar
@@ -32,7 +33,15 @@ from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
-KINDS: tuple[type[Evidence], ...] = (Asserted, Alike, Displacement, Closures, Floors, Planar)
+KINDS: tuple[type[Evidence], ...] = (
+    Asserted,
+    Alike,
+    Displacement,
+    Closures,
+    Floors,
+    Landings,
+    Planar,
+)
 
 __all__ = [
     "KINDS",
@@ -44,6 +53,7 @@ __all__ = [
     "Equality",
     "Evidence",
     "Floors",
+    "Landings",
     "Pairs",
     "Planar",
     "evidence_of",
