@@ -200,11 +200,7 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 
 class _Output:
-    """Standard output, which also knows whether anything was printed.
-
-    Attributes:
-        is_used: Whether anything was printed.
-    """
+    """Standard output, which also knows whether anything was printed: `is_used`."""
 
     def __init__(self, stream: Any) -> None:
         self._stream, self.is_used = stream, False

@@ -28,6 +28,7 @@ from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.explain.no_map import steps_listed
 from ssh_abduction.solver import RESTS_ON, Ranking, Sharing, Solution, summary_of
 from ssh_abduction.theory.fields import AUTO
 from ssh_abduction.theory.settle import settle
@@ -77,8 +78,7 @@ class _Judgement:
         """Yield the lines to print."""
         for i, some in enumerate(self.violations, 1):
             for v in some[:SHOWN]:
-                numbers = ", ".join(map(str, v.steps))
-                steps = f"step{'' if len(v.steps) == 1 else 's'} {numbers}: " if v.steps else ""
+                steps = f"{steps_listed(v.steps)}: " if v.steps else ""
                 yield f"map {i}: {v.axiom}: {steps}{printable(v.message)}"
             if more := some[SHOWN:]:
                 yield f"map {i}: and {counted(len(more), 'more violations')}"

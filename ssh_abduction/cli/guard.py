@@ -215,16 +215,11 @@ class _Signals:
 
 
 class _Printer:
-    """Prints to standard output, and measures how long the reader of the output takes.
-
-    Attributes:
-        speaking: A lock for the thread that prints.
-        waited: The seconds that the reader of the output took. They do not count as search time.
-    """
+    """Prints to standard output, and measures how long the reader of the output takes."""
 
     def __init__(self) -> None:
-        self.speaking = threading.RLock()
-        self.waited = 0.0
+        self.speaking = threading.RLock()  # of the thread that prints
+        self.waited = 0.0  # seconds that the reader took, which do not count as search time
         self._begun: float | None = None  # when the current piece of text was begun
         self._patience = DEAF  # how many seconds it may take
 

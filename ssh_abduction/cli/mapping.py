@@ -167,12 +167,9 @@ class MapQuestion(FileQuestion):
             interrupt()
 
         def last_words(_: Stop) -> tuple[str, int, Callable[[], None]]:
-            is_begun = begun and begun[0].search is not None
-            answer = (
-                self._answer(number, paths, begun[0].known(), content)
-                if is_begun
-                else self._given_up(number, paths[0])
-            )
+            answer = self._given_up(number, paths[0])
+            if begun and begun[0].search is not None:
+                answer = self._answer(number, paths, begun[0].known(), content)
             return "", interrupted_code(), partial(keep or workers.reply, answer)
 
         guard = Guard(interrupt, last_words, given_up=given_up)

@@ -23,8 +23,9 @@ from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import MapError, named, printable, said_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.words import noun_of
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solver import Watch, check_limit
+from ssh_abduction.solver import Watch, check_limit, stretches
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 SHOWN_COLUMNS, SHOWN_LINES = 6, 40
 # Exit codes if a limit ended the search: with a plan that may not be the best, or without a plan.
 EXIT_CUT_SHORT, EXIT_NOTHING = 10, 30
-HOW = {"link": "known", "implied": "implied", "expected": "expected", "open": "open"}
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -161,10 +161,10 @@ def _expected(untried: Untried) -> Iterator[str]:
 
 def _says(says: Consequence) -> tuple[str, str, str]:
     where = "not known" if says.dstate is None else f"dstate {says.dstate}"
-    return where, "not known" if says.seen is None else str(says.seen), HOW[says.how]
+    how = "known" if says.how == "link" else says.how
+    return where, "not known" if says.seen is None else str(says.seen), how
 
 
 def _rivals_in_words(rivals: Sequence[int]) -> str:
-    from ssh_abduction.rivals.experiment import rivals_in_words  # loads numpy
-
-    return rivals_in_words(rivals)
+    """Put the numbers of rivals into words: "map 1", or "maps 1–3 and 7"."""
+    return f"{noun_of('map', rivals)} {stretches(rivals)}"

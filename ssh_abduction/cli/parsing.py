@@ -103,16 +103,12 @@ class _Set(argparse.Action):
 
 
 class Parser(argparse.ArgumentParser):
-    """An argparse parser with settings, groups of verbs, and hints for misspelt names.
-
-    Attributes:
-        settings: The settings of this verb, by name.
-        groups: The names of this program's verbs, by their heading in the help.
-    """
+    """An argparse parser with settings, groups of verbs, and hints for misspelt names."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.settings: dict[str, Setting] = {}
+        self.settings: dict[str, Setting] = {}  # of this verb, by name
+        # The names of this program's verbs, by their heading in the help.
         self.groups: dict[str, tuple[str, ...]] = {}
 
     def add(
@@ -160,11 +156,6 @@ class Parser(argparse.ArgumentParser):
             details["metavar"] = metavar
         self.settings[name] = Setting(name, said, **details)
         self.set_defaults(**{name: default})
-
-    @property
-    def takes_many(self) -> bool:
-        """Whether an argument takes many values. They are one after the other."""
-        return any(a.nargs in ("*", "+") and not a.option_strings for a in self._actions)
 
     def format_help(self) -> str:
         """Make the help text, with verbs in groups and with the settings."""
@@ -225,7 +216,9 @@ class Parser(argparse.ArgumentParser):
             verb = self.verbs[options.verb] if getattr(options, "verb", None) else self
             wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
             hint = meant(wrong.partition("=")[0], verb.names)
-            if not wrong.startswith("-") and verb.takes_many:
+            # The values of an argument that takes many are one after the other.
+            takes_many = any(a.nargs in ("*", "+") for a in verb._get_positional_actions())
+            if not wrong.startswith("-") and takes_many:
                 hint = "; write them before the options"
             verb.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return options

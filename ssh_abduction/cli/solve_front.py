@@ -36,7 +36,11 @@ def run(options: argparse.Namespace) -> int:
         options.front,
         options.time_limit,
     )
-    print(json_line(_as_data(front)) if options.json else _as_text(front, options.front))
+    if options.json:
+        points = [attributes_of(p, "faults", "dstates", "proven", "map") for p in front.points]
+        print(json_line(attributes_of(front, "knee", "prices") | {"front": points}))
+    else:
+        print(_as_text(front, options.front))
     return 10 if front.stopped else 0 if front.points else 20
 
 
@@ -52,9 +56,8 @@ def _as_text(front: Front, most: int) -> str:
     for point in front.points:
         faults = "; ".join(map(str, point.map.faults)) if point.map else "–"
         shown = str(point.dstates) if point.proven else f"at least {point.dstates}"
-        rows.append(
-            [point.faults, shown, "knee" if point.faults == front.knee else "", faults or "none"]
-        )
+        knee = "knee" if point.faults == front.knee else ""
+        rows.append([point.faults, shown, knee, faults or "none"])
     lines = [table(["faults", "dstates", "", "of the map found"], rows)]
     if front.prices:
         lines.append(
@@ -67,13 +70,6 @@ def _as_text(front: Front, most: int) -> str:
         why = "interrupted" if program.raised else "stopped by the time limit"
         lines.append(f"{why} at {front.points[-1].faults} faults")
     if first := front.points[0].faults:
-        lines.append(
-            f"no map with the asserted pairs of steps has fewer than {counted(first, 'faults')}"
-        )
+        fewest = counted(first, "faults")
+        lines.append(f"no map with the asserted pairs of steps has fewer than {fewest}")
     return "\n".join(lines)
-
-
-def _as_data(front: Front) -> dict[str, object]:
-    """Convert a front to a dict for JSON."""
-    points = [attributes_of(p, "faults", "dstates", "proven", "map") for p in front.points]
-    return attributes_of(front, "knee", "prices") | {"front": points}

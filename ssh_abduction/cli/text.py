@@ -17,6 +17,7 @@ from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted as counted  # noqa: PLC0414 - the verbs have it from here
+from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.output.cards import table_of_dstates
 from ssh_abduction.solver import Backbone, Cost, Solution, Status, stretches
@@ -264,7 +265,7 @@ def _choice_in_words(choice: Choice, number: Mapping[Question, int], maps: int) 
     for question in asked[:SHOWN_QUESTIONS]:
         options = (option for option in choice.options if option.answers[index[question]])
         yes = sorted(i for option in options for i in option.maps)
-        where = f"{'map' if len(yes) == 1 else 'maps'} {stretches(yes)} ({len(yes)} of {maps})"
+        where = f"{noun_of('map', yes)} {stretches(yes)} ({len(yes)} of {maps})"
         yield f"    question {number[question]}: {question}: in {where}"
     if len(asked) > SHOWN_QUESTIONS:
         yield f"    and {counted(len(asked) - SHOWN_QUESTIONS, 'more questions')}; --json has them"
@@ -292,4 +293,4 @@ def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
 
 def steps_in_words(steps: Sequence[int]) -> str:
     """Write step numbers in words, such as "step 40" or "steps 12–15 and 40"."""
-    return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"
+    return f"{noun_of('step', steps)} {stretches(steps)}"

@@ -274,12 +274,10 @@ def _joined_steps(names: Sequence[str], drives: Sequence[Sequence[Step]]) -> lis
         if steps:
             steps[-1] = replace(steps[-1], action=Action(name, "start"))
         begin = len(steps)
-        steps += [
-            replace(step, action=Action.that_slipped(begin + t))
-            if step.action is not None and step.action.slipped
-            else step
-            for t, step in enumerate(drive)
-        ]
+        for step in drive:
+            slipped = step.action is not None and step.action.slipped
+            other = Action.that_slipped(len(steps)) if slipped else step.action
+            steps.append(replace(step, action=other) if slipped else step)
         steps[begin] = replace(steps[begin], displacement=None, covariance=None)
     return steps
 

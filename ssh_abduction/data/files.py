@@ -45,12 +45,7 @@ _MENDS = {
 
 
 class NotFinite(ValueError):  # noqa: N818 - part of an error message, which the caller completes
-    """JSON contains NaN or Infinity.
-
-    Attributes:
-        field: The path of the field with this number, such as "a.b[2]".
-        text: The number as the JSON has it.
-    """
+    """JSON contains NaN or Infinity, as `text`, in the field with the path `field`: "a.b[2]"."""
 
     def __init__(self, field: str, text: str) -> None:
         super().__init__(f"{text} in {field}" if field else text)

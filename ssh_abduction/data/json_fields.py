@@ -16,10 +16,8 @@ class FieldReader:
     """Reads and checks fields of a JSON object from a file of maps.
 
     Most methods return the checked value or raise an error. Their argument `name` is the name of
-    the field in error messages. Readers of other files are subclasses.
-
-    Args:
-        where: The name of the file in error messages.
+    the field in error messages, and `where` the name of the file. Readers of other files are
+    subclasses.
     """
 
     error: ClassVar[type[AbductionError]] = MapError  # the class of the errors that are raised

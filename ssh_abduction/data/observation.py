@@ -11,11 +11,7 @@ View: TypeAlias = str | int
 
 
 def checked_view(value: Any, where: str) -> View:
-    """Return a view if it is a text or an integer of 32 bits, or raise TraceError.
-
-    Args:
-        value: What the caller gave. Whole numbers of numpy are accepted.
-    """
+    """Return a view if it is a text or an integer of 32 bits, perhaps of numpy. Else TraceError."""
     if is_whole(value):
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, str | int):

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 from ssh_abduction.data.map_parts import signed_path
+from ssh_abduction.data.words import noun_of
 
 # What makes places a region: ("beside", path, direction), ("between", place) or ("behind", place).
 Reason: TypeAlias = tuple[str, int] | tuple[str, int, int]
@@ -60,15 +61,14 @@ class Region:
 
 def described(region: Region, called: Callable[[str, int], str]) -> str:
     """Say what the region is. `called` puts a kind and a number into words, as `SSHMap.called`."""
-    places = f"place{'' if len(region.places) == 1 else 's'} {list_in_words(region.places)}"
+    places = f"{noun_of('place', region.places)} {list_in_words(region.places)}"
     parts = [f"{called('region', region.id)}: {places}"]
     if region.bounds:
         parts.append(f"right of {list_in_words(map(course_named, region.bounds))}")
     if region.door is not None:
         parts.append(f"behind {called('place', region.door)}")
     if region.inside:
-        plural = "" if len(region.inside) == 1 else "s"
-        parts.append(f"in region{plural} {list_in_words(region.inside)}")
+        parts.append(f"in {noun_of('region', region.inside)} {list_in_words(region.inside)}")
     return ", ".join(parts)
 
 
@@ -108,13 +108,9 @@ def _smallest_around(places: frozenset[int], before: Iterable[frozenset[int]]) -
 
 
 def right_of(regions: Iterable[Region], path: int, direction: int) -> tuple[int, ...]:
-    """Find the places that are known to lie right of a path in a direction.
+    """Return the ids of the places that are known to lie right of a path in a direction, +1 or -1.
 
-    Args:
-        direction: +1 or -1. The places left of the path in direction +1 are right of it in -1.
-
-    Returns:
-        The ids of the places, ascending.
+    The places left of the path in direction +1 are right of it in -1.
     """
     return tuple(sorted({q for r in regions if (path, direction) in r.bounds for q in r.places}))
 

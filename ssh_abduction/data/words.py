@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from dataclasses import MISSING, fields
 from importlib import import_module
 from typing import Any
@@ -18,6 +18,11 @@ from ssh_abduction.data.errors import brief
 def counted(number: float, things: str) -> str:
     """Return a number with its noun: "8 dstates", "1 dstate"."""
     return f"{number} {things.removesuffix('s') if number == 1 else things}"
+
+
+def noun_of(noun: str, things: Sized) -> str:
+    """Return a noun in the plural, unless there is one thing: "steps"."""
+    return noun if len(things) == 1 else f"{noun}s"
 
 
 def first_few(things: Sequence[object], most: int) -> str:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.checker.checker import Violation
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.words import PlainData, attributes_of
-from ssh_abduction.explain.no_map import ClashingAxiom, clashes_of
+from ssh_abduction.data.words import PlainData, attributes_of, noun_of
+from ssh_abduction.explain.no_map import ClashingAxiom, clashes_of, steps_listed
 
 # If an inference has more reasons than IN_A_LINE, each gets a line of its own.
 IN_A_LINE, INDENT = 2, " " * 7
@@ -97,8 +97,8 @@ class Derivation:
 def _lines_of(inference: Inference, number: int) -> Iterator[str]:
     """Yield the lines that print an inference: conclusions, premises, axioms and their steps."""
     lines = ", ".join(str(premise + 1) for premise in inference.premises)
-    by = f" (from {'line' if len(inference.premises) == 1 else 'lines'} {lines})" if lines else ""
-    names = "; ".join(f"{link.axiom}, {_steps(link.steps)}" for link in inference.links)
+    by = f" (from {noun_of('line', inference.premises)} {lines})" if lines else ""
+    names = "; ".join(f"{link.axiom}, {steps_listed(link.steps)}" for link in inference.links)
     says = f"{number:3}. {'; '.join(inference.says)}{by}:"
     named = [f"[{names}]"] if names else []
     if len(inference.because) > IN_A_LINE:
@@ -106,8 +106,3 @@ def _lines_of(inference: Inference, number: int) -> Iterator[str]:
         yield from (f"{INDENT}{line}" for line in (*inference.because, *named))
     else:
         yield " ".join([says, "; ".join(inference.because), *named])
-
-
-def _steps(steps: Sequence[int]) -> str:
-    """Name steps in words."""
-    return f"step{'' if len(steps) == 1 else 's'} {', '.join(map(str, steps))}"

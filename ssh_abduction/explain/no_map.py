@@ -14,14 +14,14 @@ stretch has a map.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import PlainData
+from ssh_abduction.data.words import PlainData, noun_of
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.solver import check_rules
@@ -40,6 +40,11 @@ class ClashingAxiom(PlainData):
     axiom: str  # the name of the axiom
     # The steps. If the axiom is about several steps at once, the last one is listed.
     steps: tuple[int, ...]
+
+
+def steps_listed(steps: Sequence[int]) -> str:
+    """List steps in words: "steps 3, 4"."""
+    return f"{noun_of('step', steps)} {', '.join(map(str, steps))}"
 
 
 def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[ClashingAxiom, ...]:
@@ -75,10 +80,7 @@ class Explanation(PlainData):
         return tuple(clash.axiom for clash in self.clashes)
 
     def __str__(self) -> str:
-        parts = [
-            f"{c.axiom} ({'step' if len(c.steps) == 1 else 'steps'} {', '.join(map(str, c.steps))})"
-            for c in self.clashes
-        ]
+        parts = [f"{clash.axiom} ({steps_listed(clash.steps)})" for clash in self.clashes]
         many = f"steps {self.first} to {self.last}"
         where = f"step {self.last}" if self.first == self.last else many
         clash = f"these clash: {', '.join(parts)}" if parts else "some clash"
@@ -150,11 +152,9 @@ def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = Non
     problem = settle(trace, theory)
     check_two_steps(trace, first, second)
     displacement = displacement_of(problem)
-    return (
-        displacement.returns_of(trace).why_apart(min(first, second), max(first, second))
-        if displacement
-        else None
-    )
+    if displacement is None:
+        return None
+    return displacement.returns_of(trace).why_apart(min(first, second), max(first, second))
 
 
 def check_two_steps(trace: Trace, first: object, second: object) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable
 from contextlib import suppress
 from typing import Generic, TypedDict, TypeVar
 
-from ssh_abduction.data.maps import Fault, SSHMap, check_of_trace, checked_maps
+from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_maps
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.solver import (
@@ -127,15 +127,29 @@ class LimitedQuestion(ABC, Generic[_Answer]):
     def _changes_in_words(
         self, ssh_map: SSHMap, places: Collection[int | None], cost: Cost | None, nats: float | None
     ) -> tuple[str, ...]:
-        """Say which gateways at these places changed between drives, and what the changes cost."""
+        """Say which gateways at these places changed between drives, and what the changes cost.
+
+        The last sentence says what the best map without changes costs. `cost` and `nats` are the
+        costs of the map with changes; `nats` is None if maps are not weighed.
+        """
         changes = [f for f in ssh_map.faults if f.kind == "changed" and f.place in places]
         if not changes or cost is None:
             return ()
-        search = self._solved(self.trace, self.theory.replace(changed=0.0), 1, self._watch.left())
-        for _ in search:
+        without = self._solved(self.trace, self.theory.replace(changed=0.0), 1, self._watch.left())
+        for _ in without:
             pass
-        self._ended(search)
-        return (*changes_in_words(changes, cost, nats, search),)
+        self._ended(without)
+        said = [f"{change}; this change costs {change.cost:g} dstates" for change in changes]
+        if without.status is Status.UNSATISFIABLE:
+            return (*said, "without changes there is no map")
+        if without.cost is None:
+            return (*said, "no map without changes was found in time")
+        best = "the best map" if without.status is Status.OPTIMAL else "the best map found"
+        changed = f"{cost.dstates} and changes for {cost.faults:g}"
+        more = f"has {without.cost.dstates} dstates, not {changed}"
+        if nats is not None and without.nats is not None:
+            more = f"costs {without.nats:.1f} nats, not {nats:.1f}"
+        return (*said, f"without changes, {best} {more}")
 
     def _ended(self, search: Search) -> None:
         """Store in `stopped` why a search ended early, if a limit of this question was reached."""
@@ -143,25 +157,3 @@ class LimitedQuestion(ABC, Generic[_Answer]):
         if search.stopped in ("interrupted", "memory limit"):
             self.stopped = search.stopped
         self._over()
-
-
-def changes_in_words(
-    changes: Collection[Fault], cost: Cost, nats: float | None, without: Search
-) -> list[str]:
-    """Say what changed in a map, and what the best map without changes costs.
-
-    `cost` and `nats` are the costs of the map with these changes; `nats` is None if maps are not
-    weighed. `without` is a search, already ended, for the best map without any changes.
-    """
-    said = [f"{change}; this change costs {change.cost:g} dstates" for change in changes]
-    if without.status is Status.UNSATISFIABLE:
-        return [*said, "without changes there is no map"]
-    if without.cost is None:
-        return [*said, "no map without changes was found in time"]
-    best = "the best map" if without.status is Status.OPTIMAL else "the best map found"
-    if nats is not None and without.nats is not None:
-        more = f"costs {without.nats:.1f} nats, not {nats:.1f}"
-    else:
-        changed = f"{cost.dstates} and changes for {cost.faults:g}"
-        more = f"has {without.cost.dstates} dstates, not {changed}"
-    return [*said, f"without changes, {best} {more}"]

@@ -51,12 +51,7 @@ _TURNED = (
 
 
 class Words:
-    """Writes English clauses for conclusions and axioms.
-
-    Args:
-        piece: The piece of the trace that the argument is about.
-        trace: The whole trace.
-    """
+    """Writes English clauses for conclusions and axioms, about a piece of a whole trace."""
 
     def __init__(self, piece: Piece, trace: Trace) -> None:
         self._piece, self._trace = piece, trace

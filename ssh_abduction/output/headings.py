@@ -163,17 +163,9 @@ def _synchronised(graph: nx.MultiDiGraph[Any], first: Course, robust: bool) -> d
 def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
     """Find by how many degrees each action turns.
 
-    Args:
-        turns: The trace that was mapped; or a dict from the name of an action to "right", "left",
-            "around" or degrees clockwise. Actions that are themselves named right, left or around
-            need no entry.
-
-    Returns:
-        For each action's name, the degrees clockwise, and their weight: SURE if the degrees are
-        known, GUESSED if only the side is known.
-
-    Raises:
-        MapError: A value of `turns` is none of these.
+    `turns` says how actions turn, as in `to_svg`. Return for each action's name the degrees
+    clockwise, and their weight: SURE if the degrees are known, GUESSED if only the side is known.
+    Raises MapError if a value is no turn.
     """
     known: dict[str, str | float] = {name: name for name in TURN_DEGREES}
     if isinstance(turns, Trace):

@@ -11,6 +11,7 @@ from itertools import pairwise
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import Region, course_named, list_in_words
+from ssh_abduction.data.words import noun_of
 from ssh_abduction.output.drawing import Point, element, line, svg_text, titled
 
 # The colour and the opacity of bands. Each band around another one is wider by WIDER times the
@@ -78,8 +79,7 @@ def place_title(ssh_map: SSHMap, place: int) -> str:
     bounds = sorted({course for region in regions for course in region.bounds})
     beside = f", right of {list_in_words(map(course_named, bounds))}" if bounds else ""
     around = [ssh_map.numbered("region", region.id) for region in regions]
-    plural = "" if len(around) == 1 else "s"
-    within = f", in region{plural} {list_in_words(around)}" if around else ""
+    within = f", in {noun_of('region', around)} {list_in_words(around)}" if around else ""
     return f"{ssh_map.called('place', place)}{beside}{within}"
 
 

@@ -59,10 +59,6 @@ class StreetProgram:
 
     Its first variables are x and y of each spot. Then comes for each street the distance by which
     it deviates from its heading, and last for each street the length by which it is too short.
-
-    Args:
-        spots: The ids of the spots.
-        streets: The heading and the cost factor of each street between two spots.
     """
 
     def __init__(self, spots: Sequence[int], streets: Streets) -> None:

@@ -254,7 +254,7 @@ def _unit(found: Layout) -> float:
 def _numbers(found: Layout, ssh_map: SSHMap) -> dict[str, Any]:
     """Make a dict of a drawing. Positions are in units of the distance between neighbours."""
     unit = _unit(found)
-    return {
+    numbers: dict[str, Any] = {
         "metric": found.metric,
         "unit": round(unit, 3),
         "places": [
@@ -264,13 +264,13 @@ def _numbers(found: Layout, ssh_map: SSHMap) -> dict[str, Any]:
             [round(x / unit, 2), round(y / unit, 2), None if h is None else round(h, 2)]
             for x, y, h in found.dstates
         ],
-        **(
-            {"floors": _corners(found, ssh_map, unit), "lifts": _lifts(found, ssh_map, unit)}
-            if ssh_map.floors
-            else {}
-        ),
-        **({"ellipses": _ellipses(found, ssh_map, unit)} if found.metric else {}),
     }
+    if ssh_map.floors:
+        numbers["floors"] = _corners(found, ssh_map, unit)
+        numbers["lifts"] = _lifts(found, ssh_map, unit)
+    if found.metric:
+        numbers["ellipses"] = _ellipses(found, ssh_map, unit)
+    return numbers
 
 
 def _corners(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:

@@ -85,11 +85,9 @@ class Consequences:
     ) -> None:
         self._dstates, self._links, self._looks = ssh_map.dstates, links, looks
         headed = [s for s in ssh_map.dstates if s.heading is not None and s.place is not None]
-        has_frames = (
-            all((s.heading or 0) < 4 for s in headed)
-            if theory is None
-            else theory.star == "frame" and theory.hard >= OF_FRAMES
-        )
+        has_frames = all((s.heading or 0) < 4 for s in headed)
+        if theory is not None:
+            has_frames = theory.star == "frame" and theory.hard >= OF_FRAMES
         self._framed = {(s.place, s.heading): s.id for s in headed} if has_frames else {}
         self._seen_at = {s.place: s for s in headed} if has_frames else {}  # a dstate at each place
         self._at: dict[tuple[int | None, int | None, int | None], int] = {

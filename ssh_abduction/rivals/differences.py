@@ -26,7 +26,7 @@ from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.groups import firsts, gathered, indices_of
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
-from ssh_abduction.data.words import attributes_of
+from ssh_abduction.data.words import attributes_of, noun_of
 from ssh_abduction.rivals.known_sides import Beside, only_in
 from ssh_abduction.rivals.table import NONE, Table
 from ssh_abduction.solver import Sort, stretches
@@ -288,13 +288,10 @@ def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
 
 def _groups_in_words(groups: Sequence[Steps], none: Steps) -> str:
     """Put into words how one map groups steps: "groups steps 0–1 | 2 and leaves out step 5"."""
-    grouped = f"groups {_steps(sum(map(len, groups)))} {' | '.join(map(stretches, groups))}"
-    left = f"leaves out {_steps(len(none))} {stretches(none)}"
+    steps = [step for group in groups for step in group]
+    grouped = f"groups {noun_of('step', steps)} {' | '.join(map(stretches, groups))}"
+    left = f"leaves out {noun_of('step', none)} {stretches(none)}"
     return " and ".join(([grouped] if groups else []) + ([left] if none else []))
-
-
-def _steps(count: int) -> str:
-    return "step" if count == 1 else "steps"
 
 
 def _listed(parts: Sequence[object]) -> str:

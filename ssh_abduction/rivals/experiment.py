@@ -10,7 +10,7 @@ from ssh_abduction.data.errors import printable
 from ssh_abduction.data.words import PlainData, attributes_of
 from ssh_abduction.rivals.consequences import Consequence
 from ssh_abduction.rivals.machines import Seen
-from ssh_abduction.solver import Stop, stretches
+from ssh_abduction.solver import Stop
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,8 +218,3 @@ def _untried_in_words(untried: Untried | None) -> str:
 def _acts(actions: Sequence[str]) -> str:
     """Join the names of actions with commas."""
     return printable(", ".join(actions))
-
-
-def rivals_in_words(rivals: Sequence[int]) -> str:
-    """Put the numbers of rivals into words: "map 1", or "maps 1–3 and 7"."""
-    return f"{'map' if len(rivals) == 1 else 'maps'} {stretches(rivals)}"

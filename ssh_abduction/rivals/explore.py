@@ -135,14 +135,10 @@ def next_experiment(
     extra = [Action.of(action) for action in a_list("actions", actions, MapError)]
     if isinstance(maps, Solution):
         theory, complete, maps = theory or maps.theory, maps.complete, maps.maps
-    rivals = (
-        [maps]
-        if isinstance(maps, SSHMap)
-        else a_list("maps", maps, MapError, what="a Solution or maps")
-    )
+    maps = [maps] if isinstance(maps, SSHMap) else maps
+    rivals = a_list("maps", maps, MapError, what="a Solution or maps")
     _check(rivals, trace)
-    if watch is None:
-        watch = Watch(time_limit, memory_limit)
+    watch = watch or Watch(time_limit, memory_limit)
     watch.start()
     laboratory = Laboratory(rivals, trace, theory, extra, can, implied, watch)
     plan = laboratory.plan()

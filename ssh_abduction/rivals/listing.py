@@ -112,18 +112,13 @@ class Listing:
         if isinstance(source, Listing):
             return source
         if isinstance(source, Solution):
-            minimal = (
-                (source.levels[0].count if source.levels else source.count)
-                if source.status is Status.OPTIMAL
-                else None
-            )
-            backbone = source.backbone if source.maps else None
+            minimal = source.levels[0].count if source.levels else source.count
             listing = cls(
                 source.maps,
-                minimal,
+                minimal if source.status is Status.OPTIMAL else None,
                 source.minimal_listed,
                 source.stopped,
-                backbone,
+                source.backbone if source.maps else None,
                 weighed=source.weighed,
                 by_minimality=source.by_minimality,
                 drives=source.drives,
@@ -266,12 +261,8 @@ class Listing:
             MapError: There is no such map.
         """
         text = str(name)
-        if (
-            len(text) < ID_LENGTH
-            and text.isdecimal()
-            and text.isascii()
-            and 1 <= int(text) <= len(self.maps)
-        ):
+        is_number = len(text) < ID_LENGTH and text.isdecimal() and text.isascii()
+        if is_number and 1 <= int(text) <= len(self.maps):
             return int(text) - 1
         found = [i for i, ssh_map in enumerate(self.maps) if ssh_map.id == text]
         if not found:

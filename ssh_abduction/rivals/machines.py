@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.groups import firsts, reached
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.star import Star
+from ssh_abduction.data.star import Star, star_to_json
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.solver import Watch, observation
 from ssh_abduction.theory.evidence.alike import are_alike
@@ -59,19 +60,13 @@ Can: TypeAlias = Callable[[Seen], Iterable[str]]
 
 def _entry(entry: Any) -> Any:
     """Convert an entry of a star for JSON. An open opening becomes 1, a closed one 0."""
-    if hasattr(entry, "to_json"):
-        return entry.to_json()
-    return int(entry) if isinstance(entry, bool) else entry
+    return int(entry) if isinstance(entry, bool) else star_to_json([entry])[0]
 
 
 def _star_text(star: Sequence[Any]) -> str:
     """Put a star into words: its open directions, or the number of its gateways."""
     if all(isinstance(entry, bool) for entry in star):
-        ways = [
-            name
-            for name, is_open in zip(("ahead", "right", "back", "left"), star, strict=True)
-            if is_open
-        ]
+        ways = compress(("ahead", "right", "back", "left"), star)
         return f"(open: {', '.join(ways) or 'nothing'})"
     return f"({len(star)} gateways)"
 
@@ -85,15 +80,6 @@ class Observations:
     angles. With a tolerance, stars that could be equal, directly or through other stars, count as
     equal. So the robot can see each predicted difference. Without a theory, stars are used unless a
     map has a dstate with two different stars.
-
-    Args:
-        maps: The rival maps.
-        trace: The trace of the maps; None to compare views only.
-        theory: The theory of the maps; None if unknown.
-
-    Attributes:
-        seen: The observation of each number.
-        of: For each map, the number of the observation at each dstate.
     """
 
     def __init__(self, maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> None:
@@ -108,7 +94,8 @@ class Observations:
                 found.setdefault((s.view, key), Seen(s.view, star))
                 keys[-1].append((s.view, key))
         number = {key: i for i, key in enumerate(found)}
-        self.seen = list(found.values())
+        self.seen = list(found.values())  # the observation of each number
+        # For each map, the number of the observation at each dstate.
         self.of = [[number[key] for key in of_map] for of_map in keys]
 
 
@@ -241,17 +228,14 @@ def machine_of(
 
 
 class MachineTable:
-    """Machines as arrays, so that an action is followed in all of them at once.
-
-    Attributes:
-        ends: The state that an action leads to, or UNKNOWN. Shape (machines, states, actions).
-        sights: The number of what is seen in a state. Shape (machines, states).
-    """
+    """Machines as arrays, so that an action is followed in all of them at once."""
 
     def __init__(self, machines: Sequence[Machine], actions: Sequence[str]) -> None:
         column = {action: i for i, action in enumerate(actions)}
         most = max(len(machine.sights) for machine in machines)
+        # The state that an action leads to, or UNKNOWN. Shape (machines, states, actions).
         self.ends: Array = np.full((len(machines), most, len(actions)), UNKNOWN, np.int32)
+        # The number of what is seen in a state. Shape (machines, states).
         self.sights: Array = np.full((len(machines), most), UNKNOWN, np.int32)
         for i, machine in enumerate(machines):
             self.sights[i, : len(machine.sights)] = machine.sights
@@ -284,13 +268,8 @@ class Layer:
 class Walk:
     """A breadth-first search over joint states.
 
-    It follows links that all machines have, as long as all predict the same observations.
-
-    Args:
-        table: All machines.
-        group: The indices of the machines to follow.
-        start: The state in which each of these machines begins.
-        watch: The limits of the search.
+    It follows links that all machines have, as long as all predict the same observations. `group`
+    has the indices of the machines to follow, and `start` the state in which each of them begins.
 
     >>> blind = Machine((0, 0), ((("a", 1),), (("a", 0),)))
     >>> walk = Walk(MachineTable([blind, blind], ["a"]), [0, 1], (0, 0), Watch())

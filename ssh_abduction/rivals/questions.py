@@ -17,7 +17,7 @@ import numpy as np
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.groups import indices_of
 from ssh_abduction.data.maps import Fault, SSHMap
-from ssh_abduction.data.words import attributes_of
+from ssh_abduction.data.words import attributes_of, noun_of
 from ssh_abduction.rivals.table import Bools, Table
 from ssh_abduction.solver import SORTS, stretches
 
@@ -76,9 +76,7 @@ class Question:
     def _at(self, side: int) -> str:
         """Put the places of one side (0 for `here`, 1 for `there`) into words, in brackets."""
         places = self.places[side] if self.places else ()
-        return (
-            f" ({'place' if len(places) == 1 else 'places'} {stretches(places)})" if places else ""
-        )
+        return f" ({noun_of('place', places)} {stretches(places)})" if places else ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the question as plain data, as `compare --json` prints it."""
@@ -170,4 +168,4 @@ def _key(column: Bools) -> bytes:
 
 def _steps(steps: Sequence[int]) -> str:
     """Put the numbers of steps into words: "step 1", or "steps 1–3 and 7"."""
-    return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"
+    return f"{noun_of('step', steps)} {stretches(steps)}"

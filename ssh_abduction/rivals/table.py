@@ -33,24 +33,20 @@ NONE = -1  # no place, path or course
 
 
 class Table:
-    """Maps of one trace as arrays.
-
-    Attributes:
-        firsts: The first step of each class, shape (classes,).
-        classes: The class of each step, shape (steps,).
-        steps: The numbers of all steps. With several drives, a step prints with its drive's name.
-        ones: For each sort that all maps have, an array of shape (maps, classes): the first class
-            that is one with each class in each map; NONE if the class has no place, path or course.
-    """
+    """Maps of one trace as arrays."""
 
     def __init__(self, maps: Sequence[SSHMap], drives: Sequence[Drive] = ()) -> None:
-        labelings = {ssh_map.dstate_at: i for i, ssh_map in enumerate(maps)}
+        labelings = dict.fromkeys(ssh_map.dstate_at for ssh_map in maps)
         by_labels = {labels: np.array(labels, dtype=np.int32) for labels in labelings}
+        # The class of each step, shape (steps,), and the first step of each class, (classes,).
         self.classes = _common_classes(list(by_labels.values()))
-        self.steps = named_steps(drives, len(self.classes))
         _, self.firsts = np.unique(self.classes, return_index=True)
+        # The numbers of all steps. With several drives, a step prints with its drive's name.
+        self.steps = named_steps(drives, len(self.classes))
         label_of = {labels: numbers[self.firsts].tolist() for labels, numbers in by_labels.items()}
         has_places = all(any(s.place is not None for s in ssh_map.dstates) for ssh_map in maps)
+        # For each sort that all maps have, an array of shape (maps, classes): the first class that
+        # is one with each class in each map; NONE if the class has no place, path or course.
         self.ones: dict[Sort, Ints] = {}
         for sort in SORTS if has_places else SORTS[:1]:
             known: dict[tuple[Hashable, ...], Ints] = {}

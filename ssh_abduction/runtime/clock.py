@@ -43,10 +43,8 @@ def each_looking(items: Iterable[Item]) -> Iterator[Item]:
 def heeding(check: Callable[[], None]) -> Iterator[None]:
     """Make `look_at_clock` call `check` inside a `with` block.
 
-    If such blocks are nested, the checks of the outer blocks are called first.
-
-    Args:
-        check: Raises if the work has to end. It is called often, so it should take microseconds.
+    If such blocks are nested, the checks of the outer blocks are called first. A check raises an
+    error if the work has to end. It is called often, so it should take microseconds.
     """
     around = _check.get()
 
@@ -63,11 +61,7 @@ def heeding(check: Callable[[], None]) -> Iterator[None]:
 
 
 def each_heeding(check: Callable[[], None], items: Iterator[Item]) -> Iterator[Item]:
-    """Yield the items of an iterator. Only the work of the iterator runs within `heeding(check)`.
-
-    Args:
-        check: Raises if the work has to end, as in `heeding`.
-    """
+    """Yield the items of an iterator. Only its own work runs within `heeding(check)`."""
     while True:
         with heeding(check):
             try:
