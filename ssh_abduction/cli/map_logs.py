@@ -56,13 +56,10 @@ def add_parser(verbs: Verbs) -> None:
     )
     add_jobs(parser, "map", "logs")
     add_reading(parser)
-    add_theory(
-        parser,
-        default=(
-            "topological, but without the axioms of stars, sides and paths, as logs do not show "
-            "these reliably"
-        ),
+    said = (
+        "topological, but without the axioms of stars, sides and paths, as logs do not show these"
     )
+    add_theory(parser, default=f"{said} reliably")
 
 
 def run(options: argparse.Namespace) -> int:

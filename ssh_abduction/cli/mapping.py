@@ -274,7 +274,7 @@ def run(options: argparse.Namespace) -> int:
         return _together(question, options)
     folders, same = folders_of(options.logs, Path(options.output))
     for path, other in same.items():
-        print(f"{named(path)}: the same log as {named(other)}, in {named(str(folders[other]))}")
+        print(f"{named(path)}: the same log as {named(other)}, in {named(folders[other])}")
     # Skip the logs that are done, and those with a folder that cannot be written.
     left = [
         path
@@ -284,7 +284,7 @@ def run(options: argparse.Namespace) -> int:
     ]
     for path in folders:
         if path not in left:
-            print(f"{named(path)}: done already, in {named(str(folders[path]))}")
+            print(f"{named(path)}: done already, in {named(folders[path])}")
     if len(options.logs) == 1 and options.jobs is None and options.scheduler is None:
         return max([0, *(_here(question, [path], folders[path]) for path in left)])
     return _many(question, options, {path: folders[path] for path in left})
@@ -326,7 +326,7 @@ def _together(question: MapQuestion, options: argparse.Namespace) -> int:
             )
     folder = Path(options.output)
     if not options.again and is_done(folder, logs, question.obeying(folder).settings):
-        print(f"{counted(len(logs), 'logs')}: done already, in {named(str(folder))}")
+        print(f"{counted(len(logs), 'logs')}: done already, in {named(folder)}")
         return 0
     return _here(question, logs, folder)
 
@@ -336,7 +336,7 @@ def _check_alone(path: str, folder: Path) -> None:
     if (file := beside(folder / "maps.json")) is not None:
         raise MapError(
             f"{named(path)}: expected no corrections, got {named(file)}, which a call for many "
-            f"logs does not obey; map this log alone, with -o {named(str(folder))}"
+            f"logs does not obey; map this log alone, with -o {named(folder)}"
         )
 
 
@@ -387,7 +387,7 @@ def _kept(
 
 
 def _say(answer: FileAnswer, folder: Path) -> None:
-    where = f" → {named(str(folder))}" if answer.files else ""
+    where = f" → {named(folder)}" if answer.files else ""
     print(f"{answer.line}{where}", flush=True)
 
 

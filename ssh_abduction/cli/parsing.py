@@ -143,13 +143,8 @@ class Parser(argparse.ArgumentParser):
         """
         name, _, metavar = spec.partition(" ")
         if not self.settings:
-            self.add_argument(
-                "--set",
-                action=_Set,
-                dest=argparse.SUPPRESS,
-                metavar="NAME=VALUE",
-                help="change one of the settings that are listed below; may be given again",
-            )
+            shown = "change one of the settings that are listed below; may be given again"
+            self.add("--set NAME=VALUE", shown, action=_Set, dest=argparse.SUPPRESS)
         if isinstance(default, bool):
             details["type"], metavar = true_or_false, "true|false"
         if metavar:

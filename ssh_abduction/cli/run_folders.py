@@ -71,13 +71,13 @@ def check_folder(folder: Path) -> None:
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not there.is_dir():
         raise AbductionError(
-            f"{named(str(folder))}: expected a folder to write, got a file: {named(str(there))}; "
+            f"{named(folder)}: expected a folder to write, got a file: {named(there)}; "
             "name another one"
         )
     if not os.access(there, os.W_OK):
         raise AbductionError(
-            f"{named(str(folder))}: expected a folder that can be written, got no permission in "
-            f"{named(str(there))}; name another one"
+            f"{named(folder)}: expected a folder that can be written, got no permission in "
+            f"{named(there)}; name another one"
         )
 
 
@@ -125,7 +125,7 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
             if place != wished and content:
                 is_taken = _key(wished) in owners
                 why = "has the map of another log" if is_taken else "is the name of several logs"
-                where = f"its folder is {named(str(place))}, as {named(str(wished))} {why}"
+                where = f"its folder is {named(place)}, as {named(wished)} {why}"
                 warn([f"{named(path)}: {where}"])
         other = next((one for one, taken in found.items() if _key(taken) == _key(place)), None)
         if other is None:

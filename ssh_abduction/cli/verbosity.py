@@ -23,20 +23,10 @@ def add_verbosity(parser: argparse.ArgumentParser) -> None:
     """Add -q and -v to a parser, so that they may come before or behind the verb."""
     group = parser.add_argument_group("messages").add_mutually_exclusive_group()
     none = argparse.SUPPRESS  # a default of the verb would overwrite a flag before the verb
-    group.add_argument(
-        "-q",
-        "--quiet",
-        action="store_true",
-        default=none,
-        help="print only errors on stderr, no warnings and no progress",
-    )
-    group.add_argument(
-        "-v",
-        "--verbose",
-        action="count",
-        default=none,
-        help="log on stderr what is tried, found and proven; -vv: also what clingo is given",
-    )
+    said = "print only errors on stderr, no warnings and no progress"
+    group.add_argument("-q", "--quiet", action="store_true", default=none, help=said)
+    said = "log on stderr what is tried, found and proven; -vv: also what clingo is given"
+    group.add_argument("-v", "--verbose", action="count", default=none, help=said)
 
 
 @contextlib.contextmanager

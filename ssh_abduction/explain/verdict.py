@@ -229,12 +229,11 @@ class PairExplanation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the answer as plain data, as `explain --json` prints it."""
+        names = ("sentences", "same", "different", "listed", "derivation", "clash")
         return {
             "steps": [self.first, self.second],
             "verdict": self.verdict.value,
-            **attributes_of(
-                self, "sentences", "same", "different", "listed", "derivation", "clash"
-            ),
+            **attributes_of(self, *names),
             **({"stopped": self.stopped} if self.stopped else {}),
         }
 

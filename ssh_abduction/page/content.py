@@ -69,16 +69,12 @@ def content_of(
     drawings = [_numbers(drawn, maps[i]) for i, drawn in layouts]
     spots = _spots(maps[0], layouts[0][1])
     return {
-        "sentence": found.sentence,
-        "sureness": listing.sureness,
-        "warnings": listing.warnings,
+        **attributes_of(found, "sentence", "minimal", "complete"),
+        **attributes_of(listing, "sureness", "warnings"),
         "joins": _joins(listing),
         **_drives(listing),
         "file": called.maps,
-        "trace": called.trace,
-        "flags": called.flags,
-        "minimal": found.minimal,
-        "complete": found.complete,
+        **attributes_of(called, "trace", "flags"),
         "shared": _shared(listing),
         "choices": [_choice(choice) for choice in found.choices],
         "replays": replays(maps, [one["labeling"] for one in entries], trace, run),

@@ -132,13 +132,10 @@ def _sides(
 
     A key is the first step at the place and the first step along the path.
     """
+    courses_of = [[(path.id, d) for path in m.paths for d in (1, -1)] for m in maps]
     beside = [
-        {
-            (path.id, d): {*right_of(m.regions or (), path.id, d)}
-            for path in m.paths
-            for d in (1, -1)
-        }
-        for m in maps
+        {course: {*right_of(m.regions or (), *course)} for course in listed}
+        for m, listed in zip(maps, courses_of, strict=True)
     ]
     states = [[m.dstates[label] for label in m.dstate_at] for m in maps]
     places: dict[tuple[int | None, ...], int] = {}

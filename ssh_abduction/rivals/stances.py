@@ -50,14 +50,7 @@ class Stances:
     """The stances of a map: places and headings where a robot may stand.
 
     The first stances are the dstates of the map, with the same numbers. The robot was never in the
-    others: turns lead there from dstates.
-
-    Args:
-        trace: The trace of the map.
-        theory: The theory of the map.
-        actions: Actions that the robot can do, in addition to the actions of the trace.
-        can: A function from what the robot sees to the names of the actions that it can do there.
-            If None, the robot can do any action that the star (the openings seen) allows.
+    others: turns lead there from dstates. Parameters as in `next_tour`.
     """
 
     def __init__(
