@@ -23,17 +23,8 @@ UNKNOWN = "–"
 ALIKE = 0.9
 OF_PAIRS = ("joined", "right", "precision", "recall")
 PAIRS = ("map", "places", *OF_PAIRS, "dstates", *OF_PAIRS)
-HEAD = (
-    "map",
-    "isomorphic",
-    "dstates",
-    "places",
-    "paths",
-    "accuracy",
-    "same place",
-    "edges",
-    "links",
-)
+THINGS = ("dstates", "places", "paths")
+HEAD = ("map", "isomorphic", *THINGS, "accuracy", "same place", "edges", "links")
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -182,7 +173,7 @@ def _headline(found: Evaluation, may_be_more: bool) -> str:
 
 def _truth(found: Evaluation, steps: int) -> str:
     """Describe the truth of a trace with this number of steps: where it is known, and counts."""
-    known = {things: getattr(found, f"true_{things}") for things in ("dstates", "places", "paths")}
+    known = {things: getattr(found, f"true_{things}") for things in THINGS}
     counts = ", ".join(counted(n, things) for things, n in known.items() if n is not None)
     ambiguity = ""
     if found.ambiguity is not None:
@@ -192,12 +183,11 @@ def _truth(found: Evaluation, steps: int) -> str:
 
 def _row(number: int, one: MapEvaluation) -> list[object]:
     """Make the table row of the map with this number."""
-    counts = [
-        UNKNOWN
-        if (count := getattr(one, kind)) is None
-        else f"{count} {_word(getattr(one, f'{kind}_right'), 'right', 'wrong')}"
-        for kind in ("dstates", "places", "paths")
-    ]
+    counts = []
+    for kind in THINGS:
+        count, is_right = getattr(one, kind), getattr(one, f"{kind}_right")
+        counts.append(f"{count} {_word(is_right, 'right', 'wrong')}")
+        counts[-1] = UNKNOWN if count is None else counts[-1]
     shares = [
         " ".join(_share(getattr(one, f"{kind}_{what}")) for what in ("precision", "recall"))
         for kind in ("place", "edge", "link")

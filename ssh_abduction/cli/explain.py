@@ -16,6 +16,7 @@ from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.obeyed_corrections import as_corrected
 from ssh_abduction.cli.options import (
     add_limits,
+    add_max_maps,
     add_theory,
     maps_path,
     number_steps,
@@ -82,13 +83,7 @@ def add_parser(verbs: Verbs) -> None:
         default=(),
         metavar="step",
     )
-    parser.add(
-        "-n --maps K",
-        "list at most K minimal maps, to count those in which the two steps are one dstate; "
-        "0 for all (default: 100)",
-        type=int,
-        default=100,
-    )
+    add_max_maps(parser, "minimal maps, to count those in which the two steps are one dstate")
     parser.add("--json", "print the explanation as JSON")
     add_limits(parser, "what is known", SECONDS)
     parser.add(

@@ -61,12 +61,8 @@ def add_parser(verbs: Verbs) -> None:
 def add_reading(parser: Parser) -> None:
     """Add the options that say how to read a log, and how wide the robot is."""
     group = parser.add_argument_group("reading logs")
-    parser.add(
-        "--format",
-        "format of the log (default: guessed from its content)",
-        to=group,
-        choices=FORMATS,
-    )
+    said = "format of the log (default: guessed from its content)"
+    parser.add("--format", said, to=group, choices=FORMATS)
     parser.add(
         "--width METRES",
         f"width of the robot in metres, which cannot pass narrower gaps (default: {WIDTH:g})",
@@ -193,26 +189,19 @@ def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Rob
         raise AbductionError("standard input: expected a log, got a closed stream; name a file")
     asked = {name: getattr(options, name) for name in ("fov", "mount", "no_return", "zero_is")}
     items = live_log(sys.stdin.buffer, **asked, tell=tell)
-    numbers = count()
+    numbers, output = count(), sys.stderr if options.output == "-" else sys.stdout
 
     def show(visit: Visit) -> None:
         x, y = visit.middle
-        print(
-            f"visit {next(numbers)}, scans {visit.begin} to {visit.end}: a place at "
-            f"({x:.1f}, {y:.1f}) m with {counted(len(visit.ways), 'ways')}",
-            file=sys.stderr if options.output == "-" else sys.stdout,
-            flush=True,
-        )
+        where = f"({x:.1f}, {y:.1f}) m with {counted(len(visit.ways), 'ways')}"
+        scans = f"scans {visit.begin} to {visit.end}"
+        print(f"visit {next(numbers)}, {scans}: a place at {where}", file=output, flush=True)
 
-    stop = StopFlag()
-    with until_ctrl_c(items, stop) as some:
+    with until_ctrl_c(items, StopFlag()) as some:
         log, done = import_live(some, options.width or WIDTH, None, tell, show, "-")
     if more := len(done.visits) - next(numbers):
-        print(
-            f"at the end of the drive: {counted(more, 'more visits')} where stretches of it "
-            "diverge",
-            file=sys.stderr if options.output == "-" else sys.stdout,
-        )
+        ways = f"{counted(more, 'more visits')} where stretches of it diverge"
+        print(f"at the end of the drive: {ways}", file=output)
     for warning in log.warnings:
         tell(warning)
     return log, done

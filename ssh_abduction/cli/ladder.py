@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import add_theory, theory_of, trace_path
+from ssh_abduction.cli.options import add_max_maps, add_theory, theory_of, trace_path
 from ssh_abduction.cli.outcome import on_ctrl_c
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import table
@@ -36,12 +36,7 @@ def add_parser(verbs: Verbs) -> None:
         "trace has truth, which map is true.",
     )
     parser.add("trace", "trace file (JSON Lines), or - for standard input", type=trace_path)
-    parser.add(
-        "-n --maps K",
-        "list at most K maps on each rung; 0 for all (default: 100)",
-        type=int,
-        default=100,
-    )
+    add_max_maps(parser, "maps on each rung")
     parser.add("--time-limit S", "stop each search after S seconds", type=float)
     parser.add("--json", "print one JSON object for each rung")
     add_theory(parser)

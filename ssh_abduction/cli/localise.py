@@ -35,7 +35,15 @@ if TYPE_CHECKING:
 
 HEAD = ("step", "action", "seen", "", "dstate")
 NUMBERS = ("probability", "nowhere", "entropy", "normaliser")
-CHANCES = ("misread", "slipped", "unmapped", "reentered")
+# For each chance, what has this probability.
+CHANCES = {
+    "misread": "at a step, the view or image does not fit the dstate where the robot is (default: "
+    "0.01)",
+    "slipped": "an action fails, or the robot is kidnapped during it (default: 0.01)",
+    "unmapped": "the robot is outside the map at the start, after a slip, or after an action for "
+    "which the map has no link (default: 0.1)",
+    "reentered": "a robot outside the map is back on it after its next action (default: 0.1)",
+}
 NOWHERE = "–"
 
 
@@ -68,16 +76,8 @@ def add_parser(verbs: Verbs) -> None:
         "recogniser that train wrote for this map, to use images instead of views (default: "
         "in a folder that map wrote, one for the images of its trace)",
     )
-    said = {
-        "misread": "at a step, the view or image does not fit the dstate "
-        "where the robot is (default: 0.01)",
-        "slipped": "an action fails, or the robot is kidnapped during it (default: 0.01)",
-        "unmapped": "the robot is outside the map at the start, after a slip, or after an action "
-        "for which the map has no link (default: 0.1)",
-        "reentered": "a robot outside the map is back on it after its next action (default: 0.1)",
-    }
-    for name in CHANCES:
-        parser.add_setting(name, f"the probability that {said[name]}", type=float, metavar="P")
+    for name, said in CHANCES.items():
+        parser.add_setting(f"{name} P", f"the probability that {said}", type=float)
     parser.add_setting(
         "zero_one",
         "whether views and actions never fail: the defaults of misread, slipped and unmapped are "

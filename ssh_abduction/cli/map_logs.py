@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ssh_abduction.cli.import_log import add_reading
-from ssh_abduction.cli.options import add_jobs, add_theory, output
+from ssh_abduction.cli.options import add_jobs, add_max_maps, add_theory, output
 from ssh_abduction.cli.parsing import Verbs
 
 
@@ -33,12 +33,7 @@ def add_parser(verbs: Verbs) -> None:
         type=output,
         required=True,
     )
-    parser.add(
-        "-n --maps K",
-        "list at most K minimal maps; 0 for all (default: 300)",
-        type=int,
-        default=300,
-    )
+    add_max_maps(parser, "minimal maps", 300)
     parser.add(
         "--time-limit S",
         "seconds for the search (default: a twentieth of the time that the robot drove, less the "
@@ -56,10 +51,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     add_jobs(parser, "map", "logs")
     add_reading(parser)
-    said = (
-        "topological, but without the axioms of stars, sides and paths, as logs do not show these"
-    )
-    add_theory(parser, default=f"{said} reliably")
+    left_out = "the axioms of stars, sides and paths, as logs do not show these reliably"
+    add_theory(parser, default=f"topological, but without {left_out}")
 
 
 def run(options: argparse.Namespace) -> int:

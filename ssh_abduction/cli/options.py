@@ -123,6 +123,12 @@ def add_limits(parser: Parser, printed: str, seconds: float | None = None) -> No
     )
 
 
+def add_max_maps(parser: Parser, listed: str, default: int = 100) -> None:
+    """Add the option that limits how many maps are listed. The help calls them `listed`."""
+    said = f"list at most K {listed}; 0 for all (default: {default})"
+    parser.add("-n --maps K", said, type=int, default=default)
+
+
 def add_jobs(parser: Parser, act: str, things: str, said: str | None = None) -> None:
     """Add the options that spread work on processes or a cluster, such as "solve" of "traces"."""
     many = parser.add_argument_group(f"many {things}", said)

@@ -19,6 +19,7 @@ from ssh_abduction.cli.obeyed_corrections import Obeying
 from ssh_abduction.cli.options import (
     add_jobs,
     add_limits,
+    add_max_maps,
     add_theory,
     check_output,
     maps_path,
@@ -89,9 +90,7 @@ def add_parser(verbs: Verbs) -> None:
         metavar="trace",
         type=trace_path,
     )
-    parser.add(
-        "-n --maps K", "list at most K maps; 0 for all (default: 100)", type=int, default=100
-    )
+    add_max_maps(parser, "maps")
     parser.add("--json", "print the solution as JSON; for many traces, one line each")
     parser.add("--together", "the traces are drives through one building: find their joint maps")
     parser.add("-o --output FILE", "also write the solution to this file, as JSON", type=output)

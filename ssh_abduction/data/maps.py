@@ -41,23 +41,8 @@ from ssh_abduction.data.regions import Region, renumbered, right_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted, in_output
 
-__all__ = [
-    "FAULTS",
-    "ID_LENGTH",
-    "MOVED",
-    "DState",
-    "Fault",
-    "Fit",
-    "MapPath",
-    "Name",
-    "Pose",
-    "SSHMap",
-    "check_labels",
-    "check_of_trace",
-    "checked_map",
-    "checked_maps",
-    "maps_of",
-]
+# Other modules import the parts of maps from here, too.
+__all__ = ["FAULTS", "DState", "Fault", "Fit", "MapPath", "Name", "Pose", "SSHMap"]
 
 # Hexadecimal digits of a map's id. Among a million maps the chance of two equal ids is 1 in 500.
 ID_LENGTH = 12

@@ -33,16 +33,8 @@ from ssh_abduction.data.step import Step, as_list, of_actions
 from ssh_abduction.data.trace_file import FORMAT, VERSION, read_trace
 from ssh_abduction.data.words import counted, in_output
 
-__all__ = [
-    "STANDARD_ACTIONS",
-    "Action",
-    "Kind",
-    "Step",
-    "Trace",
-    "TurnDirection",
-    "View",
-    "checked_trace",
-]
+# Other modules import the parts of traces from here, too.
+__all__ = ["STANDARD_ACTIONS", "Action", "Kind", "Step", "Trace", "TurnDirection", "View"]
 
 _USUAL = Odometry()  # used if the trace has no odometry
 
