@@ -52,11 +52,8 @@ def add_parser(verbs: Verbs) -> None:
         type=output,
         required=True,
     )
-    parser.add(
-        "--k K",
-        "number of views (default: the number that the measure M of the paper rates best)",
-        type=int,
-    )
+    said = "number of views (default: the number that the measure M of the paper rates best)"
+    parser.add("--k K", said, type=int)
     parser.add_setting("k_max K", "largest number of views to try (default: 20)", type=int)
     parser.add_setting(
         "by",

@@ -107,14 +107,8 @@ def _answers(
 class Absence:
     """Measures how long a cluster has had no worker, because Dask itself would wait for ever.
 
-    It warns after PATIENCE seconds. If there is a time limit, waiting should end after this limit,
-    but not before PATIENCE seconds.
-
-    Args:
-        workers: Returns the number of workers.
-        limit: The time limit in seconds; None for no limit.
-        address: The address of the scheduler, for messages.
-        clock: Returns the time in seconds.
+    It warns after PATIENCE seconds. If there is a time limit in seconds, waiting should end after
+    this limit, but not before PATIENCE seconds. `workers` returns the number of workers.
     """
 
     def __init__(

@@ -37,21 +37,11 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.cli import parser
 
     top = parser()
-    for action in _all_actions(top):
+    for action in (action for one in (top, *top.verbs.values()) for action in one._actions):
         if kind := _file_kind(action):
             action.complete = shtab.FILE if kind == "file" else shtab.DIRECTORY  # type: ignore[attr-defined]
     print(shtab.complete(top, options.shell))
     return 0
-
-
-def _all_actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    """List the arguments of a parser and of all its verbs."""
-    found = list(parser._actions)  # argparse has no public name for these
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for verb in action.choices.values():
-                found += _all_actions(verb)
-    return found
 
 
 def _file_kind(action: argparse.Action) -> str | None:

@@ -41,13 +41,8 @@ def add_parser(verbs: Verbs) -> None:
     for name, words in HELPS.items():
         metavar = "I,J" if name in ASSERTIONS else "GATEWAY"
         parser.add(f"--{name.replace('_', '-')}", words, action=_InOrder, metavar=metavar)
-    parser.add(
-        "--name",
-        "name or rename a place, path or region (p4, path2, kitchen), or the place of a step",
-        action=_InOrder,
-        nargs=2,
-        metavar=("WHAT", "NAME"),
-    )
+    said = "name or rename a place, path or region (p4, path2, kitchen), or the place of a step"
+    parser.add("--name", said, action=_InOrder, nargs=2, metavar=("WHAT", "NAME"))
     parser.set_defaults(said=())
     add_map(parser)
 
@@ -110,8 +105,7 @@ def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
         hint = "" if about_places else "; places are for --elsewhere and --same-place"
         raise MapError(f"{flag}: {error}{hint}") from None
     if len(steps) != 2 or steps[0] == steps[1]:
-        what = (
-            "places, such as kitchen,p7" if about_places else "steps, such as monday:12,tuesday:3"
-        )
+        what = "steps, such as monday:12,tuesday:3"
+        what = "places, such as kitchen,p7" if about_places else what
         raise MapError(f"{flag}: expected two different {what}, got {brief(pair)}; name two")
     return steps[0], steps[1]

@@ -35,11 +35,8 @@ def add_parser(verbs: Verbs) -> None:
         choices=FORMATS,
     )
     add_map(parser)
-    parser.add(
-        "--trace TRACE",
-        "the trace that was mapped; its turns give a better layout of a map without poses",
-        type=trace_path,
-    )
+    said = "the trace that was mapped; its turns give a better layout of a map without poses"
+    parser.add("--trace TRACE", said, type=trace_path)
     parser.add(
         "-o --output FILE", "file to write (default: standard output)", default="-", type=output
     )

@@ -159,12 +159,8 @@ class Guard:
                 self._printer.wait_for(save, SAVING)
         except BaseException as error:
             with suppress(OSError, ValueError):
-                print(
-                    f"ssh-abduction: {why}: expected to print what is known, "
-                    f"got {type(error).__name__}: {error}",
-                    file=sys.stderr,
-                    flush=True,
-                )
+                found = f"expected to print what is known, got {type(error).__name__}: {error}"
+                print(f"ssh-abduction: {why}: {found}", file=sys.stderr, flush=True)
         finally:
             self._leave(code)
 

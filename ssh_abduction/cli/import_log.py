@@ -63,23 +63,16 @@ def add_reading(parser: Parser) -> None:
     group = parser.add_argument_group("reading logs")
     said = "format of the log (default: guessed from its content)"
     parser.add("--format", said, to=group, choices=FORMATS)
-    parser.add(
-        "--width METRES",
-        f"width of the robot in metres, which cannot pass narrower gaps (default: {WIDTH:g})",
-        to=group,
-        type=metres,
-    )
+    said = f"width of the robot in metres, which cannot pass narrower gaps (default: {WIDTH:g})"
+    parser.add("--width METRES", said, to=group, type=metres)
     parser.add_setting(
         "fov DEGREES",
         "the angle from the first to the last beam of the laser; negative for a laser mounted "
         "upside down (default: from the log, else 180)",
         type=partial(_laser_value, "fov"),
     )
-    parser.add_setting(
-        "scan_topic TOPIC",
-        "topic of the scans, if a bag has several; may be given again to read several lasers",
-        many=True,
-    )
+    said = "topic of the scans, if a bag has several; may be given again to read several lasers"
+    parser.add_setting("scan_topic TOPIC", said, many=True)
     parser.add_setting("odom_topic TOPIC", "topic of the odometry, if a bag has several")
     parser.add_setting(
         "mount X,Y,DEGREES",

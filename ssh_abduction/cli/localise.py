@@ -183,9 +183,5 @@ def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
     if ssh_map.places:
         place = None if dstate is None else ssh_map.dstates[dstate].place
         cells.append(NOWHERE if place is None else ssh_map.numbered("place", place))
-    return [
-        *cells,
-        *(f"{belief[name]:.3f}" for name in ("probability", "nowhere")),
-        f"{belief['entropy']:.2f}",
-        f"{belief['normaliser']:.3g}",
-    ]
+    shares = [f"{belief[name]:.3f}" for name in ("probability", "nowhere")]
+    return [*cells, *shares, f"{belief['entropy']:.2f}", f"{belief['normaliser']:.3g}"]

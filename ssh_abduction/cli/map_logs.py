@@ -27,12 +27,8 @@ def add_parser(verbs: Verbs) -> None:
         metavar="log",
     )
     parser.add("--together", "the logs are drives through one building: find their joint maps")
-    parser.add(
-        "-o --output FOLDER",
-        "folder to write; each of several logs gets a folder inside it",
-        type=output,
-        required=True,
-    )
+    said = "folder to write; each of several logs gets a folder inside it"
+    parser.add("-o --output FOLDER", said, type=output, required=True)
     add_max_maps(parser, "minimal maps", 300)
     parser.add(
         "--time-limit S",
@@ -41,11 +37,8 @@ def add_parser(verbs: Verbs) -> None:
         "after this time goes on for up to 64 times as long",
         type=float,
     )
-    parser.add_setting(
-        "ladder",
-        "whether to compute how much each kind of evidence helps (default: true)",
-        default=True,
-    )
+    said = "whether to compute how much each kind of evidence helps (default: true)"
+    parser.add_setting("ladder", said, default=True)
     parser.add_setting(
         "again", "whether to map also logs that are already mapped (default: false)", default=False
     )

@@ -110,17 +110,10 @@ def add_limits(parser: Parser, printed: str, seconds: float | None = None) -> No
     `seconds` is the default time limit; None for no limit.
     """
     default = "" if seconds is None else f" (default: {seconds:g}; inf for no limit)"
-    parser.add(
-        "--time-limit S",
-        f"stop after S seconds and print {printed}{default}",
-        type=float,
-        default=seconds,
-    )
-    parser.add(
-        "--memory-limit MIB",
-        f"stop when the process has used this many MiB, and print {printed}",
-        type=int,
-    )
+    said = f"stop after S seconds and print {printed}{default}"
+    parser.add("--time-limit S", said, type=float, default=seconds)
+    said = f"stop when the process has used this many MiB, and print {printed}"
+    parser.add("--memory-limit MIB", said, type=int)
 
 
 def add_max_maps(parser: Parser, listed: str, default: int = 100) -> None:
@@ -139,11 +132,8 @@ def add_jobs(parser: Parser, act: str, things: str, said: str | None = None) -> 
         to=many,
         type=int,
     )
-    parser.add(
-        "--scheduler ADDRESS",
-        f"{act} on the workers of the Dask scheduler at this address, tcp://host:port",
-        to=many,
-    )
+    said = f"{act} on the workers of the Dask scheduler at this address, tcp://host:port"
+    parser.add("--scheduler ADDRESS", said, to=many)
 
 
 def add_output(parser: Parser) -> None:

@@ -25,11 +25,8 @@ def add_parser(verbs: Verbs) -> None:
         "Reproduce an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn. "
         "Writes figures, data and a page into a folder.",
     )
-    parser.add(
-        "experiment",
-        "which experiment of the paper to repeat",
-        choices=("notched-rectangle", "taylor-hall"),
-    )
+    said = "which experiment of the paper to repeat"
+    parser.add("experiment", said, choices=("notched-rectangle", "taylor-hall"))
     parser.add("--seeds", "random seeds, such as 0-19 or 1,5,7 (default: 0-19)", default="0-19")
     parser.add("--json", "print each claim, with the paper's value and ours for each seed, as JSON")
     parser.add(

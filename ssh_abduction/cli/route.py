@@ -34,12 +34,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "--to B", "goal: a dstate, place or region, named as for --from", dest="goal", required=True
     )
-    parser.add(
-        "--avoid X",
-        "dstates, places and regions that the route must not visit",
-        nargs="+",
-        action="extend",
-    )
+    said = "dstates, places and regions that the route must not visit"
+    parser.add("--avoid X", said, nargs="+", action="extend")
     parser.add(
         "--by",
         "what to minimise (default: actions). With actions or metres, a route uses only moves "

@@ -147,12 +147,8 @@ def is_done(folder: Path, logs: Sequence[str], settings: dict[str, Any]) -> bool
     """Whether a folder holds a finished run of these logs with the same `MapQuestion.settings`."""
     run = _run_in(folder)
     content = run.get("digest")
-    return bool(
-        run.get("settings") == json.loads(json.dumps(settings))
-        and not run.get("interrupted")
-        and content is not None
-        and content == _content(logs)
-    )
+    is_same = run.get("settings") == json.loads(json.dumps(settings)) and content is not None
+    return is_same and not run.get("interrupted") and bool(content == _content(logs))
 
 
 def digest(logs: Sequence[str]) -> str | None:

@@ -83,13 +83,8 @@ def add_parser(verbs: Verbs) -> None:
         "find the minimal maps of a trace, or of many",
         "Find the minimal maps of a trace. With several traces, the result of each is one line.",
     )
-    parser.add(
-        "traces",
-        "trace file (JSON Lines), or - for standard input",
-        nargs="+",
-        metavar="trace",
-        type=trace_path,
-    )
+    said = "trace file (JSON Lines), or - for standard input"
+    parser.add("traces", said, nargs="+", metavar="trace", type=trace_path)
     add_max_maps(parser, "maps")
     parser.add("--json", "print the solution as JSON; for many traces, one line each")
     parser.add("--together", "the traces are drives through one building: find their joint maps")

@@ -35,9 +35,8 @@ def add_parser(verbs: Verbs) -> None:
         "Train a nearest-neighbour recogniser on the images of a trace. The label of an image is "
         "its dstate in a map.",
     )
-    train.add(
-        "-o --output FILE.skops", "file for the trained recogniser", type=output, required=True
-    )
+    said = "file for the trained recogniser"
+    train.add("-o --output FILE.skops", said, type=output, required=True)
     curve = verbs.add(
         "learning-curve",
         run_learning_curve,
@@ -45,9 +44,8 @@ def add_parser(verbs: Verbs) -> None:
         "Compute the share of images that are recognised, for growing numbers of training images, "
         "by cross-validation. The label of an image is its dstate in a map.",
     )
-    curve.add_setting(
-        "folds N", "number of folds of the cross-validation (default: 10)", 10, type=int
-    )
+    said = "number of folds of the cross-validation (default: 10)"
+    curve.add_setting("folds N", said, 10, type=int)
     curve.add("--seed", "random seed of the folds (default: 0)", type=seed, default=0)
     curve.add("--plot PNG", "draw the learning curve into this file", type=picture_file)
     curve.add("--json", "print JSON")
@@ -58,9 +56,8 @@ def add_parser(verbs: Verbs) -> None:
         "Find the laser beams that distinguish two dstates that look alike, by default for each "
         "pair of dstates with the same view.",
     )
-    apart.add(
-        "--dstates I,J", "two dstates of the map (default: each pair that shares a view)", type=pair
-    )
+    said = "two dstates of the map (default: each pair that shares a view)"
+    apart.add("--dstates I,J", said, type=pair)
     apart.add("--plot PNG", "draw the beams over the scans, into this file", type=picture_file)
     apart.add("--json", "print how much each beam helps, by each method, as JSON")
     for parser in (train, curve, apart):
@@ -201,11 +198,10 @@ def run_tell_apart(options: argparse.Namespace) -> int:
         )
     found = {p: telling_features(images, labels, *p) for p in pairs}
     if options.json:
-        records = [
-            {"dstates": p, "recognised": f.recognised}
-            | {method: shares.tolist() for method, shares in f.methods.items()}
-            for p, f in found.items()
-        ]
+        records = []
+        for p, f in found.items():
+            methods = {method: shares.tolist() for method, shares in f.methods.items()}
+            records.append({"dstates": p, "recognised": f.recognised, **methods})
         print(json.dumps(records))
     else:
         rows = [

@@ -70,12 +70,8 @@ def add_parser(verbs: Verbs) -> None:
         "serve the page, on this computer only, so that it can explain why two steps are one "
         "dstate or not, and solve again with assumptions; needs the trace. Ctrl-C ends the server",
     )
-    parser.add(
-        "--time-limit S",
-        "with --serve, seconds for each answer (default: 30)",
-        type=float,
-        default=30.0,
-    )
+    said = "with --serve, seconds for each answer (default: 30)"
+    parser.add("--time-limit S", said, type=float, default=30.0)
     parser.add_setting("port N", "with --serve, the port (default: any free port)", 0, type=int)
     parser.add_setting("open", "whether to open the page in the browser (default: true)", True)
 

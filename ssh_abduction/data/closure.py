@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ssh_abduction.data.checks import a_whole_number, an_instance
+from ssh_abduction.data.checks import a_list, a_whole_number, an_instance
 from ssh_abduction.data.errors import TraceError, brief, named, said_of
 from ssh_abduction.data.odometry import (
     Covariance,
@@ -104,10 +104,9 @@ def parse_closures(value: Any) -> tuple[Closure, ...]:
     """
     if value is None:
         return ()
-    if not isinstance(value, Sequence) or isinstance(value, str | bytes):
-        raise TraceError(f"closures: expected a list, got {brief(value)}; leave it out for none")
     found = []
-    for i, entry in enumerate(value):
+    listed = a_list("closures", value, TraceError, mend="leave it out for none")
+    for i, entry in enumerate(listed):
         with said_of(f"closures[{i}]"):
             found.append(Closure.of(entry))
     return tuple(found)

@@ -295,13 +295,8 @@ class Argument:
             dict.fromkeys(self._words.reason(axiom, t, said, self._pair) for axiom, t in needed)
         )
         links = clashes_of((axiom, self._piece.steps[t]) for axiom, t in needed)
-        return Inference(
-            says,
-            because or ("by the supposition" if line.supposed else "by the trace alone",),
-            links,
-            premises,
-            line.supposed,
-        )
+        because = because or ("by the supposition" if line.supposed else "by the trace alone",)
+        return Inference(says, because, links, premises, line.supposed)
 
     def _summary(
         self,

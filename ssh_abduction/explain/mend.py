@@ -59,22 +59,16 @@ def explain_trace(
 
 @dataclass(frozen=True, slots=True)
 class Mend:
-    """An observation whose change gives a trace a map.
+    """An observation whose change gives a trace a map."""
 
-    Attributes:
-        step: The step of the observation; the later step of an asserted pair.
-        kind: "view", "star", "action" or "displacement"; "same", "different", "elsewhere" or
-            "same_place" for an asserted pair.
-        seen: The value in the trace, in words.
-        instead: A value, in words, with which there is a map; None if the observation is dropped.
-        proven: Whether the whole changed trace is known to have a map, not only the stretch that
-            had none.
-    """
-
-    step: int
+    step: int  # the step of the observation; the later step of an asserted pair
+    # "view", "star", "action" or "displacement"; "same", "different", "elsewhere" or "same_place"
+    # for an asserted pair.
     kind: str
-    seen: str
+    seen: str  # the value in the trace, in words
+    # A value, in words, with which there is a map; None if the observation is dropped.
     instead: str | None
+    # Whether the whole changed trace is known to have a map, not only the stretch that had none.
     proven: bool
 
     def __str__(self) -> str:
@@ -172,9 +166,11 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
             for instead, trace, theory in changes:
                 if self._over():
                     return
-                # the stretch is checked first, as it is much faster than the whole trace
-                if not self._suits(trace, theory):
+                try:
+                    settle(trace, theory)
+                except AbductionError:  # the changed trace lacks what the theory needs
                     continue
+                # the stretch is checked first, as it is much faster than the whole trace
                 piece = Piece.of(self.problem.changed(trace, theory), stretch)
                 if not Axioms(piece, self._over).consistent():
                     continue
@@ -183,14 +179,6 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
                     self._mends.append(Mend(step, kind, seen, instead, proven=bool(found)))
                     break
         self._complete = True
-
-    def _suits(self, trace: Trace, theory: Theory) -> bool:
-        """Tell whether a changed trace still has everything that the theory needs."""
-        try:
-            settle(trace, theory)
-        except AbductionError:
-            return False
-        return True
 
     def _has_map(self, trace: Trace, theory: Theory) -> bool | None:
         """Tell whether a whole trace has a map; None if there is no answer in time."""

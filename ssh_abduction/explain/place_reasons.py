@@ -174,15 +174,8 @@ class PlaceQuestion(LimitedQuestion[PlaceExplanation]):
     def known(self, why: Stop | None = None) -> PlaceExplanation:
         """Return what is known so far. Raises MapError if the map has no such place or path."""
         sides, regions = self._sides_and_regions() if self._maps else ((), ())
-        return PlaceExplanation(
-            self._place,
-            sides,
-            regions,
-            self._changes,
-            len(self._maps),
-            self._possible,
-            why or self.stopped,
-        )
+        found = self._place, sides, regions, self._changes, len(self._maps), self._possible
+        return PlaceExplanation(*found, stopped=why or self.stopped)
 
     def _sides_and_regions(self) -> tuple[tuple[PathSide, ...], tuple[str, ...]]:
         """Find the sides and the regions of the place. Raises MapError, as `known`."""

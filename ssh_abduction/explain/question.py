@@ -43,12 +43,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
     """A question about a trace under limits of time and memory.
 
     `answer` may be called once. `known` may be called from any thread while `answer` runs.
-
-    Args:
-        theory: The theory; Theory.topological() if None.
-        time_limit: Seconds; None for no limit.
-        memory_limit: MiB; None for no limit.
-        known: Maps of the trace that are known. Each search begins with them.
+    Parameters as in `explain_pair`.
     """
 
     def __init__(

@@ -36,19 +36,13 @@ class Side:
     """What is known about one side of a pair of steps.
 
     A side is all maps in which the steps are one dstate, or all maps in which they differ.
-
-    Attributes:
-        possible: Whether this side has a map; None if unknown.
-        cost: The cost of the best known map of this side; None if no map is known.
-        proven: Whether it is proven that no map of this side costs less.
-        maps: The number of listed minimal maps that are on this side.
-        nats: The cost of the best known map in nats, if maps are weighed; else None.
     """
 
-    possible: bool | None = None
-    cost: Cost | None = None
-    proven: bool = False
-    maps: int = 0
+    possible: bool | None = None  # whether this side has a map; None if unknown
+    cost: Cost | None = None  # the cost of the best known map of this side; None if no map is known
+    proven: bool = False  # whether it is proven that no map of this side costs less
+    maps: int = 0  # the number of listed minimal maps that are on this side
+    # The cost of the best known map in nats, if maps are weighed; else None.
     nats: float | None = None
 
     def dearness(self, theory: Theory) -> tuple[float, ...] | None:

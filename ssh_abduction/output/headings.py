@@ -79,11 +79,6 @@ def turns_between(
             yield Turn(s, x, 0.0, SURE)
 
 
-def in_quarters(turns: Sequence[Turn]) -> bool:
-    """Whether all turns are multiples of 90 degrees."""
-    return all(abs(math.remainder(turn.angle, math.pi / 2)) < EXACT for turn in turns)
-
-
 def headings_by(
     turns: Sequence[Turn], courses: Mapping[int, tuple[Course, float]], robust: bool
 ) -> tuple[dict[int, float], int]:
@@ -106,8 +101,8 @@ def headings_by(
         first, ahead = next((course, off) for course, off in courses.values() if course in part)
         found = _synchronised(graph.subgraph(part), first, robust)
         angles |= {course: angle - ahead for course, angle in found.items()}
-    if robust and in_quarters(turns):
-        quarter = math.pi / 2
+    quarter = math.pi / 2
+    if robust and all(abs(math.remainder(turn.angle, quarter)) < EXACT for turn in turns):
         angles = {course: round(angle / quarter) * quarter for course, angle in angles.items()}
     headings = {
         s: math.remainder(angles[course] + off, math.tau) for s, (course, off) in courses.items()

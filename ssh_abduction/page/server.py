@@ -116,7 +116,10 @@ class PageServer(ThreadingHTTPServer):
             if pair is not None:
                 asked = self._trace, *pair, theory, known, self._limit
                 why = in_process(answers.pair_explained, *asked, watch=watch)
-                text = "\n".join([*self._in_map(pair, theory), str(why)])
+                # The maps of the page tell more, unless the user assumes more.
+                as_mapped = theory == (self._theory or Theory.topological())
+                said = PairInMap.of(self._listing, *pair) if as_mapped else None
+                text = "\n".join(map(str, filter(None, (said, why))))
                 return {"text": text, "assuming": why.assuming}
             search = self._trace, theory, known, self._maps, self._limit
             found = in_process(answers.solved_with, *search, watch=watch)
@@ -124,13 +127,6 @@ class PageServer(ThreadingHTTPServer):
             return {"text": found.headline}
         content = content_of(found, self._trace, self._run, self._called)
         return {"text": found.headline, "content": content}
-
-    def _in_map(self, pair: tuple[int, int], theory: Theory) -> Iterator[str]:
-        """Yield what the maps of the page say about two steps, unless the user assumes more."""
-        if theory == (self._theory or Theory.topological()) and (
-            said := PairInMap.of(self._listing, *pair)
-        ):
-            yield str(said)
 
     @contextmanager
     def _turn(self, watch: Watch) -> Iterator[None]:

@@ -62,17 +62,13 @@ class Option:
 
 @dataclass(frozen=True, slots=True)
 class Choice(PlainData):
-    """Questions that depend on each other, but on no question of another choice.
+    """Questions that depend on each other, but on no question of another choice."""
 
-    Attributes:
-        questions: Some of the questions in `Comparison.deciding`.
-        options: The ways in which maps answer these questions, the way of map 1 first.
-        differing: For each sort (faults, dstates, places, paths, courses), the steps whose grouping
-            depends on this choice and on no other. A course is a path with a direction.
-    """
-
-    questions: tuple[Question, ...]
+    questions: tuple[Question, ...]  # some of the questions in `Comparison.deciding`
+    # The ways in which maps answer these questions, the way of map 1 first.
     options: tuple[Option, ...]
+    # For each sort (faults, dstates, places, paths, courses), the steps whose grouping depends on
+    # this choice and on no other. A course is a path with a direction.
     differing: dict[Matter, tuple[int, ...]] = field(hash=False)
 
 

@@ -51,21 +51,16 @@ class Branch:
 
 @dataclass(frozen=True, slots=True)
 class ExperimentPlan:
-    """An experiment as a tree: actions, and a further plan for each observation after them.
+    """An experiment as a tree: actions, and a further plan for each observation after them."""
 
-    Attributes:
-        rivals: The rivals that are left, numbered from 1.
-        actions: Actions along links that all these rivals have. Empty if no such links distinguish
-            the rivals.
-        branches: For each predicted observation after the last action, the plan for the rivals that
-            are then left.
-        untried: The most informative untried action. Only at the ends of the tree, where one rival
-            is left or known links do not distinguish the rivals. None if there is no such action.
-    """
-
-    rivals: tuple[int, ...]
+    rivals: tuple[int, ...]  # the rivals that are left, numbered from 1
+    # Actions along links that all these rivals have. Empty if no such links distinguish the rivals.
     actions: tuple[str, ...] = ()
+    # For each predicted observation after the last action, the plan for the rivals that are then
+    # left.
     branches: tuple[Branch, ...] = ()
+    # The most informative untried action. Only at the ends of the tree, where one rival is left or
+    # known links do not distinguish the rivals. None if there is no such action.
     untried: Untried | None = None
 
     @property

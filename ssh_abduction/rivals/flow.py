@@ -126,14 +126,9 @@ def _program(
         np.array([number[n] for n in ends])
         for ends in ([x.source for x in moves], [x.target for x in moves])
     )
-    kinds = [np.arange(m), np.arange(m), m + np.arange(size)]
-    balance = coo_array(
-        (
-            np.r_[np.ones(m), -np.ones(m), -np.ones(size)],
-            (np.r_[targets, sources, np.arange(size)], np.concatenate(kinds)),
-        ),
-        (size, m + size),
-    ).tocsr()
+    signs = np.r_[np.ones(m), -np.ones(m), -np.ones(size)]
+    at = np.r_[targets, sources, :size], np.r_[:m, :m, m : m + size]
+    balance = coo_array((signs, at), (size, m + size)).tocsr()
     enters = coo_array((np.ones(m), (targets, np.arange(m))), (size, m + size)).tocsr()
     begins = -1.0 * (np.arange(size) == number[start])
     rows = sorted(number[n] for n in unseen - {start})

@@ -32,27 +32,20 @@ class Question:
 
     It asks whether two steps are one dstate, at one place, along one path, or along one path in one
     direction; or whether a map has a fault (treats a step as wrong).
-
-    Attributes:
-        sort: The subject: "faults", "dstates", "places", "paths" or "courses".
-        first: The earlier of the two steps. If `first` and `later` are equal, the question asks
-            whether the step is at a place, or along a path, at all. For a fault, both are its step.
-        later: The later of the two steps.
-        yes: The number of maps that answer yes.
-        here: The steps that all maps group with `first`, by this sort.
-        there: The steps that all maps group with `later`, by this sort.
-        places: The places of the steps in `here`, and of the steps in `there`. Only for questions
-            about paths or courses, if all maps have the same places; otherwise None.
-        fault: The fault of the maps that answer yes; None if the question is not about faults.
     """
 
-    sort: Matter
+    sort: Matter  # the subject: "faults", "dstates", "places", "paths" or "courses"
+    # The earlier of the two steps. If `first` and `later` are equal, the question asks whether the
+    # step is at a place, or along a path, at all. For a fault, both are its step.
     first: int
-    later: int
-    yes: int
-    here: tuple[int, ...]
-    there: tuple[int, ...]
+    later: int  # the later of the two steps
+    yes: int  # the number of maps that answer yes
+    here: tuple[int, ...]  # the steps that all maps group with `first`, by this sort
+    there: tuple[int, ...]  # the steps that all maps group with `later`, by this sort
+    # The places of the steps in `here`, and of the steps in `there`. Only for questions about paths
+    # or courses, if all maps have the same places; otherwise None.
     places: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+    # The fault of the maps that answer yes; None if the question is not about faults.
     fault: Fault | None = None
 
     def __str__(self) -> str:

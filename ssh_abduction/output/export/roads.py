@@ -130,7 +130,8 @@ class Roads:
             stops, ends = _dstates(ssh_map, drawn), _links(ssh_map)
         at = {stop.id: (stop.x, stop.y) for stop in stops}
         floor = {stop.id: stop.floor for stop in stops}
-        place = {s.id: s.place for s in ssh_map.dstates} if level == "dstates" else {}
+        dstates = ssh_map.dstates if level == "dstates" else ()
+        place = {s.id: s.place for s in dstates if s.place is not None}
         roads = tuple(
             Road(
                 a,
@@ -138,7 +139,8 @@ class Roads:
                 # Floors are drawn apart, so the distance along a lift means nothing.
                 length := math.dist(at[a], at[b]) if floor[a] == floor[b] else LEAST,
                 *what,
-                turns=floor[a] == floor[b] and _is_turn(place.get(a), place.get(b), length),
+                turns=floor[a] == floor[b]
+                and (length < LEAST if {a, b} - place.keys() else place[a] == place[b]),
                 name=ssh_map.name_of("path", what[1]),
             )
             for (a, b), what in sorted(ends.items())
@@ -189,11 +191,6 @@ def _joined(before: Road, after: Road) -> Road:
         before.direction if before.direction == after.direction and path is not None else None,
         name=name,
     )
-
-
-def _is_turn(here: int | None, there: int | None, length: float) -> bool:
-    """Whether a road is a turn on the spot."""
-    return length < LEAST if here is None or there is None else here == there
 
 
 def _dstates(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
