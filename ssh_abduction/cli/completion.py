@@ -37,9 +37,10 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.cli import parser
 
     top = parser()
-    for action in (action for one in (top, *top.verbs.values()) for action in one._actions):
-        if kind := _file_kind(action):
-            action.complete = shtab.FILE if kind == "file" else shtab.DIRECTORY  # type: ignore[attr-defined]
+    for one in (top, *top.verbs.values()):
+        for action in one._actions:  # argparse has no public name for these
+            if kind := _file_kind(action):
+                action.complete = shtab.FILE if kind == "file" else shtab.DIRECTORY  # type: ignore[attr-defined]
     print(shtab.complete(top, options.shell))
     return 0
 

@@ -186,8 +186,8 @@ def _row(number: int, one: MapEvaluation) -> list[object]:
     counts = []
     for kind in THINGS:
         count, is_right = getattr(one, kind), getattr(one, f"{kind}_right")
-        counts.append(f"{count} {_word(is_right, 'right', 'wrong')}")
-        counts[-1] = UNKNOWN if count is None else counts[-1]
+        said = f"{count} {_word(is_right, 'right', 'wrong')}"
+        counts.append(UNKNOWN if count is None else said)
     shares = [
         " ".join(_share(getattr(one, f"{kind}_{what}")) for what in ("precision", "recall"))
         for kind in ("place", "edge", "link")
