@@ -298,3 +298,11 @@ def test_drives_by_different_lifts_give_no_false_warning(kind: str, warned: int)
         warnings.simplefilter("always")
         together(drives)
     assert len(caught) == warned
+
+
+def test_map_at_the_time_limit_has_the_end_of_a_lift_on_a_path() -> None:
+    stars = [(1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0)]
+    trace = Trace.from_steps("abc", ["travel", UP], stars=stars)
+    theory = Theory(all_on_paths=True)
+    (ssh_map,) = solve(trace, theory, time_limit=1e-9).maps
+    assert check(trace, ssh_map, theory) == ()

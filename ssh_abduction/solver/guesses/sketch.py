@@ -194,10 +194,14 @@ class Sketch:
         if self._theory.level == "causal":
             return self._new(step, 0, 0)
         if action.leaves_paths:
-            return self._new_place(step)
-        if action.kind == "travel":
-            return self._travel(here, step)
-        return self._turn(here, action, step)
+            there = self._new_place(step)
+        elif action.kind == "travel":
+            there = self._travel(here, step)
+        else:
+            there = self._turn(here, action, step)
+        if self._theory.all_on_paths:
+            self._find_course(there)
+        return there
 
     def _turn(self, here: int, action: Action, step: Step) -> int:
         """Decide where a turn without a link leads, and return the dstate there."""
@@ -211,8 +215,6 @@ class Sketch:
             self._turned_around(here, there)
         elif s.path is not None and self._states[there].path is not None:
             self._doubt_if_grown_from_map()
-        if self._theory.all_on_paths:
-            self._find_course(there)
         return there
 
     def _turned_to(self, here: int, heading: int, action: Action, step: Step) -> int | None:
