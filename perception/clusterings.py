@@ -50,16 +50,12 @@ class Tried:
 
 @dataclass(frozen=True)
 class Predictor:
-    """Gives views to new images.
+    """Gives views to new images."""
 
-    Attributes:
-        model: The fitted clusterer, or a classifier if the clusterer cannot predict.
-        inside: (m, d) the fitted images that are not isolated; empty if the settings isolate none.
-        reach: An image is isolated if its third nearest neighbour is farther than this.
-    """
-
-    model: Any
+    model: Any  # the fitted clusterer, or a classifier if the clusterer cannot predict
+    # (m, d) the fitted images that are not isolated; empty if the settings isolate none.
     inside: NDArray[np.float64]
+    # An image is isolated if its third nearest neighbour is farther than this.
     reach: float = math.inf
 
     def views(self, images: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -90,11 +90,9 @@ def _length(log: RobotLog) -> tuple[float, list[str]]:
         return 1.0, []
     count = UNITS[found]
     return count, [
-        (
-            "The odometry does not count metres: its usual step between two scans would be "
-            f"{usual:.0f} m. It is read as {found}, which agrees with scan matching: "
-            f"{usual / count:.2f} m per step."
-        )
+        "The odometry does not count metres: its usual step between two scans would be "
+        f"{usual:.0f} m. It is read as {found}, which agrees with scan matching: "
+        f"{usual / count:.2f} m per step."
     ]
 
 

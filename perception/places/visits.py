@@ -15,30 +15,45 @@ MERGED = math.radians(45)
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """A way out of a place."""
+    """A way out of a place.
 
-    bearing: float  # direction in radians, counterclockwise in the frame of the track
-    # Whether the way certainly is a gateway. Few local maps show an uncertain one.
+    Attributes:
+        bearing: Direction in radians, counterclockwise in the frame of the track.
+        sure: Whether the way certainly is a gateway. Few local maps show an uncertain one.
+    """
+
+    bearing: float
     sure: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Visit:
-    """A stay at a distinctive place."""
+    """A stay at a distinctive place.
 
-    scan: int  # index of the scan nearest to the middle
-    middle: Array  # (x, y) middle of the place in metres, in the frame of the track
-    begin: int  # index of the first scan of the stay
-    end: int  # index of the last scan of the stay
-    radius: float = 0.5  # radius of the disc of the place in metres
-    ways: tuple[Way, ...] = ()  # ways out, counterclockwise
-    # Index in `ways` of the way by which the robot came; None at the beginning of the log.
+    Attributes:
+        scan: Index of the scan nearest to the middle.
+        middle: (x, y) middle of the place in metres, in the frame of the track.
+        begin: Index of the first scan of the stay.
+        end: Index of the last scan of the stay.
+        radius: Radius of the disc of the place in metres.
+        ways: Ways out, counterclockwise.
+        arrived: Index in `ways` of the way by which the robot came; None at the beginning of the
+            log.
+        left: Index in `ways` of the way by which the robot left; None at the end of the log.
+        support: Share of the local maps nearby that show the place, from 0 to 1.
+        patch: Local map around the middle, or around that of a visit near it; None while the visit
+            is not final.
+    """
+
+    scan: int
+    middle: Array
+    begin: int
+    end: int
+    radius: float = 0.5
+    ways: tuple[Way, ...] = ()
     arrived: int | None = None
-    # Index in `ways` of the way by which the robot left; None at the end of the log.
     left: int | None = None
-    support: float = 1.0  # share of the local maps nearby that show the place, from 0 to 1
-    # Local map around the middle, or around that of a visit near it; None while the visit is not
-    # final.
+    support: float = 1.0
     patch: PackedPatch | None = None
 
     def later(self, scans: int) -> Visit:

@@ -60,14 +60,7 @@ class Connection:
 class Salvage:
     """The intact messages of a bag file, with the interface of the readers of rosbags.
 
-    Args:
-        path: Path of the file.
-        format: `ros1`, `ros2` (SQLite) or `mcap`.
-
-    Attributes:
-        connections: The connections with intact messages.
-        count: Number of intact messages.
-        seconds: Time from the first to the last intact message, in seconds.
+    The format is `ros1`, `ros2` (SQLite) or `mcap`.
     """
 
     def __init__(self, path: Path, format: str) -> None:
@@ -79,12 +72,12 @@ class Salvage:
             found.setdefault(message.connection, (message.topic, message.msgtype, message.sender))
             counts[message.connection] += 1
             first, last = message.time if first is None else first, message.time
-        self.connections = [
+        self.connections = [  # those with intact messages
             Connection(number, topic, kind, counts[number], _Sender(sender))
             for number, (topic, kind, sender) in found.items()
         ]
-        self.count = counts.total()
-        self.seconds = (last - (first or 0)) / NANO
+        self.count = counts.total()  # number of intact messages
+        self.seconds = (last - (first or 0)) / NANO  # from the first to the last intact message
 
     def messages(
         self, connections: Collection[Connection]

@@ -3,8 +3,6 @@
 A view is a cluster of images that look alike. A dstate (distinctive state) is a place and the
 direction that the robot faces there. The map labels each image with its dstate.
 
-Reference: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", Figure 1.
-
 >>> from simulator.tours import simulate
 >>> from simulator.world import World
 >>> learner = BootstrapLearner().fit(simulate(World.named("notched-rectangle"), tours=3, seed=1))

@@ -37,34 +37,26 @@ class BeliefVerdict(Enum):
     """A belief summed up in one word.
 
     If several words apply, NOWHERE is preferred to LOCATED, and LOCATED to LOST.
-
-    Attributes:
-        LOCATED: One dstate has at least a probability of 0.9.
-        UNSURE: No dstate is that probable, as when localisation begins.
-        LOST: An observation was very improbable by an earlier belief, and the robot has not been
-            found again since.
-        NOWHERE: The robot is at no dstate of the map, with a probability above 0.5.
     """
 
-    LOCATED = "located"
-    UNSURE = "unsure"
+    LOCATED = "located"  # one dstate has at least a probability of 0.9
+    UNSURE = "unsure"  # no dstate is that probable, as when localisation begins
+    # An observation was very improbable by an earlier belief, and the robot has not been found
+    # again since.
     LOST = "lost"
-    NOWHERE = "nowhere"
+    NOWHERE = "nowhere"  # the robot is at no dstate of the map, with a probability above 0.5
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observation:
-    """How well an observation o fits each of N dstates x. `localiser.py` defines f and q.
+    """How well an observation o fits each of N dstates x. `localiser.py` defines f and q."""
 
-    Attributes:
-        where: The ids of k dstates, of shape (k,), or a slice of all dstates.
-        ratio: f(o|x) / q(o) for each of these dstates, of shape (k,). For all others it is 0.
-        novel: Probability, given o, that an unknown place looks like no dstate of the map. A
-            priori, the N + 1 cases are equally likely: it looks like one of the dstates, or none.
-    """
-
+    # The ids of k dstates, of shape (k,), or a slice of all dstates.
     where: NDArray[np.intp] | slice
+    # f(o|x) / q(o) for each of these dstates, of shape (k,). For all others it is 0.
     ratio: NDArray[np.float64]
+    # Probability, given o, that an unknown place looks like no dstate of the map. A priori, the N +
+    # 1 cases are equally likely: it looks like one of the dstates, or none.
     novel: float
 
     def __and__(self, other: Observation) -> Observation:

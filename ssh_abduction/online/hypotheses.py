@@ -203,13 +203,8 @@ def shares_of_rivals(
 ) -> list[float]:
     """Compute the probability of each rival, given that one of them is true.
 
-    The formula is in the docstring of this module.
-
-    Args:
-        theory: A theory with faults.
-        chance: The probability of the cheapest kind of fault, at each step.
-        dstates: The number N of dstates. It counts as at least 2.
-        views: The number V of views. It counts as at least 2.
+    The formula is in the docstring of this module. `chance` is the probability of the cheapest kind
+    of fault, at each step. The numbers of dstates, N, and of views, V, count as at least 2.
     """
     cheapest = min(round(10 * price) for price in (theory.misread, theory.slipped) if price)
     per_dstate, per_view = math.log(max(dstates, 2)), math.log(max(views, 2))

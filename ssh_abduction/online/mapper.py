@@ -266,14 +266,9 @@ class TheorySettler:
     The first step decides how to use stars (the openings seen at a step). All steps so far decide
     whether displacements are used, and how many returns of the robot are counted.
 
-    Args:
-        theory: The theory as the user gave it.
-        first: A trace with only the first step.
-
-    Raises:
-        TheoryError: The theory needs stars, but the first step has none; or it compares maps by
-            their cost in nats.
-        TraceError: The first step lacks something else that the theory needs.
+    `theory` is as the user gave it, and `first` a trace with only the first step. Raises
+    TheoryError if the theory needs stars, but the first step has none, or if it compares maps by
+    their cost in nats. Raises TraceError if the first step lacks something else.
     """
 
     def __init__(self, theory: Theory, first: Trace) -> None:

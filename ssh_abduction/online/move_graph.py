@@ -36,18 +36,9 @@ class MoveGraph:
     links; for routes by places also moves that paths imply or, in a map without paths such as that
     of a log, the way back of each travel.
 
-    Args:
-        by: What the shortest route minimises: "actions", "places" or "metres".
-        drives: The drives of the map's trace, to find steps such as "monday:12".
-
-    Raises:
-        MapError: The map has no poses for "metres", or no places for "places".
-
-    Attributes:
-        map: The map.
-        by: What the shortest route minimises.
-        closed: The gateways that were closed when a drive last saw them: the place and the slot or
-            bearing of each. No edge passes them.
+    `by` says what the shortest route minimises: "actions", "places" or "metres". The drives of the
+    map's trace serve to find steps such as "monday:12". Raises MapError if the map has no poses for
+    "metres", or no places for "places".
     """
 
     def __init__(self, ssh_map: SSHMap, by: str, drives: Sequence[Drive] = ()) -> None:
@@ -55,9 +46,8 @@ class MoveGraph:
         self._poses = drawable_poses(ssh_map)
         if by == "metres" and self._poses is None:
             raise MapError(
-                "by: expected actions or places, got metres: the map has no poses; "
-                "solve a trace with displacements, and without a short time limit, or take --by "
-                "actions"
+                "by: expected actions or places, got metres: the map has no poses; solve a trace "
+                "with displacements, and without a short time limit, or take --by actions"
             )
         if by == "places" and not ssh_map.places:
             raise MapError(
@@ -73,6 +63,8 @@ class MoveGraph:
             self._add_implied()
         elif by == "places":
             self._add_returns()
+        # Place, and slot or bearing, of each gateway that was closed when a drive last saw it. No
+        # edge passes them.
         self.closed = _closed_gateways(ssh_map)
         shut = [edge for edge in self._graph.edges if self._passes_closed(*edge)]
         self._graph.remove_edges_from(shut)

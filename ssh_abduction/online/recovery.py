@@ -44,15 +44,7 @@ import time
 from ssh_abduction.online.keeper import StepOptions
 from ssh_abduction.online.rival_maps import RivalMaps
 from ssh_abduction.online.standing import Confidence, Standing
-from ssh_abduction.solver import (
-    Effort,
-    Judging,
-    Seconds,
-    Solution,
-    Status,
-    cost_as_counted,
-    solve,
-)
+from ssh_abduction.solver import Effort, Judging, Seconds, Solution, Status, cost_as_counted, solve
 from ssh_abduction.theory.settle import Problem
 
 # After each search with a time limit the trace has to grow by this factor, and by at least this
@@ -64,14 +56,8 @@ PAUSE = 2
 class Recovery:
     """Keeps the maps up to date for a theory that allows faults, and says how sure they are.
 
-    Args:
-        problem: The steps so far, and the theory: it allows faults, and no field is "auto".
-        options: The limits and speed-ups for each step.
-        before: The Recovery of fewer steps that this one replaces; None for the first.
-
-    Attributes:
-        searches: The number of searches by clingo so far.
-        standing: How sure the best map is; None before the first answer.
+    `problem` has the steps so far, and the theory, in which no field is "auto". `before` is the
+    Recovery of fewer steps that this one replaces; None for the first.
     """
 
     def __init__(
@@ -80,11 +66,11 @@ class Recovery:
         self._trace, self._theory, self._options = problem.trace, problem.theory, options
         self._judging = Judging(problem)
         self._maps = RivalMaps(problem, options.max_maps, self._judging)
-        self.searches: int = before.searches if before else 0
+        self.searches: int = before.searches if before else 0  # by clingo, so far
         self._next_search = 0  # no search before the trace has this many steps
         self._confidence: Confidence = before._confidence if before else Confidence(problem.theory)
         self._spent = 0.0  # seconds that all steps took
-        self.standing: Standing | None = None
+        self.standing: Standing | None = None  # before the first answer
 
     def restarted(self, problem: Problem) -> Recovery:
         """Make a Recovery for a theory that changed with the last step. It has no proofs yet."""

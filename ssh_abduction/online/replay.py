@@ -17,13 +17,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 class MinimalMaps:
-    """The minimal maps of the steps so far, with how much is proven about them.
-
-    Args:
-        trace: The steps so far.
-        theory: The theory, in which no field is "auto".
-        judging: Judges maps by the evidence and the checker, for this theory.
-    """
+    """The minimal maps of the steps so far, with how much is proven about them."""
 
     def __init__(self, trace: Trace, theory: Theory, judging: Judging) -> None:
         # The minimal maps. If `replays` is false, the maps that clingo found last, which may not be

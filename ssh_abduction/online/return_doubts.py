@@ -23,11 +23,8 @@ class ReturnDoubts:
     """Keeps track of the returns of minimal maps that are in doubt.
 
     A return is in doubt while some map without it has at most `margin` dstates more than the
-    minimal maps.
-
-    Args:
-        margin: Number of dstates; 0 doubts no return.
-        time_limit: Seconds for finding a map without one return; None waits for the exact answer.
+    minimal maps; 0 doubts no return. `time_limit` is in seconds, for finding a map without one
+    return; None waits for the exact answer.
     """
 
     def __init__(self, margin: int, time_limit: float | None) -> None:

@@ -28,40 +28,28 @@ LEAST_SHARE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class StepEffect:
-    """The effect of one more step on the rivals.
+    """The effect of one more step on the rivals."""
 
-    Attributes:
-        lost_proof: Whether the step undid a proof: the maps are not proven minimal any more, or
-            further minimal maps may exist.
-        broke: A sentence about what the best map expected instead; None if it predicted the step.
-    """
-
+    # Whether the maps are not proven minimal any more, or further minimal maps may exist.
     lost_proof: bool = False
+    # A sentence about what the best map expected instead; None if it predicted the step.
     broke: str | None = None
 
 
 class RivalMaps:
     """The rivals of the steps so far, with how much is proven about them.
 
-    Args:
-        problem: The steps so far, and the theory: it allows faults, and no field is "auto".
-        max_maps: Keep at most this many of the cheapest rivals; None keeps all.
-        judging: Judges maps by the evidence and the checker, for this theory.
-
-    Attributes:
-        rivals: The rivals. The cheapest come first, then the others by their probability.
-        solved: The last result of the solver; None before the first.
-        bound: The best lower bound of the cost so far.
-        is_proven: Whether the cheapest rivals are proven minimal.
-        is_complete: Whether the list of minimal maps is proven complete.
-        is_impossible: Whether it is proven that no map satisfies the axioms.
+    The theory of `problem` allows faults, and no field is "auto". At most `max_maps` of the
+    cheapest rivals are kept; None keeps all.
     """
 
     def __init__(self, problem: Problem, max_maps: int | None, judging: Judging) -> None:
         trace, theory = problem.trace, problem.theory
-        self.rivals: list[ExtendedMap] = []
-        self.solved: Solution | None = None
-        self.bound = Bound()
+        self.rivals: list[ExtendedMap] = []  # the cheapest first, then others by probability
+        self.solved: Solution | None = None  # the last result of the solver
+        self.bound = Bound()  # the best lower bound of the cost so far
+        # Whether it is proven that the cheapest rivals are minimal, that all minimal maps are
+        # listed, and that no map satisfies the axioms.
         self.is_proven = self.is_complete = self.is_impossible = False
         self._problem, self._max_maps, self._judging = problem, max_maps, judging
         self._views = {step.view for step in trace.steps}

@@ -325,9 +325,7 @@ def notched(depth: float) -> World:
 
 
 @cache
-def _driven(
-    notch: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
+def _driven(notch: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
     """Simulate all tours in the rectangle with this notch.
 
     Return three arrays with a row for each of n steps: the mean pose at its true dstate, of shape
