@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening, distance_transform_edt, label
 
-from perception.readers.scans import Pose, RobotLog
-from ssh_abduction.data.odometry import moved
+from perception.readers.scans import RobotLog
+from ssh_abduction.data.odometry import Pose, moved
 
 Array = NDArray[np.float64]
 CELL = 0.1  # side of a cell

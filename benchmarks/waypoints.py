@@ -33,8 +33,9 @@ from skimage.measure import find_contours
 from skimage.morphology import skeletonize
 
 from perception.readers.logs import read_log
-from perception.readers.scans import Pose, RobotLog
+from perception.readers.scans import RobotLog
 from ssh_abduction import SSHMap, Trace
+from ssh_abduction.data.odometry import Pose
 from ssh_abduction.robot_logs.edges import grouped
 
 # Metres between nodes along the skeleton, along walls, and in free space.

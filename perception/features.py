@@ -108,14 +108,9 @@ def telling_features(
 
 
 def strongest(shares: ArrayLike, most: float = 0.5) -> str:
-    """Name the fewest features whose shares sum to `most` of the total.
+    """Name the fewest features whose shares, (d,), sum to the part `most` of the total, 0 to 1.
 
-    Args:
-        shares: (d,) share of each feature.
-        most: Part of the sum of all shares, from 0 to 1.
-
-    Returns:
-        Indices of features, as ranges: "3–14, 80"; "–" if all shares are 0.
+    Their indices are written as ranges, such as "3–14, 80", or "–" if all shares are 0.
     """
     weights = np.asarray(shares)
     order = np.argsort(-weights, kind="stable")
@@ -135,10 +130,8 @@ def _neighbours(
     distances = cdist(images, images)
     np.fill_diagonal(distances, np.inf)
     same = second[:, None] == second
-    hits, misses = (
-        np.where(same, distances, np.inf).argmin(axis=1),
-        np.where(same, np.inf, distances).argmin(axis=1),
-    )
+    hits = np.where(same, distances, np.inf).argmin(axis=1)
+    misses = np.where(same, np.inf, distances).argmin(axis=1)
     return hits.astype(np.intp), misses.astype(np.intp)
 
 
@@ -162,12 +155,9 @@ def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
     """
     distances = cdist(images, model._fit_X, "sqeuclidean")
     same = second[:, None] == model.classes_[model._y]
-    return float(
-        (
-            np.where(same, np.inf, distances).min(axis=1)
-            - np.where(same, distances, np.inf).min(axis=1)
-        ).mean()
-    )
+    other = np.where(same, np.inf, distances).min(axis=1)
+    own = np.where(same, distances, np.inf).min(axis=1)
+    return float((other - own).mean())
 
 
 def _linear(images: Floats, second: NDArray[np.bool_]) -> Floats:

@@ -97,15 +97,10 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
                 refuse_huge(file, "images", "write fewer images to each file")
             file.seek(0)
             data = np.load(file, allow_pickle=False)
-            table = (
-                data
-                if isinstance(data, np.ndarray)
-                else data["images" if "images" in data else data.files[0]]
-            )
-            floats = np.issubdtype(table.dtype, np.integer) or np.issubdtype(
-                table.dtype, np.floating
-            )
-            shape = table.shape
+            table = data
+            if not isinstance(data, np.ndarray):
+                table = data["images" if "images" in data else data.files[0]]
+            floats, shape = table.dtype.kind in "iuf", table.shape
     except OSError as error:
         raise PerceptionError(
             f"{path}: expected a .npy or .npz file of images: {error.strerror or error}; "
@@ -125,7 +120,7 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
             f"{path}: expected a table of images x ranges, got {table.dtype} of shape "
             f"{shape}; store one image per row"
         )
-    return table.astype(float)
+    return np.asarray(table, float)
 
 
 def refuse_huge(file: BinaryIO | str | os.PathLike[str], what: object, mend: str) -> None:

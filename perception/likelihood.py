@@ -147,15 +147,10 @@ class ImageLikelihood:
                 f"of shape {table.shape}; give images of the same laser"
             )
         try:
-            features = np.asarray(
-                self.recogniser[:-1].transform(table)
-                if isinstance(self.recogniser, Pipeline)
-                else table,
-                np.float64,
-            )
-        except (
-            Exception
-        ) as error:  # Each part of a model that was damaged in its file fails in its own way.
+            if isinstance(self.recogniser, Pipeline):
+                table = self.recogniser[:-1].transform(table)
+            features = np.asarray(table, np.float64)
+        except Exception as error:  # Each part of a model that was damaged fails in its own way.
             raise PerceptionError(
                 f"recogniser: expected one that reads images, got {type(error).__name__}: "
                 f"{error}; train it again"

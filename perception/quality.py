@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -146,11 +147,7 @@ def trimmed_quality(
     widths = [
         np.quantile(distances[np.ix_(m, m)][np.triu_indices(len(m), 1)], 1 - trim) for m in wide
     ]
-    gaps = [
-        np.quantile(distances[np.ix_(m, other)], trim)
-        for i, m in enumerate(members)
-        for other in members[:i]
-    ]
+    gaps = [np.quantile(distances[np.ix_(m, n)], trim) for m, n in combinations(members, 2)]
     between, within = float(min(gaps)), float(max(widths, default=0.0))
     return 0.0 if between == 0 else between / within if within > 0 else math.inf
 

@@ -43,17 +43,13 @@ OURS = (
 
 @dataclass(frozen=True)
 class Stored:
-    """Content of a file that `save` wrote.
+    """Content of a file that `save` wrote."""
 
-    Attributes:
-        model: The fitted estimator or pipeline.
-        classes: Labels that the model predicts, sorted; empty if the model has no classes.
-        versions: Version of each program that saved the model, by name: python, numpy,
-            scikit-learn, skops, ssh-abduction.
-    """
-
-    model: Any
+    model: Any  # the fitted estimator or pipeline
+    # Labels that the model predicts, sorted; empty if the model has no classes.
     classes: tuple[Any, ...]
+    # Version of each program that saved the model, by name: python, numpy, scikit-learn, skops,
+    # ssh-abduction.
     versions: Mapping[str, str]
 
     def likelihood(self) -> ImageLikelihood | None:
@@ -88,8 +84,7 @@ class Stored:
         except Exception as error:  # Each part of a damaged model fails in its own way.
             raise PerceptionError(
                 f"recogniser: expected a recogniser that works, got {type(error).__name__}: "
-                f"{error}; "
-                "train it again"
+                f"{error}; train it again"
             ) from None
         if not sound:
             raise PerceptionError(
@@ -117,15 +112,8 @@ def written(model: Any, name: str = "recogniser") -> bytes:
     versions = {
         name: version(name) for name in ("numpy", "scikit-learn", "skops", "ssh-abduction")
     } | {"python": platform.python_version()}
-    data: bytes = skops.io.dumps(
-        {
-            "format": FORMAT,
-            "version": VERSION,
-            "model": model,
-            "classes": classes,
-            "versions": versions,
-        }
-    )
+    parts = {"format": FORMAT, "version": VERSION, "model": model, "classes": classes}
+    data: bytes = skops.io.dumps({**parts, "versions": versions})
     # Reject now what `load` would reject later.
     if foreign := _foreign(data=data):
         raise PerceptionError(

@@ -1,7 +1,5 @@
 """Clusters images into views and chooses the number of views.
 
-A view is a cluster of images that look alike.
-
 >>> import numpy as np
 >>> images = np.concatenate([np.random.default_rng(0).normal(c, 0.1, (20, 3)) for c in (0, 2, 5)])
 >>> ViewClusterer(random_state=0).fit(images).k_
@@ -104,15 +102,9 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         trim: float = 0.5,
         isolated: float | None = None,
     ) -> None:
-        self.k = k
-        self.k_min = k_min
-        self.k_max = k_max
-        self.clusterer = clusterer
-        self.n_init = n_init
-        self.random_state = random_state
-        self.by = by
-        self.trim = trim
-        self.isolated = isolated
+        self.k, self.k_min, self.k_max = k, k_min, k_max
+        self.clusterer, self.n_init, self.random_state = clusterer, n_init, random_state
+        self.by, self.trim, self.isolated = by, trim, isolated
 
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
         """Cluster images.
@@ -193,11 +185,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             M; larger is better. NaN for one view, or if all images are noise.
         """
         views, images = self.predict(X), np.asarray(X, float)
-        return (
-            cluster_quality(images[views != NOISE], views[views != NOISE])
-            if (views != NOISE).any()
-            else math.nan
-        )
+        seen = views != NOISE
+        return cluster_quality(images[seen], views[seen]) if seen.any() else math.nan
 
     @property
     def k_(self) -> int:
@@ -277,11 +266,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         settings = chosen.get_params()
         if k is not None:
             chosen.set_params(**{str(_count_parameter(chosen)): k})
-        if (
-            "random_state" in settings
-            and settings["random_state"] is None
-            and self.random_state is not None
-        ):
+        if settings.get("random_state", seed) is None and self.random_state is not None:
             chosen.set_params(random_state=seed)
         return chosen.fit(images)
 
@@ -295,14 +280,10 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 # The sample may have fewer different images than k while all images have enough.
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", ConvergenceWarning)
-                    start = (
-                        KMeans(k, n_init=self.n_init, max_iter=ROUNDS, random_state=seed)
-                        .fit(images[sample])
-                        .cluster_centers_
-                    )
-                return KMeans(k, init=start, n_init=1, max_iter=ROUNDS, random_state=seed).fit(
-                    images
-                )
+                    start = KMeans(k, n_init=self.n_init, max_iter=ROUNDS, random_state=seed)
+                    centres = start.fit(images[sample]).cluster_centers_
+                model = KMeans(k, init=centres, n_init=1, max_iter=ROUNDS, random_state=seed)
+                return model.fit(images)
             return KMeans(k, n_init=self.n_init, random_state=seed).fit(images)
 
     def _check(self) -> None:

@@ -51,9 +51,8 @@ class Opening:
         Along counts from the middle, and across to the left of the direction of the wall.
         """
         cos, sin = math.cos(self.along), math.sin(self.along)
-        return self.middle[0] + cos * along - sin * across, self.middle[
-            1
-        ] + sin * along + cos * across
+        x, y = self.middle
+        return x + cos * along - sin * across, y + sin * along + cos * across
 
     @property
     def threshold(self) -> Array:
@@ -94,8 +93,7 @@ def _outline(room: Room) -> Array:
     """The walls of a room: (n, 4), metres."""
     corners = np.array(room.polygon)
     walls = np.hstack([corners, np.roll(corners, -1, axis=0)])
-    drawn: Array = walls[np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1]) > 1e-6]
-    return drawn
+    return np.asarray(walls[np.hypot(*(walls[:, 2:] - walls[:, :2]).T) > 1e-6])
 
 
 def _opening(plan: Plan, door: Door) -> Opening:
@@ -110,13 +108,8 @@ def _opening(plan: Plan, door: Door) -> Opening:
     low, high = max(low for low, _ in spans) + OFF, min(high for _, high in spans) - OFF
     width = min(DOOR, high - low) if high > low else DOOR
     shift = float(np.clip(0.0, low + width / 2, high - width / 2)) if high > low else 0.0
-    across = [_across(flat, wall, shift) for wall in walls]
-    return Opening(
-        flat.point(shift, (across[0] + across[1]) / 2),
-        flat.along,
-        width,
-        abs(across[0] - across[1]),
-    )
+    one, other = (_across(flat, wall, shift) for wall in walls)
+    return Opening(flat.point(shift, (one + other) / 2), flat.along, width, abs(one - other))
 
 
 def _span(flat: Opening, walls: Array) -> tuple[float, float]:

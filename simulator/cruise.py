@@ -74,10 +74,8 @@ def _stride(driver: Driver, way: Array, aim: float) -> None:
     if abs(turn) > SHARP:
         driver.go(0.0, math.copysign(min(abs(turn), BEND), turn))
     else:
-        driver.go(
-            min(STRIDE, max(math.dist(goal, (x, y)), CELL / 2)),
-            math.copysign(min(0.5 * abs(turn), BEND), turn),
-        )
+        metres = min(STRIDE, max(math.dist(goal, (x, y)), CELL / 2))
+        driver.go(metres, math.copysign(min(0.5 * abs(turn), BEND), turn))
 
 
 def _around_obstacles(
@@ -90,14 +88,11 @@ def _around_obstacles(
     """
     seen = _obstacles(driver, space, image)
     ahead = slice(at, at + round(WATCH / CELL))
-    if (
-        not len(seen)
-        or not (
-            blocked := np.flatnonzero(
-                _apart(space.middles(way[ahead]), space.middles(seen)) < space.least
-            )
-        ).size
-    ):
+    if not len(seen):
+        return way, numbers
+    apart = _apart(space.middles(way[ahead]), space.middles(seen))
+    blocked = np.flatnonzero(apart < space.least)
+    if not len(blocked):
         return way, numbers
     # Rejoin the route at the first free point behind the obstacle that can be reached.
     here = driver.robot.pose[:2]
@@ -127,8 +122,7 @@ def _obstacles(driver: Driver, space: FreeSpace, image: Array) -> Array:
 
 def _apart(points: Array, others: Array) -> Array:
     """The distance from each point to the nearest of other points, (n,)."""
-    off: Array = np.hypot(*(points[:, None] - others).transpose(2, 0, 1)).min(1)
-    return off
+    return np.asarray(np.hypot(*(points[:, None] - others).transpose(2, 0, 1)).min(1))
 
 
 def _error(driver: Driver, expected: str, got: str) -> SimulatorError:

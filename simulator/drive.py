@@ -121,29 +121,21 @@ class Recorder:
         way = math.hypot(dx, dy)
         parts = max(math.ceil(FINE * max(way / self.every, abs(turned) / self.turn)), 1)
         for part in range(1, parts):
-            self._add(
-                world,
-                moved(start, (dx * part / parts, dy * part / parts, turned * part / parts)),
-                way / parts,
-                abs(turned) / parts,
-            )
+            there = moved(start, (dx * part / parts, dy * part / parts, turned * part / parts))
+            self._add(world, there, way / parts, abs(turned) / parts)
         self._add(world, pose, way / parts, abs(turned) / parts)
 
     def _add(self, world: World, pose: Pose, way: float, turned: float) -> None:
         """Record a pose after a motion of `way` metres and `turned` radians; scan if one is due."""
         self.metres += way
-        self._seconds.append(
-            (self._seconds[-1] if self._seconds else 0.0) + way / SPEED + turned / SPIN
-        )
+        before = self._seconds[-1] if self._seconds else 0.0
+        self._seconds.append(before + way / SPEED + turned / SPIN)
         self._way, self._turned = self._way + way, self._turned + turned
         self.poses.append(pose)
         if not self.scans or self.scans[-1][0] is not world:
             self.scans.append((world, []))
-        if (
-            len(self.poses) == 1
-            or self._way >= self.every - TINY
-            or self._turned >= self.turn - TINY
-        ):
+        is_due = self._way >= self.every - TINY or self._turned >= self.turn - TINY
+        if is_due or len(self.poses) == 1:
             self.scans[-1][1].append(len(self.poses) - 1)
             self._way = self._turned = 0.0
 

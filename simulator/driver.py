@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,13 +177,8 @@ def climb(driver: Driver, turned: bool = False) -> None:
         to_go, offset = seen.to_go(reach), seen.offset(reach)
         # Turning on the spot cannot correct a distance from the line: drive back, and come again.
         aside = abs(offset) if offset is not None else 0.0
-        if (
-            aside > tolerance.aside
-            and to_go is not None
-            and abs(to_go) < 0.1
-            and not turned
-            and attempt < TRIES // 2
-        ):
+        is_near = to_go is not None and abs(to_go) < 0.1
+        if aside > tolerance.aside and is_near and not turned and attempt < TRIES // 2:
             _come_again(driver)
             continue
         if abs(seen.tilt) > tolerance.straight:
@@ -210,21 +205,19 @@ def _come_again(driver: Driver) -> None:
         driver.go(stride, _steer(seen, reach, stride))
 
 
+@dataclass
 class Corridors:
     """Does the actions of a route in a world whose streets meet at right angles.
 
-    It also collects the openings of the current place, for stars.
-
-    Args:
-        driver: Moves the robot, and takes its laser images.
-        looks_behind: Whether the robot looks behind itself at the start and after a lift.
-            Elsewhere, it knows that the path by which it came is behind.
+    It also collects the openings of the current place, for stars. If it `looks_behind`, the robot
+    looks behind itself at the start and after a lift. Elsewhere, it knows that the path by which it
+    came is behind.
     """
 
-    def __init__(self, driver: Driver, looks_behind: bool = False) -> None:
-        self.driver, self.looks_behind = driver, looks_behind
-        self._openings: dict[int, bool] = {}
-        self._facing = 0
+    driver: Driver
+    looks_behind: bool = False
+    _openings: dict[int, bool] = field(default_factory=dict, init=False)
+    _facing: int = field(default=0, init=False)
 
     def begin(self) -> None:
         """Climb to the dstate near the robot, and look behind if required."""

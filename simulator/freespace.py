@@ -99,10 +99,7 @@ class FreeSpace:
 
     def middles(self, points: Array) -> Array:
         """Move points, (n, 2) in metres, to the centres of their cells."""
-        found: Array = (np.column_stack(self.cells(points)[::-1]) + 0.5) * CELL + np.array(
-            self.corner
-        )
-        return found
+        return _middles(np.column_stack(self.cells(points)), self.corner)
 
     def part(self, points: Array, closed: Mask | None = None) -> FreeRectangle:
         """Make a `FreeRectangle`: a rectangle of the grid around some points, (n, 2) metres.
@@ -140,13 +137,11 @@ class FreeRectangle:
 
         It is (n, 2) metres, with a point in each cell; None if there is no route.
         """
-        (row, other_row), (column, other_column) = self._cells(np.array([start, goal]))
-        cells = _shortest(
-            self.clearance, self.least, (int(row), int(column)), (int(other_row), int(other_column))
-        )
+        ends = np.column_stack(self._cells(np.array([start, goal])))
+        cells = _shortest(self.clearance, self.least, *map(tuple, ends.tolist()))
         if cells is None:
             return None
-        way = self._middles(cells)
+        way = _middles(cells, self.corner)
         way[0], way[-1] = start, goal
         # Use a smoothed point only if it is far enough from obstacles.
         smooth = gaussian_filter1d(way, SMOOTH / CELL, axis=0, mode="nearest")
@@ -156,19 +151,16 @@ class FreeRectangle:
 
     def off(self, points: Array) -> Array:
         """Measure how far points, (n, 2), are from occupied cells: (n,), metres."""
-        found: Array = self.clearance[self._cells(points)]
-        return found
+        return np.asarray(self.clearance[self._cells(points)])
 
     @cached_property
     def regions(self) -> Cells:
         """The number of the connected region of each cell; 0 if the robot cannot be there."""
-        numbered: Cells = label(self.clearance >= self.least, structure=np.ones((3, 3)))[0]
-        return numbered
+        return np.asarray(label(self.clearance >= self.least, structure=np.ones((3, 3)))[0])
 
     def region(self, points: Array) -> Cells:
         """Look up the number of the region of each point, (n, 2) metres; see `regions`."""
-        found: Cells = self.regions[self._cells(points)]
-        return found
+        return np.asarray(self.regions[self._cells(points)])
 
     def nearest(self, region: int, goal: Point, room: float) -> Point:
         """Find the point (x, y) of a region, by its number, that is nearest to a goal.
@@ -179,27 +171,24 @@ class FreeRectangle:
         cells = np.argwhere(self.regions == region)
         clearance = self.clearance[tuple(cells.T)]
         cells = cells[clearance >= min(room, float(clearance.max()))]
-        middles = self._middles(cells)
+        middles = _middles(cells, self.corner)
         x, y = middles[int(np.hypot(*(middles - np.array(goal)).T).argmin())]
         return float(x), float(y)
 
     def _cells(self, points: Array) -> tuple[Cells, Cells]:
         columns, rows = np.floor((points - np.array(self.corner)) / CELL + 1e-6).astype(np.intp).T
-        return rows.clip(0, self.clearance.shape[0] - 1), columns.clip(
-            0, self.clearance.shape[1] - 1
-        )
-
-    def _middles(self, cells: Cells) -> Array:
-        middles: Array = (cells[:, ::-1] + 0.5) * CELL + np.array(self.corner)
-        return middles
+        height, width = self.clearance.shape
+        return rows.clip(0, height - 1), columns.clip(0, width - 1)
 
 
 def _clearance(occupied: Mask) -> Array:
     """The distance from each cell to the nearest cell that is occupied or outside, in metres."""
-    clearance: Array = (
-        distance_transform_edt(np.pad(~occupied, 1, constant_values=False))[1:-1, 1:-1] * CELL
-    )
-    return clearance
+    return np.asarray(distance_transform_edt(np.pad(~occupied, 1))[1:-1, 1:-1] * CELL)
+
+
+def _middles(cells: Cells, corner: Point) -> Array:
+    """The centres, (n, 2) metres, of cells, (n, 2) rows and columns, of a grid with this corner."""
+    return np.asarray((cells[:, ::-1] + 0.5) * CELL + np.array(corner))
 
 
 def _shortest(
@@ -212,13 +201,10 @@ def _shortest(
     planned, it need only not touch an occupied cell.
     """
     free = clearance >= least
-    for row, column in (start, goal):
-        beside = (
-            slice(max(row - LEEWAY, 0), row + LEEWAY + 1),
-            slice(max(column - LEEWAY, 0), column + LEEWAY + 1),
-        )
+    for cell in (start, goal):
+        beside = tuple(slice(max(k - LEEWAY, 0), k + LEEWAY + 1) for k in cell)
         free[beside] |= clearance[beside] > 1.5 * CELL
-        free[row, column] = True
+        free[cell] = True
     price = 1 + (NARROW - 1) * (1 - np.minimum(clearance / ROOM, 1.0)) ** 2
     ways = MCP_Geometric(np.where(free, price, -1.0))  # -1 is closed
     costs, _ = ways.find_costs([start], [goal])

@@ -61,11 +61,7 @@ class Here:
 
 
 class Pilot:
-    """Does the actions of a route in a world whose streets meet at any angles.
-
-    Args:
-        driver: Moves the robot, and takes its laser images.
-    """
+    """Does the actions of a route in a world whose streets meet at any angles."""
 
     here: Here  # the place where the robot is; set by `begin`
 
@@ -81,8 +77,7 @@ class Pilot:
         if not self._climb():
             raise self._error(
                 "start",
-                "a place, where streets meet or end",
-                "a street that goes straight on",
+                "expected a place, where streets meet or end, got a street that goes straight on; "
                 "move the start",
             )
 
@@ -97,9 +92,8 @@ class Pilot:
             if turn is None:
                 raise self._error(
                     action,
-                    f"a street to the {action}",
-                    "none before straight behind",
-                    "take around, or another turn",
+                    f"expected a street to the {action}, got none before straight behind; take "
+                    "around, or another turn",
                 )
             self._face(self.here.heading + turn)
 
@@ -117,7 +111,7 @@ class Pilot:
     def _travel(self) -> None:
         """Follow the street to the next place, and climb to its dstate."""
         if not self.here.place.faces(self.here.heading):
-            raise self._error("travel", "a free way ahead", "a wall", "change the route")
+            raise self._error("travel", "expected a free way ahead, got a wall; change the route")
         began = self.driver.robot.driven
         heed = began + LEAVE * self.reach
         while True:
@@ -155,21 +149,16 @@ class Pilot:
                     opened = robot.driven
             streets = streets_of(walls_of(points, beams), points, reach, 0.0)
             course_off = course - robot.odometry[2]
-            street = min(
-                streets,
-                key=lambda street: radians_between(street.bearing, course_off),
-                default=None,
-            )
-            if street is not None and radians_between(street.bearing, course_off) <= STRAIGHT:
-                course = robot.odometry[2] + street.bearing
-                self.driver.go(STRIDE, _steer(street))
-            else:
-                self.driver.go(STRIDE)
+            off = [radians_between(street.bearing, course_off) for street in streets]
+            turn = 0.0
+            if min(off, default=math.pi) <= STRAIGHT:
+                street = streets[off.index(min(off))]
+                course, turn = robot.odometry[2] + street.bearing, _steer(street)
+            self.driver.go(STRIDE, turn)
             if self.driver.on_travel is not None:
                 self.driver.on_travel(self.driver)
-        raise self._error(
-            "travel", f"a place within {LONGEST_TRAVEL:.0f} m", "none", "close the street"
-        )
+        said = f"expected a place within {LONGEST_TRAVEL:.0f} m, got none; close the street"
+        raise self._error("travel", said)
 
     def _straight(self, way: float) -> None:
         """Drive straight ahead, in metres; back if negative."""
@@ -185,12 +174,9 @@ class Pilot:
             self.here = self._look_around()
             place = self.here.place
             if not place.streets:
-                raise self._error(
-                    "place",
-                    f"a street, about {2 * self.reach:g} m wide",
-                    "none",
-                    "give another reach",
-                )
+                width = 2 * self.reach
+                said = f"expected a street, about {width:g} m wide, got none; give another reach"
+                raise self._error("place", said)
             # Done at the fixed point, or if there is none.
             if place.fixed is None or abs(place.fixed) <= self.driver.tolerance.close:
                 break
@@ -232,12 +218,9 @@ class Pilot:
         self.driver.go(0.0, turn)
         return math.remainder(self.driver.robot.odometry[2] - before, math.tau)
 
-    def _error(self, what: str, expected: str, got: str, mend: str) -> SimulatorError:
+    def _error(self, what: str, said: str) -> SimulatorError:
         x, y, _ = self.driver.robot.pose
-        return SimulatorError(
-            f"{self.driver.world.name}: {what} at ({x:.2f}, {y:.2f}): expected {expected}, "
-            f"got {got}; {mend}"
-        )
+        return SimulatorError(f"{self.driver.world.name}: {what} at ({x:.2f}, {y:.2f}): {said}")
 
 
 def _is_open(image: Array, side: int, reach: float) -> bool:

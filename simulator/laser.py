@@ -14,9 +14,8 @@ from simulator.world import World
 
 Array = NDArray[np.float64]
 BEAMS = 180
-BEARINGS: Array = np.radians(
-    np.arange(BEAMS) - 89.5
-)  # Radians, counterclockwise from straight ahead.
+# Radians, counterclockwise from straight ahead.
+BEARINGS: Array = np.radians(np.arange(BEAMS) - 89.5)
 # Largest number of intersections of beams and walls that are computed at once: 32 MB. A single
 # image may need more.
 _BLOCK = 4_000_000
@@ -58,20 +57,15 @@ class Laser:
     def _cast(self, segments: Array, poses: Array) -> Array:
         """The distance from each pose to the nearest wall along each beam: (m, 180), metres."""
         near = _near(segments, poses, self.reach)
-        nearest: Array = np.minimum(
-            meetings(near, poses, BEARINGS).min(axis=2, initial=np.inf), self.reach
-        )
-        return nearest
+        return np.asarray(meetings(near, poses, BEARINGS).min(axis=2, initial=self.reach))
 
 
 def _near(segments: Array, poses: Array, reach: float) -> Array:
     """The walls whose bounding box is within `reach` of the bounding box of the poses."""
     low, high = poses[:, :2].min(0) - reach, poses[:, :2].max(0) + reach
     ends, others = segments[:, :2], segments[:, 2:]
-    near: Array = segments[
-        (np.minimum(ends, others) <= high).all(1) & (np.maximum(ends, others) >= low).all(1)
-    ]
-    return near
+    is_near = (np.minimum(ends, others) <= high) & (np.maximum(ends, others) >= low)
+    return np.asarray(segments[is_near.all(1)])
 
 
 def meetings(segments: Array, poses: Array, bearings: Array) -> Array:

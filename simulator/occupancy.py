@@ -146,16 +146,9 @@ class _MapFileReader:
             raise self._wrong(
                 "free_thresh", f"less than occupied_thresh ({occupied:g}) in mode scale"
             )
-        image = self._text("image")
-        return MapFile(
-            self.path.parent / image,
-            self._resolution(),
-            self._origin(),
-            negate,
-            occupied,
-            free,
-            mode,
-        )
+        image = self.path.parent / self._text("image")
+        place = self._resolution(), self._origin()
+        return MapFile(image, *place, negate, occupied, free, mode)
 
     def _wrong(self, name: str, expected: str) -> SimulatorError:
         got = brief(self.fields[name]) if name in self.fields else "none"
@@ -226,19 +219,12 @@ def _cells(fields: MapFile, path: Path) -> Cells:
         value = np.rint(shade * 255)
         return np.where(value <= OCCUPIED, value, UNKNOWN).astype(np.int8)
     occupancy = shade if fields.negate else 1 - shade
-    if fields.mode == "trinary":
-        between: NDArray[np.float64] | int = UNKNOWN
-    else:
-        between = np.rint(
-            (occupancy - fields.free_thresh)
-            / (fields.occupied_thresh - fields.free_thresh)
-            * OCCUPIED
-        )
-    known = np.where(
-        occupancy > fields.occupied_thresh,
-        OCCUPIED,
-        np.where(occupancy < fields.free_thresh, FREE, between),
-    )
+    free, occupied = fields.free_thresh, fields.occupied_thresh
+    between: NDArray[np.float64] | int = UNKNOWN
+    if fields.mode != "trinary":
+        between = np.rint((occupancy - free) / (occupied - free) * OCCUPIED)
+    between = np.where(occupancy < free, FREE, between)
+    known = np.where(occupancy > occupied, OCCUPIED, between)
     return np.where(opaque, known, UNKNOWN).astype(np.int8)
 
 
@@ -299,10 +285,8 @@ def _edges(
 ) -> NDArray[np.float64]:
     """The borders between occupied and other cells, joined to long segments: (n, 4), metres.
 
-    Args:
-        occupied: (rows, columns) mask, with the bottom row first.
-        resolution: Side of a cell in metres.
-        origin: (x, y) of the lower left corner in metres, and rotation in radians.
+    The bottom row of the mask, (rows, columns), comes first. The other arguments are as in
+    `MapFile`.
     """
     found: list[tuple[float, float, float, float]] = []
     # Find borders between rows, then between columns by transposing.

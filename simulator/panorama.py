@@ -114,16 +114,10 @@ class Paint:
         """
         checked_segments("segments", segments)
         a_whole_number("walls", walls, SimulatorError)
-        ways = segments[:, 2:] - segments[:, :2]
-        lengths = np.maximum(np.hypot(*ways.T), 1e-9)
-        degrees = np.round(np.degrees(np.arctan2(ways[:, 1], ways[:, 0]))).astype(int) % 360
-        offsets = np.round(
-            100 * (ways[:, 0] * segments[:, 1] - ways[:, 1] * segments[:, 0]) / lengths
-        ).astype(int)
+        _, lengths, lines = _lines(segments)
+        sizes = zip(lengths.tolist(), lines.tolist(), strict=True)
         found: list[tuple[Any, ...]] = []
-        for i, (degree, offset, length) in enumerate(
-            zip(degrees.tolist(), offsets.tolist(), lengths.tolist(), strict=True)
-        ):
+        for i, (length, (degree, offset)) in enumerate(sizes):
             # Clutter moves, so its texture must not depend on its position.
             if i >= walls:
                 found.append(("clutter", degree % 180, round(100 * length)))
@@ -143,23 +137,15 @@ class Paint:
         an_instance("key", key, tuple, SimulatorError, mend="take one of Paint.keys")
         # A checksum of the key as seed gives the same texture in each process.
         rng = np.random.default_rng([self.seed, zlib.crc32(repr(key).encode())])
-        base, stripe, skirting = (
-            rng.uniform(0.25, 0.75, 3),
-            rng.uniform(0.15, 0.85, 3),
-            rng.uniform(0.1, 0.4, 3),
-        )
-        stripes = [
-            rng.uniform(0.5, 1.2),
-            rng.uniform(0.2, 0.5),
-            rng.uniform(0, 1),
-            rng.uniform(0.1, 0.3),
-        ]
+        # Three colours; then period, share and phase of stripes, and height of the skirting board.
+        colours = [rng.uniform(*span, 3) for span in ((0.25, 0.75), (0.15, 0.85), (0.1, 0.4))]
+        stripes = [rng.uniform(*span) for span in ((0.5, 1.2), (0.2, 0.5), (0, 1), (0.1, 0.3))]
         waves = [
             rng.normal(0, 3.0, (2, WAVES)),
             rng.uniform(0, math.tau, (1, WAVES)),
             rng.normal(0, 0.04, (3, WAVES)),
         ]
-        return np.concatenate([base, stripe, skirting, stripes, np.vstack(waves).ravel()])
+        return np.concatenate([*colours, stripes, np.vstack(waves).ravel()])
 
 
 @dataclass(frozen=True)
@@ -242,15 +228,11 @@ class Camera:
             "rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)"
         )
         light = Light.at(a_number("hour", hour, SimulatorError, 0, 24))
-        scene = (
-            self.scene(world, pose, light, walls)
-            .reshape(self.rows, DOWN, self.columns, ACROSS, 3)
-            .mean(axis=(1, 3))
-        )
+        points = self.scene(world, pose, light, walls)
+        scene = points.reshape(self.rows, DOWN, self.columns, ACROSS, 3).mean(axis=(1, 3))
         values = WHITE_VALUE * scene * (GREY_VALUE / (WHITE_VALUE * scene.mean())) ** self.exposure
         noisy = values + rng.normal(0, self.noise, values.shape) if self.noise else values
-        pixels: NDArray[np.uint8] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
-        return pixels
+        return np.asarray(np.clip(np.round(noisy), 0, 255).astype(np.uint8))
 
     def scene(self, world: World, pose: Pose, light: Light, walls: int | None = None) -> Array:
         """Compute the light that reaches the camera, before exposure and noise.
@@ -265,9 +247,8 @@ class Camera:
         an_instance("light", light, Light, SimulatorError, mend="take Light.at(12)")
         pose = pose_of("pose", pose)
         segments = world.segments
-        bearings = math.pi - (np.arange(ACROSS * self.columns) + 0.5) * math.tau / (
-            ACROSS * self.columns
-        )
+        columns = ACROSS * self.columns
+        bearings = math.pi - (np.arange(columns) + 0.5) * math.tau / columns
         far = meetings(segments, np.array([pose]), bearings)[0]
         hit = far.argmin(axis=1)
         distance = np.minimum(far[np.arange(len(hit)), hit], 1e6)
@@ -278,25 +259,29 @@ class Camera:
         )
         ways = segments[:, 2:] - segments[:, :2]
         angles = np.arctan2(ways[:, 1], ways[:, 0])
-        along = (points * np.column_stack([np.cos(angles), np.sin(angles)])[hit]).sum(
-            axis=1
-        ) - _beginnings(segments)[hit]
-        textures = np.array(
-            [
-                self.paint.texture(key)
-                for key in self.paint.keys(segments, len(segments) if walls is None else walls)
-            ]
-        )
+        directions = np.column_stack([np.cos(angles), np.sin(angles)])
+        along = (points * directions[hit]).sum(axis=1) - _beginnings(segments)[hit]
+        keys = self.paint.keys(segments, len(segments) if walls is None else walls)
+        textures = np.array([self.paint.texture(key) for key in keys])
         # The visible face of a wall is on the side of the robot.
         to_robot = np.angle(np.exp(1j * (pose[2] + bearings + math.pi - angles[hit]))) > 0
         faces = angles[hit] + np.where(to_robot, math.pi / 2, -math.pi / 2)
         wall = _albedo(textures[hit], along, height) * light.on(faces)[None, :, None]
-        return (
-            np.where(
-                (height < 0)[..., None], FLOOR, np.where((height > CEILING)[..., None], WHITE, wall)
-            )
-            * light.colour
-        )
+        above_floor = np.where((height > CEILING)[..., None], WHITE, wall)
+        return np.where((height < 0)[..., None], FLOOR, above_floor) * light.colour
+
+
+def _lines(segments: Array) -> tuple[Array, Array, NDArray[np.intp]]:
+    """The unit vectors, (n, 2), and lengths, (n,), of segments, and the lines that they are on.
+
+    A line, (n, 2), is its direction in degrees, and its distance from the origin in centimetres.
+    """
+    ways = segments[:, 2:] - segments[:, :2]
+    lengths = np.maximum(np.hypot(*ways.T), 1e-9)
+    degrees = np.round(np.degrees(np.arctan2(ways[:, 1], ways[:, 0]))) % 360
+    offsets = 100 * (ways[:, 0] * segments[:, 1] - ways[:, 1] * segments[:, 0]) / lengths
+    lines = np.column_stack([degrees, np.round(offsets)]).astype(np.intp)
+    return ways / lengths[:, None], lengths, lines
 
 
 def _beginnings(segments: Array) -> Array:
@@ -304,16 +289,11 @@ def _beginnings(segments: Array) -> Array:
 
     Segments on one line have the same position, so that a texture continues behind a gap in a wall.
     """
-    ways = segments[:, 2:] - segments[:, :2]
-    ways = ways / np.maximum(np.hypot(*ways.T), 1e-9)[:, None]
-    degrees = np.round(np.degrees(np.arctan2(ways[:, 1], ways[:, 0]))) % 360
-    offsets = np.round(100 * (ways[:, 0] * segments[:, 1] - ways[:, 1] * segments[:, 0]))
-    lines = np.unique(np.column_stack([degrees, offsets]), axis=0, return_inverse=True)[1].ravel()
-    starts = (segments[:, :2] * ways).sum(axis=1)
-    first = np.full(lines.max() + 1, np.inf)
-    np.minimum.at(first, lines, starts)
-    found: Array = first[lines]
-    return found
+    ways, _, lines = _lines(segments)
+    numbers = np.unique(lines, axis=0, return_inverse=True)[1].ravel()
+    first = np.full(numbers.max() + 1, np.inf)
+    np.minimum.at(first, numbers, (segments[:, :2] * ways).sum(axis=1))
+    return np.asarray(first[numbers])
 
 
 def _albedo(textures: Array, along: Array, height: Array) -> Array:

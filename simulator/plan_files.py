@@ -155,9 +155,8 @@ class _PlanReader:
         """Read a point, and convert it to metres. In drawings y points down; here it points up."""
         if point is None:
             raise self.wrong(f"{where}.point", "x and y", None)
-        return scale * self.number(point.get("x"), f"{where}.x"), -scale * self.number(
-            point.get("y"), f"{where}.y"
-        )
+        x, y = (self.number(point.get(name), f"{where}.{name}") for name in "xy")
+        return scale * x, -scale * y
 
     def number(self, text: str | None, where: str) -> float:
         """Read a number of at most a million."""
@@ -172,9 +171,7 @@ class _PlanReader:
 
 def _matched(here: Sequence[Point], there: Sequence[Point]) -> Iterator[Point]:
     """Match the doors that two rooms list: yield the mean of both positions, or the only one."""
-    distances = np.array([[math.dist(a, b) for b in there] for a in here]).reshape(
-        len(here), len(there)
-    )
+    distances = np.reshape([math.dist(a, b) for a in here for b in there], (len(here), len(there)))
     first, second = linear_sum_assignment(distances)
     yield from (_mean([here[i], there[j]]) for i, j in zip(first, second, strict=True))
     yield from (point for i, point in enumerate(here) if i not in first)
@@ -182,6 +179,5 @@ def _matched(here: Sequence[Point], there: Sequence[Point]) -> Iterator[Point]:
 
 
 def _mean(points: Sequence[Point]) -> Point:
-    return math.fsum(x for x, _ in points) / len(points), math.fsum(y for _, y in points) / len(
-        points
-    )
+    x, y = (math.fsum(values) / len(points) for values in zip(*points, strict=True))
+    return x, y

@@ -115,13 +115,11 @@ class Floor:
     >>> floor = Floor(Plan("two", rooms, (Door((0, 1), (0, 5)),)))
     >>> floor.sight(floor.start).view, [action.name for action in floor.ends(floor.start)]
     ('1 door: 0', ['travel'])
-
-    Attributes:
-        plan: The plan. It should come from `Plan.told_apart`, so that doors can be distinguished.
-        spread: Error of bearings that stars state, in degrees. The bearings themselves are exact.
     """
 
+    # The plan. It should come from `Plan.told_apart`, so that doors can be distinguished.
     plan: Plan
+    # Error of bearings that stars state, in degrees. The bearings themselves are exact.
     spread: float = APART / 4
 
     @property
@@ -157,10 +155,8 @@ class Floor:
             k for k, g in enumerate(self.plan.gateways[gateway.to]) if g.door == gateway.door
         )
         ahead = self.plan.gateways[gateway.to][back].opposite
-        yield (
-            Action.of("travel"),
-            Stand(gateway.to, back, False) if ahead is None else Stand(gateway.to, ahead),
-        )
+        after = Stand(gateway.to, back, False) if ahead is None else Stand(gateway.to, ahead)
+        yield Action.of("travel"), after
 
     def drive(
         self, steps: int, chance: np.random.Generator
@@ -236,10 +232,8 @@ class Floor:
 
     def pose(self, stand: Stand) -> Pose:
         """The true pose, in metres and radians."""
-        return (
-            *self.plan.rooms[stand.room].centre,
-            math.remainder(math.radians(90 - self.heading(stand)), math.tau),
-        )
+        heading = math.remainder(math.radians(90 - self.heading(stand)), math.tau)
+        return (*self.plan.rooms[stand.room].centre, heading)
 
     def truth(self, stand: Stand, pose: Pose) -> dict[str, object]:
         """The truth about a step: dstate, place, path, direction and pose."""

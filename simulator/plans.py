@@ -60,16 +60,9 @@ class Plan:
 
     def __post_init__(self) -> None:
         a_text("plan.name", self.name, SimulatorError)
-        object.__setattr__(
-            self,
-            "rooms",
-            all_instances("plan.rooms", self.rooms, Room, SimulatorError, mend="give rooms"),
-        )
-        object.__setattr__(
-            self,
-            "doors",
-            all_instances("plan.doors", self.doors, Door, SimulatorError, mend="give doors"),
-        )
+        for name, some, kind in (("rooms", self.rooms, Room), ("doors", self.doors, Door)):
+            members = all_instances(f"plan.{name}", some, kind, SimulatorError, mend=f"give {name}")
+            object.__setattr__(self, name, members)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
@@ -166,7 +159,6 @@ class Plan:
         Args:
             degrees: Smallest angle between two doors of a room.
         """
-
         a_number("degrees", degrees, SimulatorError, 0, 180, what="degrees")
 
         def far(number: int) -> float:
@@ -181,11 +173,8 @@ class Plan:
         # Keep a door if it is far enough from the kept doors of both rooms.
         for number in sorted(range(len(self.doors)), key=far):
             rooms = self.doors[number].rooms
-            if all(
-                _apart(bearing[number, room], other) >= degrees
-                for room in rooms
-                for other in taken[room]
-            ):
+            gaps = (_apart(bearing[number, room], other) for room in rooms for other in taken[room])
+            if min(gaps, default=180.0) >= degrees:
                 kept.append(number)
                 for room in rooms:
                     taken[room].append(bearing[number, room])

@@ -53,25 +53,16 @@ class Body:
 
 @dataclass(frozen=True)
 class Report:
-    """The motion of a robot by odometry since the last report.
+    """The motion of a robot by odometry since the last report."""
 
-    Attributes:
-        displacement: Metres ahead, metres to the left, and radians turned, in the frame of the
-            robot at the last report.
-        covariance: (3, 3) covariance of the noise of the displacement, without systematic errors.
-    """
-
-    displacement: Displacement
-    covariance: NDArray[np.float64]
+    displacement: Displacement  # in the frame of the robot at the last report
+    covariance: NDArray[np.float64]  # (3, 3), of its noise, without systematic errors
 
 
 class SimulatedRobot:
     """A robot with its true pose, which only the simulator knows, and its odometry.
 
-    Args:
-        body: Errors of its motions and its odometry.
-        pose: Start pose: x and y in metres, heading in radians.
-        rng: Source of the errors.
+    `pose` is where it starts: x and y in metres, heading in radians. `rng` is the source of errors.
     """
 
     def __init__(self, body: Body, pose: Pose, rng: np.random.Generator) -> None:
@@ -121,9 +112,5 @@ class SimulatedRobot:
 def _moved(pose: Pose, forward: float, turn: float) -> Pose:
     """Move a pose forward by metres, while it turns by radians counterclockwise."""
     x, y, heading = pose
-    middle = heading + turn / 2
-    return (
-        x + forward * math.cos(middle),
-        y + forward * math.sin(middle),
-        math.remainder(heading + turn, math.tau),
-    )
+    middle, heading = heading + turn / 2, math.remainder(heading + turn, math.tau)
+    return x + forward * math.cos(middle), y + forward * math.sin(middle), heading

@@ -50,21 +50,15 @@ LASER = Laser(noise=0.01, reach=30.0)
 class Rooms:
     """Plans routes in a building: through free space in each room, and straight through doors.
 
-    Args:
-        radius: Radius of the robot in metres.
-
-    Attributes:
-        building: The building, with the openings of its doors.
-        space: Free space of the building, in which doors are open.
-        graph: Rooms as nodes, and doors as edges, both by index. It has the doors that are wide
-            enough for the robot and can be reached in both rooms.
-        middles: Dict from the index of a room to the point (x, y) that the robot uses as its
-            middle, in metres.
+    The radius of the robot is in metres. Rooms and doors are known by their indices. `graph` has
+    rooms as nodes, and as edges the doors that are wide enough for the robot and can be reached in
+    both rooms. `middles` has the point (x, y), in metres, that the robot uses as the middle of each
+    room.
     """
 
     def __init__(self, building: Building, radius: float) -> None:
         self.building = building
-        self.space = FreeSpace.of(building.segments, radius)
+        self.space = FreeSpace.of(building.segments, radius)  # doors are open
         self._shut = self.space.drawn(
             np.array([opening.threshold for opening in building.openings]).reshape(-1, 4)
         )
@@ -149,8 +143,7 @@ def holds(polygon: Sequence[Point], point: Point) -> bool:
 
 def _line(start: Point, goal: Point) -> Array:
     """A straight route from start to goal: (n, 2), metres."""
-    line: Array = np.linspace(start, goal, 1 + math.ceil(math.dist(start, goal) / CELL))
-    return line
+    return np.linspace(start, goal, 1 + math.ceil(math.dist(start, goal) / CELL))
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,14 +43,9 @@ class WallPositions:
         result is negative if the robot is beyond the point, and None if neither a wall nor a
         side street is near.
         """
-        marks = [self.front] if self.front is not None and self.front < 2.5 * reach else []
-        if streets:
-            marks += [
-                x
-                for x in (self.left_street, self.right_street)
-                if x is not None and x < 2.5 * reach
-            ]
-        return None if not marks else min(marks) - reach
+        seen = [self.front, *((self.left_street, self.right_street) if streets else ())]
+        marks = [x for x in seen if x is not None and x < 2.5 * reach]
+        return min(marks) - reach if marks else None
 
     def offset(self, reach: float) -> float | None:
         """Measure how many metres the robot is to the left of the line that it should follow.
@@ -95,8 +90,7 @@ def sight(image: Array, reach: float, farthest: float) -> WallPositions:
 
 def _turned(points: Array, angle: float) -> Array:
     c, s = math.cos(angle), math.sin(angle)
-    turned: Array = points @ np.array([[c, s], [-s, c]])
-    return turned
+    return np.asarray(points @ np.array([[c, s], [-s, c]]))
 
 
 def _axis(points: Array) -> float:

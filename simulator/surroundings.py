@@ -104,9 +104,8 @@ def streets_of(
     of `farther` metres from the robot.
     """
     found: list[Street] = []
-    for street in sorted(
-        _between(walls, points, reach, farther), key=lambda street: -street.length
-    ):
+    streets = _between(walls, points, reach, farther)
+    for street in sorted(streets, key=lambda street: -street.length):
         if all(radians_between(street.bearing, other.bearing) > STRAIGHT for other in found):
             found.append(street)
     return sorted(found, key=lambda street: -street.bearing)
@@ -149,19 +148,13 @@ def _between(
         (a, b), (c, d) = ((wall.start / along, wall.end / along) for wall in (right, left))
         width = (c.imag + d.imag - a.imag - b.imag) / 2
         near, far = max(a.real, d.real), min(b.real, c.real)
-        if (
-            not WIDTHS[0] * reach < width < WIDTHS[1] * reach
-            or far < farther
-            or far - max(near, 0.0) < LONG
-        ):
+        is_wide = WIDTHS[0] * reach < width < WIDTHS[1] * reach
+        if not is_wide or far < farther or far - max(near, 0.0) < LONG:
             continue
         lateral = (a.imag + b.imag + c.imag + d.imag) / 4
         seen = points / along
-        inside = (
-            (np.abs(seen.imag - lateral) < width / 4)
-            & (seen.real > max(near, 0.0))
-            & (seen.real < farther)
-        )
+        inside = np.abs(seen.imag - lateral) < width / 4
+        inside &= (seen.real > max(near, 0.0)) & (seen.real < farther)
         if inside.sum() < 3:
             yield Street(cmath.phase(along), 1j * lateral * along, far - near)
 
@@ -217,11 +210,8 @@ class Place:
         radians.
         """
         turns = [side * (street.bearing - heading) % math.tau for street in self.streets]
-        return min(
-            (side * turn for turn in turns if STRAIGHT < turn < math.pi - STRAIGHT),
-            key=abs,
-            default=None,
-        )
+        beside = [side * turn for turn in turns if STRAIGHT < turn < math.pi - STRAIGHT]
+        return min(beside, key=abs, default=None)
 
     def faces(self, heading: float) -> bool:
         """Check whether a street is straight ahead, with a heading in radians."""
@@ -230,12 +220,10 @@ class Place:
 
 def _meeting(streets: Sequence[Street]) -> complex | None:
     """The point nearest to all midlines; None if two streets are one that goes straight on."""
-    if (
-        len(streets) == 2
-        and radians_between(streets[0].bearing, streets[1].bearing + math.pi) <= STRAIGHT
-    ):
+    bearings = [street.bearing for street in streets]
+    if len(bearings) == 2 and radians_between(bearings[0], bearings[1] + math.pi) <= STRAIGHT:
         return None
-    across = np.array([1j * cmath.rect(1, street.bearing) for street in streets])
+    across = np.array([1j * cmath.rect(1, bearing) for bearing in bearings])
     offsets = np.array([street.middle for street in streets])
     rows = np.stack([across.real, across.imag], axis=1)
     x, y = np.linalg.lstsq(rows, (across.conj() * offsets).real, rcond=None)[0]
@@ -256,10 +244,7 @@ def _end(streets: Sequence[Street], points: NDArray[np.complex128], reach: float
 class Panorama:
     """Ranges in all directions, one per degree, collected from images of a turning robot.
 
-    The panorama is in the frame of the robot at the first image.
-
-    Args:
-        image: The first image, (180,) metres.
+    The panorama is in the frame of the robot at the first image, (180,) metres.
     """
 
     def __init__(self, image: Array) -> None:
@@ -309,5 +294,4 @@ def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
 def _around(image: Array, heading: float) -> Array:
     """Turn an image to ranges at each degree, (360,) metres; NaN in unseen directions."""
     bearings = np.angle(np.exp(1j * (AROUND - heading)))
-    ranges: Array = np.interp(bearings, BEARINGS, image, left=np.nan, right=np.nan)
-    return ranges
+    return np.asarray(np.interp(bearings, BEARINGS, image, left=np.nan, right=np.nan))

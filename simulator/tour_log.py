@@ -13,22 +13,10 @@ from simulator.driver import Driver, Tolerance
 from simulator.odometer import DIGITS
 from simulator.panorama import Camera
 from simulator.robot import Body, Report, SimulatedRobot
-from simulator.world import World
 from ssh_abduction.data.odometry import Covariance, Displacement
 from ssh_abduction.data.odometry import Odometry as Noise
 
 Array = NDArray[np.float64]
-
-
-def noise_of(log: OdometryLog, world: World, body: Body, tolerance: Tolerance | None) -> Noise:
-    """Make the noise model that a trace states for its displacements, as `noise_model`.
-
-    If streets meet at any angles, and images are at dstates, each displacement has a covariance
-    of its own. Then the model has only systematic errors.
-    """
-    if world.angles == "any" and tolerance is not None:
-        return Noise(scale=abs(body.scale), bend=abs(body.bend))
-    return noise_model(log.reports, body, tolerance)
 
 
 @dataclass
@@ -49,11 +37,8 @@ class Eye:
         if self.camera is None:
             return tuple(round(float(r), 4) for r in ranges)
         hour = self.camera.hour(done / max(self.actions - 1, 1))
-        return tuple(
-            self.camera.shot(driver.world, driver.robot.pose, self.rng, hour, self.walls)
-            .ravel()
-            .tolist()
-        )
+        shot = self.camera.shot(driver.world, driver.robot.pose, self.rng, hour, self.walls)
+        return tuple(shot.ravel().tolist())
 
 
 @dataclass
@@ -96,11 +81,8 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
     )
     # Choose relative errors that reproduce the total variance of all reports.
     share = 1 / ways if ways else 0.0
-    offset, tilt = (
-        (tolerance.close / math.sqrt(3), tolerance.straight / math.sqrt(3))
-        if tolerance
-        else (0.0, 0.0)
-    )
+    offset = tolerance.close / math.sqrt(3) if tolerance else 0.0
+    tilt = tolerance.straight / math.sqrt(3) if tolerance else 0.0
     errors = {
         "along": math.sqrt(along * share),
         "across": math.sqrt(across * share + tilt**2),

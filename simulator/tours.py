@@ -20,10 +20,11 @@ from simulator.laser import Laser
 from simulator.odometer import Odometer
 from simulator.panorama import Camera
 from simulator.robot import Body, SimulatedRobot
-from simulator.tour_log import Eye, OdometryLog, covariance_of, noise_of
+from simulator.tour_log import Eye, OdometryLog, covariance_of, noise_model
 from simulator.watch import DriveWatch
 from simulator.world import World
 from ssh_abduction.data.checks import a_flag, a_number, a_whole_number, an_instance
+from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.data.words import counted
 
@@ -75,16 +76,18 @@ def simulate(
     body, tolerance = driver.robot.body, driver.tolerance
     log = OdometryLog(driver.robot)
     # The camera has its own noise, so that it does not change the drive.
-    eye = Eye(
-        camera, len(world.segments), np.random.default_rng([seed, 1]), tours * len(world.route)
-    )
-    steps = (
-        list(_at_dstates(driver, log, world, tours, stars, eye))
-        if every is None
-        else _evenly(driver, log, world, tours, every, eye)
-    )
+    noise = np.random.default_rng([seed, 1])
+    eye = Eye(camera, len(world.segments), noise, tours * len(world.route))
+    if every is None:
+        steps = list(_at_dstates(driver, log, world, tours, stars, eye))
+    else:
+        steps = _evenly(driver, log, world, tours, every, eye)
     steps[-1] = replace(steps[-1], action=None)
-    odometry = noise_of(log, world, body, tolerance if every is None else None)
+    if every is None and world.angles == "any":
+        # Each displacement has a covariance of its own, so only systematic errors are left.
+        odometry = Odometry(scale=abs(body.scale), bend=abs(body.bend))
+    else:
+        odometry = noise_model(log.reports, body, tolerance if every is None else None)
     extra = {} if camera is None else {"panorama": list(camera.shape)}
     return Trace(
         tuple(steps),
@@ -107,8 +110,7 @@ def _check(world: World, stars: bool, every: float | None, camera: Camera | None
     if every is not None and world.lifts:
         raise SimulatorError(
             f"every: expected no distance in {world.name}, as evenly spaced images would join "
-            "the floors "
-            "at its lifts; leave it out"
+            "the floors at its lifts; leave it out"
         )
     if world.by_places:
         raise SimulatorError(
@@ -140,12 +142,10 @@ def record(
     recorder = driver.recorder = Recorder(every)
     recorder.note(driver.world, driver.robot.pose)
     steps = []
-    for _, action in (
-        _stops(driver, world, tours) if world.by_places else _legs(driver, world, tours)
-    ):
-        steps.append(
-            {"scan": recorder.taken - 1, **_truth(world, driver.robot.pose), "action": action}
-        )
+    legs = _stops(driver, world, tours) if world.by_places else _legs(driver, world, tours)
+    for _, action in legs:
+        truth = _truth(world, driver.robot.pose)
+        steps.append({"scan": recorder.taken - 1, **truth, "action": action})
     name = f"{world.name}, {counted(tours, 'tours')}, seed {seed}"
     drive = recorder.drive(name, driver.laser, odometer or Odometer(), seed)
     return drive.judged(world.places, [_place(world, pose) for pose in drive.poses], steps=steps)
@@ -207,13 +207,8 @@ def _driver(
     body = body or Body()
     _check_world(world, body)
     rng = np.random.default_rng(seed)
-    return Driver(
-        world.arranged(rng),
-        SimulatedRobot(body, world.start, rng),
-        laser or Laser(),
-        rng,
-        tolerance or Tolerance(),
-    )
+    arranged, robot = world.arranged(rng), SimulatedRobot(body, world.start, rng)
+    return Driver(arranged, robot, laser or Laser(), rng, tolerance or Tolerance())
 
 
 def _check_world(world: World, body: Body) -> None:
@@ -251,19 +246,16 @@ def _at_dstates(
         image, displacement = driver.look(STILL), log.displacement()
         # If streets meet at any angles, turns to look around differ. So each displacement has its
         # own covariance.
-        has_covariance = displacement is not None and not is_square
+        covariance = None
+        if displacement is not None and not is_square:
+            covariance = covariance_of(log.reports[-1], driver.tolerance, done)
+        does = Action.of(action) if is_square else ACTIONS[action]
         yield Step(
             image=eye.image(driver, image, number),
-            action=Action(action, "lift")
-            if action in lifts
-            else Action.of(action)
-            if is_square
-            else ACTIONS[action],
+            action=Action(action, "lift") if action in lifts else does,
             star=pilot.star(image) if stars else None,
             displacement=displacement,
-            covariance=covariance_of(log.reports[-1], driver.tolerance, done)
-            if has_covariance
-            else None,
+            covariance=covariance,
             truth=_truth(world, driver.robot.pose),
         )
         done = action
@@ -286,9 +278,8 @@ def _evenly(
         """Log an image if one is due."""
         nonlocal due
         if driver.robot.driven >= due:
-            spot = (
-                f"leg {leg % len(world.route)}, {round((driver.robot.driven - leg_began) / every)}"
-            )
+            piece = round((driver.robot.driven - leg_began) / every)
+            spot = f"leg {leg % len(world.route)}, {piece}"
             truth = {"dstate": spot, "pose": [round(v, 4) for v in driver.robot.pose]}
             image = eye.image(driver, driver.look(STILL), leg)
             travel, onward = Action.of("travel"), log.displacement()

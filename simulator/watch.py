@@ -82,10 +82,7 @@ class DriveWatch:
     def _ended(self, tour: int, pose: Pose) -> None:
         """Warn if the tour did not end where it began. With several tours, raise an error."""
         assert self._home is not None
-        if (
-            math.dist(pose[:2], self._home[:2]) <= self._near
-            and abs(math.remainder(pose[2] - self._home[2], math.tau)) <= FACING
-        ):
+        if self._are_alike(self._home, pose):
             return
         text = (
             f"{self.world.name}: tour {tour + 1}: expected it to end where it began, "
@@ -103,6 +100,11 @@ class DriveWatch:
     def _near(self) -> float:
         return max(NEAR, self.world.reach)
 
+    def _are_alike(self, one: Pose, other: Pose) -> bool:
+        """Whether two poses are about the same."""
+        turned = abs(math.remainder(one[2] - other[2], math.tau))
+        return math.dist(one[:2], other[:2]) <= self._near and turned <= FACING
+
     def _is_elsewhere(self, place: str, pose: Pose) -> bool:
         """Whether a pose is not at a place: it is nearer to another place, or far from this one."""
         far = {name: math.dist(at, pose[:2]) for name, at in self.world.places.items()}
@@ -111,11 +113,7 @@ class DriveWatch:
     def _expected(self, action: str, pose: Pose) -> str | None:
         """The name of the place where an action from a pose should end; None if unknown."""
         here = self.world.nearest(pose)
-        if (
-            here is None
-            or math.dist(here.pose[:2], pose[:2]) > self._near
-            or abs(math.remainder(here.pose[2] - pose[2], math.tau)) > FACING
-        ):
+        if here is None or not self._are_alike(here.pose, pose):
             return None
         if action in TURNS:
             return here.place
@@ -127,11 +125,8 @@ class DriveWatch:
         ahead = []
         for state in self.world.dstates:
             x, y, _ = displacement_between(here.pose, state.pose)
-            if (
-                (state.path, state.direction) == (here.path, here.direction)
-                and x > NEAR
-                and abs(y) <= STRAIGHT * x
-            ):
+            is_on_path = (state.path, state.direction) == (here.path, here.direction)
+            if is_on_path and x > NEAR and abs(y) <= STRAIGHT * x:
                 ahead.append((x, state.place))
         return min(ahead)[1] if ahead else None
 

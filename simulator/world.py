@@ -147,12 +147,10 @@ class World:
             members = all_instances(f"world.{name}", some, kind, SimulatorError, mend=mend)
             object.__setattr__(self, name, members)
         for name in ("places", "via"):
-            for place, point in an_object(
-                f"world.{name}", getattr(self, name), SimulatorError
-            ).items():
-                numbers(
-                    f"world.{name}[{brief(place)}]", point, SimulatorError, 2, "x and y in metres"
-                )
+            points = an_object(f"world.{name}", getattr(self, name), SimulatorError)
+            for place, point in points.items():
+                where = f"world.{name}[{brief(place)}]"
+                numbers(where, point, SimulatorError, 2, "x and y in metres")
 
     @property
     def by_places(self) -> bool:
@@ -253,11 +251,10 @@ class World:
             if not isinstance(route, str):
                 raise reader.wrong("route", "actions with commas between", route)
             world = replace(world, route=reader.route(route.split(","), world.stops, world.lifts))
-        return (
-            world
-            if reach is None
-            else replace(world, reach=reader.reach(reach), own_reach=world.own_reach or world.reach)
-        )
+        if reach is not None:
+            own = world.own_reach or world.reach
+            world = replace(world, reach=reader.reach(reach), own_reach=own)
+        return world
 
     @classmethod
     def named(cls, name: str) -> World:

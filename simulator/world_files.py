@@ -101,10 +101,7 @@ class WorldReader(FieldReader):
     """Reads and checks the fields of a world file.
 
     All methods but `wrong` return the checked value, or raise SimulatorError if it is invalid.
-    `name` is the name of the field, for that error.
-
-    Args:
-        where: Name of the file, for errors.
+    The error has `name`, the name of the field, and `where`, the name of the file.
     """
 
     error, mend = SimulatorError, "mend it (docs/reference/worlds.md)"
@@ -228,10 +225,8 @@ class WorldReader(FieldReader):
         ends, which = np.unique(
             np.vstack(pieces).reshape(-1, 2).round(6), axis=0, return_inverse=True
         )
-        moved: Array = (ends + np.random.default_rng(0).normal(0, value, ends.shape))[
-            which.ravel()
-        ].reshape(-1, 4)
-        return moved
+        ends += np.random.default_rng(0).normal(0, value, ends.shape)
+        return np.asarray(ends[which.ravel()].reshape(-1, 4))
 
     def points(self, value: Any, name: str) -> dict[str, Point]:
         """Read an object of points: a dict from name to (x, y) in metres."""

@@ -23,9 +23,9 @@ from test_readers import SMALL, Messages, agree, bag, drive
 from perception.errors import LogError
 from perception.readers.lines import zstd_module
 from perception.readers.logs import read_log
-from perception.readers.scans import Pose
 from perception.readers.writers import write_bag, write_carmen
 from ssh_abduction.cli import main
+from ssh_abduction.data.odometry import Pose
 
 SCANS = drive(40, SMALL)
 PACK: dict[str, Callable[[bytes], bytes]] = {

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from perception.places.closures import VisitMatch
-from perception.places.importing import calibrated, factor_of
+from perception.places.importing import factor_of
 from perception.places.matching import Match
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit
@@ -74,5 +75,6 @@ def test_one_wrong_closure_hardly_changes_the_calibration() -> None:
 
 def test_track_without_closures_keeps_its_covariances() -> None:
     track, visits, closings = driven(4.0, seed=0)
-    assert calibrated(track, visits, []).factor == 1
-    assert calibrated(track, visits, closings).corrected(1, 2)[0, 0, 0] > STATED[0] ** 2
+    assert factor_of(track, visits, []) == 1
+    factor = factor_of(track, visits, closings)
+    assert replace(track, factor=factor).corrected(1, 2)[0, 0, 0] > STATED[0] ** 2

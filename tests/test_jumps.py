@@ -19,11 +19,11 @@ from perception.places.importing import import_log, tracked
 from perception.places.jumps import Unknown, describe_cuts, keep_one_source, unknown_steps
 from perception.places.tracing import with_drives
 from perception.places.track import Track
-from perception.readers.scans import Pose, RobotLog, Scan
+from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, Step, Trace, drives_of
 from ssh_abduction.data.drives import starts_of
-from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.solver import solve
 
 START: Pose = (0.0, 0.0, 0.0)

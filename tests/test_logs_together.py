@@ -21,7 +21,7 @@ from perception.places.closures import VisitMatch
 from perception.places.importing import Imported, import_log
 from perception.places.joining import join_logs
 from perception.places.unrelated import agreeing_matches
-from perception.readers.scans import Pose, RobotLog
+from perception.readers.scans import RobotLog
 from perception.readers.writers import write_carmen
 from simulator.tours import record
 from simulator.world import World
@@ -30,7 +30,7 @@ from ssh_abduction.cli.run_folders import digest, distinct
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data import Closure, SSHMap, Trace, drives_of, together
 from ssh_abduction.data.drives import starts_of
-from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.output.layout import layout
 from ssh_abduction.robot_logs import log_maps, log_report

@@ -19,11 +19,11 @@ import pytest
 from perception.errors import LogError
 from perception.readers.lines import LONGEST_LINE
 from perception.readers.logs import FORMATS, live_log, read_log, stream_log
-from perception.readers.scans import Damage, LaserScanner, Pose, RobotLog, Scan
+from perception.readers.scans import Damage, LaserScanner, RobotLog, Scan
 from perception.readers.writers import write_bag, write_carmen
 from ssh_abduction.cli import import_log
 from ssh_abduction.data.errors import TraceError
-from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.trace import Trace
 
 LOGS = Path(__file__).parents[2] / "shared" / "data" / "logs"

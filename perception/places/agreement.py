@@ -224,11 +224,8 @@ def field_of_view(log: RobotLog) -> float | None:
         return None
     apart = np.array([one[0] for one in tried if one is not None])
     best = int(np.argmin(apart))
-    return (
-        float(FIELDS[best])
-        if abs(FIELDS[best] - fov) >= LEAST_CHANGE and apart[best] < CLOSER_WIDENED * now[0]
-        else None
-    )
+    is_closer = apart[best] < CLOSER_WIDENED * now[0]
+    return float(FIELDS[best]) if abs(FIELDS[best] - fov) >= LEAST_CHANGE and is_closer else None
 
 
 def _fov(scan: Scan) -> float:
@@ -284,10 +281,8 @@ def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
                 if math.hypot(dx, dy) < GAP[1] and abs(turn) < TURN_OF_PAIR[1]:
                     pairs.append((scan, later))
                 break
-    return [
-        pairs[i]
-        for i in np.unique(np.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).astype(int))
-    ]
+    some = np.unique(np.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).astype(int))
+    return [pairs[i] for i in some]
 
 
 def _points(scan: Scan, stretch: float) -> NDArray[np.complex128]:

@@ -133,7 +133,6 @@ class _Gates:
     """
 
     def __init__(self, track: Track, visits: Sequence[Visit], apart: float) -> None:
-        """Compute the middles of the visits for each drift of the heading that is tried."""
         self._track, self._apart = track, apart
         self._scans = [visit.scan for visit in visits]
         self._way = track.way[self._scans]
@@ -171,7 +170,6 @@ class _Corrected:
     """The positions of visits by the track. Each closure corrects the positions of later visits."""
 
     def __init__(self, visits: Sequence[Visit]) -> None:
-        """Start without any correction."""
         self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
         self._places = self._middles.copy()
         self._turns = np.zeros(len(visits))
@@ -214,15 +212,10 @@ def errors_of(poses: Array, matches: Array) -> Array:
 
 
 def without_drift(middles: Array, way: Array, drift: float) -> Array:
-    """Compute the middles of visits without a steady drift of the heading.
+    """Compute the middles of visits without a steady drift of the heading, in radians per metre.
 
-    Args:
-        middles: (n, 2) middles in metres, according to the track.
-        way: (n,) metres driven before each visit.
-        drift: The drift to remove, in radians per metre.
-
-    Returns:
-        (n, 3) x, y in metres and rotation of the axes in radians.
+    `middles` are (n, 2) metres by the track, and `way` the (n,) metres driven before each visit.
+    The result is (n, 3): x, y in metres and rotation of the axes in radians.
     """
     turn = -drift * (way - way[0])
     halfway = (turn[1:] + turn[:-1]) / 2
@@ -234,15 +227,10 @@ def without_drift(middles: Array, way: Array, drift: float) -> Array:
 
 
 def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
-    """Compute the covariance of a point near a later scan relative to an earlier scan.
+    """Compute the covariance of a point near a later scan relative to an earlier scan, (3, 3).
 
-    Args:
-        first: Index of the earlier scan.
-        last: Index of the later scan.
-        end: (x, y) of the point in metres, in the frame of the track.
-
-    Returns:
-        (3, 3) in metres and radians, in the frame of the track.
+    Scans are given by their indices. The point `end`, (x, y), and the covariance are in metres and
+    radians, in the frame of the track.
     """
     # An error of an increment rotates and shifts all later poses. The point moves as the end of an
     # arm that begins there.

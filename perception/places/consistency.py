@@ -13,6 +13,7 @@ Reference:
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -90,11 +91,8 @@ class _ClosureGraph:
     def __init__(self, track: Track, visits: Sequence[Visit], found: Sequence[VisitMatch]) -> None:
         middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
         scans = [visit.scan for visit in visits]
-        moves = [
-            k
-            for k in range(1, len(visits))
-            if not track.cuts_between(*sorted(scans[k - 1 : k + 1]))
-        ]
+        cuts = [track.cuts_between(*sorted(pair)) for pair in pairwise(scans)]
+        moves = [k for k, between in enumerate(cuts, 1) if not between]
         self._first = np.array([*(k - 1 for k in moves), *(c.first for c in found)], int)
         self._last = np.array([*moves, *(c.last for c in found)], int)
         onward = [np.array([*(middles[k] - middles[k - 1]), 0.0]) for k in moves]

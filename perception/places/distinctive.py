@@ -29,9 +29,9 @@ from perception.places.skeleton import Junction, junctions
 from perception.places.stays import AROUND, RIM, SAME, SHARE, SMALL, Stays
 from perception.places.track import Array, Track
 from perception.places.visits import MERGED, Visit, Way
-from perception.readers.scans import Pose, RobotLog, Scan
+from perception.readers.scans import RobotLog, Scan
 from perception.readers.stored import in_turn
-from ssh_abduction.data.odometry import radians_between
+from ssh_abduction.data.odometry import Pose, radians_between
 
 # The usual width of a robot in metres. It has to fit through the doors that the robot uses.
 WIDTH = 0.5
@@ -89,7 +89,6 @@ class _Detector:
     """Finds the visits in an unbroken part of a drive."""
 
     def __init__(self, width: float) -> None:
-        """Start before the first scan."""
         self._room = width / 2
         self._recent = Recent()
         self._maps = LocalMaps(self._recent, WINDOW)
@@ -201,15 +200,9 @@ class _Detector:
             near = self._near(scan, middle)
             mine = [sighting for sighting in sightings if sighting.milestone in near]
             if mine and len(mine) >= AGREED * len(near):
-                yield Visit(
-                    scan,
-                    _middle(mine),
-                    first + begin,
-                    first + end,
-                    radius,
-                    _ways(mine, radius),
-                    support=len(mine) / len(near),
-                )
+                stay, ways = (first + begin, first + end), _ways(mine, radius)
+                support = len(mine) / len(near)
+                yield Visit(scan, _middle(mine), *stay, radius, ways, support=support)
 
     def _near(self, scan: int, middle: Array) -> set[int]:
         """The numbers of the milestones near a scan at which the middle of a place can be seen."""

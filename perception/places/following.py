@@ -31,9 +31,9 @@ from perception.places.track import (
     wrapped,
 )
 from perception.places.walls import ScanFit, Surfaces, in_sight, surfaces_in
-from perception.readers.scans import Pose, RobotLog, Scan
+from perception.readers.scans import RobotLog, Scan
 from perception.readers.stored import in_turn
-from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
 # Number of previous scans to match a scan with.
 RECENT = 40
@@ -118,7 +118,6 @@ class GrowingTrack:
     """A track to which scans are added. Each needs about 100 bytes."""
 
     def __init__(self) -> None:
-        """Start before the first scan."""
         self.cuts: list[int] = []  # indices of the scans before which the motion is unknown, so far
         self._breaks: list[int] = []
         self._rows = array("d")  # pose, covariance and share of each scan
@@ -137,13 +136,8 @@ class GrowingTrack:
     def track(self) -> Track:
         """The track up to the last scan. It is not copied: while it is in use, add no scan."""
         rows = np.asarray(self._rows).reshape(-1, ROW)
-        return Track(
-            rows[:, :3],
-            rows[:, 3:12].reshape(-1, 3, 3),
-            rows[:, 12],
-            tuple(self.cuts),
-            tuple(self._breaks),
-        )
+        covariances, shares = rows[:, 3:12].reshape(-1, 3, 3), rows[:, 12]
+        return Track(rows[:, :3], covariances, shares, tuple(self.cuts), tuple(self._breaks))
 
 
 def poses_of_scans(
@@ -316,11 +310,8 @@ def _accumulating(information: Array, prior: Array) -> Array:
 
     In directions in which no wall shows the position, the error of the odometer accumulates fully.
     In the other directions, a pose is measured against the mean of the n previous scans. So an
-    error shifts later poses by only 2 / (n + 1) of itself.
-
-    Args:
-        information: (3, 3) inverse covariance of the pose by odometer and walls.
-        prior: (3, 3) inverse covariance of the pose by the odometer alone.
+    error shifts later poses by only 2 / (n + 1) of itself. `information` is the (3, 3) inverse
+    covariance of the pose by odometer and walls, and `prior` that by the odometer alone.
     """
     posterior = np.linalg.inv(information)
     by_odometer = posterior @ prior

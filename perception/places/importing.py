@@ -204,7 +204,7 @@ def _imported(
     with _timed(seconds, "trace"):
         closings = find_closures(track, visits, patches_of(visits), 2 * WINDOW)
         closings = agreeing(track, visits, closings)
-        track = calibrated(track, visits, closings)
+        track = replace(track, factor=factor_of(track, visits, closings))
         visits, closings = with_partings(track, visits, closings)
         poses = fitted_poses(track, visits, closings)
         across, part = closures_across_cuts(track, visits, poses), parts_of(track, visits)
@@ -309,12 +309,8 @@ def with_views(trace: Trace) -> Trace:
             clusterer = ViewClusterer(k_max=most, by="trimmed", random_state=0).fit(images)
         views, sure = clusterer.labels_, clusterer.confidence_
     seen = zip(trace.steps, views, sure, strict=True)
-    return replace(
-        trace,
-        steps=tuple(
-            replace(step, view=int(view), confidence=round(float(c), 4)) for step, view, c in seen
-        ),
-    )
+    steps = (replace(step, view=int(view), confidence=round(float(c), 4)) for step, view, c in seen)
+    return replace(trace, steps=tuple(steps))
 
 
 @contextmanager
@@ -322,11 +318,6 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     begin = time.process_time()
     yield
     seconds[stage] = round(time.process_time() - begin, 3)
-
-
-def calibrated(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> Track:
-    """Return a track with covariances that agree with the closures between visits, if any."""
-    return replace(track, factor=factor_of(track, visits, closings))
 
 
 def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import accumulate, chain
 
@@ -59,32 +59,30 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
         trace = together(traces)
     begin = time.process_time()
     arrivals = _arrivals(trace, track, visits)
-    found = [
-        closure_of(closing, arrivals)
-        for closing in closures_between(
-            [part.visits for part in parts], [part.poses for part in parts]
-        )
-    ]
-    seconds = _total([part.seconds for part in parts])
+    closings = closures_between([part.visits for part in parts], [part.poses for part in parts])
+    found = [closure_of(closing, arrivals) for closing in closings]
+    seconds = {
+        stage: round(math.fsum(part.seconds[stage] for part in parts), 3)
+        for stage in parts[0].seconds
+    }
     seconds["drives"] = round(time.process_time() - begin, 3)
+    trace = with_views(replace(trace, closures=(*trace.closures, *found)))
+    _, *starts = (
+        begin + start
+        for begin, part in zip(begins, parts, strict=True)
+        for start in (0, *part.starts)
+    )
+    moves = (np.array([*shift, 0.0]) for shift in shifts)
+    poses = [part.poses + move for part, move in zip(parts, moves, strict=True)]
     return log, Imported(
-        with_views(replace(trace, closures=(*trace.closures, *found))),
+        trace,
         track,
         parts[0].width,
         visits,
         seconds,
         _named(names, [part.notes for part in parts]),
-        tuple(
-            begin + start
-            for begin, part in zip(begins, parts, strict=True)
-            for start in (0, *part.starts)
-        )[1:],
-        np.concatenate(
-            [
-                part.poses + np.array([*shift, 0.0])
-                for part, shift in zip(parts, shifts, strict=True)
-            ]
-        ),
+        tuple(starts),
+        np.concatenate(poses),
     )
 
 
@@ -134,8 +132,3 @@ def _counted_from(first: int, trace: Trace) -> Trace:
         for step in trace.steps
     )
     return replace(trace, steps=tuple(steps))
-
-
-def _total(seconds: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Add up the times of each stage."""
-    return {stage: round(math.fsum(times[stage] for times in seconds), 3) for stage in seconds[0]}

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from perception.readers.poses import RecordedTrack as Odometry
 from perception.readers.poses import sources_of
-from perception.readers.scans import Pose, RobotLog, Scan
+from perception.readers.scans import RobotLog, Scan
 from perception.readers.stored import in_turn
-from ssh_abduction.data.odometry import displacement_between
+from ssh_abduction.data.odometry import Pose, displacement_between
 
 if TYPE_CHECKING:
     from perception.places.track import Track
@@ -249,7 +249,6 @@ class LiveJumps:
     """
 
     def __init__(self) -> None:
-        """Start without any step."""
         self._steps: deque[float] = deque(maxlen=LATELY)
 
     def __call__(self, scan: int, onward: Pose) -> Doubt:
@@ -266,23 +265,20 @@ class LiveJumps:
 
 @dataclass(frozen=True)
 class Unknown:
-    """Scans for which the odometry of the step before them cannot be trusted, by index.
+    """Scans for which the odometry of the step before them cannot be trusted, by index."""
 
-    Attributes:
-        unknown: Scans after a jump of the odometer, or after a motion that the odometer missed.
-        carried: The scans in `unknown` before which the robot was carried while nothing was logged.
-        doubtful: Scans after other long steps. Such a step is a jump if the scan matches only near
-            the previous pose.
-        seams: Scans at which a second drive seems to begin. The step to such a scan is unknown
-            unless the scan matches where the step ends.
-        still: First and last scan of each stretch in which the odometer stands still, though the
-            scans change.
-    """
-
+    # Scans after a jump of the odometer, or after a motion that the odometer missed.
     unknown: frozenset[int] = frozenset()
+    # The scans in `unknown` before which the robot was carried while nothing was logged.
     carried: frozenset[int] = frozenset()
+    # Scans after other long steps. Such a step is a jump if the scan matches only near the previous
+    # pose.
     doubtful: frozenset[int] = frozenset()
+    # Scans at which a second drive seems to begin. The step to such a scan is unknown unless the
+    # scan matches where the step ends.
     seams: frozenset[int] = frozenset()
+    # First and last scan of each stretch in which the odometer stands still, though the scans
+    # change.
     still: tuple[tuple[int, int], ...] = ()
 
     def doubt_of(self, scan: int) -> Doubt:
@@ -386,7 +382,6 @@ class StandstillCheck:
     """Notices whether the robot moves while its odometer stands still."""
 
     def __init__(self) -> None:
-        """Start before the first scan."""
         self.moved = False  # whether the robot moved in this way
         self._first: Scan | None = None  # of those at one pose
 

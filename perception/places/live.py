@@ -46,15 +46,7 @@ LOOKS = (200, 400, 800, 1600)
 class LiveLog:
     """The track and the visits of a drive, found while its scans come.
 
-    Args:
-        items: The scans with odometry, in order. Damaged parts are skipped.
-        width: Width of the robot in metres. It cannot pass narrower parts of the free space.
-        tell: A function that gets each note on suspicious scans, as soon as it is known.
-        source: Name of the log.
-
-    Raises:
-        LogError: The width is no positive number, the items are no iterable, or `tell` is no
-            function.
+    The arguments are those of `importing.import_live`. Raises LogError if one is invalid.
     """
 
     def __init__(
@@ -64,7 +56,6 @@ class LiveLog:
         tell: Callable[[str], None] = lambda note: None,
         source: str = "",
     ) -> None:
-        """Start before the first scan."""
         mend = "give the width of the robot"
         a_number("width", width, LogError, above=0, what="metres", mend=mend)
         if not isinstance(items, Iterable) or isinstance(items, str | bytes):
@@ -154,14 +145,9 @@ class LiveLog:
 
 
 class Teller:
-    """Tells each kind of note once, as soon as it is known.
-
-    Args:
-        tell: A function that gets each note.
-    """
+    """Tells each kind of note once to a function `tell`, as soon as it is known."""
 
     def __init__(self, tell: Callable[[str], None]) -> None:
-        """Start without any note."""
         self._tell = tell
         self.notes: list[str] = []  # the notes so far
         self._kinds: set[str] = set()

@@ -101,15 +101,12 @@ def lost(scan: Scan) -> Bools:
 
 
 class LocalMaps:
-    """Makes local maps along a trajectory.
+    """Makes local maps along a trajectory from its `recent` scans.
 
-    Args:
-        recent: The scans with their poses.
-        reach: Metres of trajectory. The window of a scan reaches this far before and after it.
+    The window of a scan reaches `reach` metres of trajectory before and after it.
     """
 
     def __init__(self, recent: Recent, reach: float) -> None:
-        """Start without any scan."""
         self._recent, self._reach = recent, reach
         # The torus covers all that the scans of one window can see, and a patch around any of them.
         self._side = int(2 * (reach + SIGHT + 2) / CELL)

@@ -112,7 +112,6 @@ class StuckLaser:
     """Notices whether the laser repeats one scan while the robot drives on."""
 
     def __init__(self) -> None:
-        """Start before the first scan."""
         self.notes: list[str] = []  # a note on the first such stretch, if there is one
         self._last: Scan | None = None
         self._metres = 0.0

@@ -108,25 +108,15 @@ class _Alignment:
 
 
 class _DrivePoints:
-    """A drive as points along its trajectory.
-
-    Args:
-        track: Trajectory of the robot.
-        visits: The visits, in order.
-
-    Attributes:
-        points: (n, 2) positions, PACE metres apart.
-        visits: The visits.
-        ways: (v,) metres driven up to each visit.
-        middles: (v, 2) middles of their places in metres.
-    """
+    """A drive as points along its trajectory, with its visits in order."""
 
     def __init__(self, track: Track, visits: Sequence[Visit]) -> None:
-        """Take points along the trajectory."""
         self._way = track.way
         at = np.arange(0.0, self._way[-1], PACE)
+        # (n, 2) positions in metres, PACE metres apart.
         self.points = np.stack([np.interp(at, self._way, track.poses[:, k]) for k in (0, 1)], 1)
         self.visits = visits
+        # The (v,) metres driven up to each visit, and the (v, 2) middles of their places in metres.
         self.ways = self._way[[visit.scan for visit in visits]]
         self.middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
         self._cuts = [0.0, *(float(self._way[cut]) for cut in track.cuts), float(self._way[-1])]

@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 
 from perception.places.track import Array
-from perception.readers.scans import Pose, Scan
+from perception.readers.scans import Scan
+from ssh_abduction.data.odometry import Pose
 
 
 class Recent:
@@ -16,14 +17,10 @@ class Recent:
 
     Scans are counted from the beginning of the drive. Older scans are dropped, and the others keep
     their indices.
-
-    Attributes:
-        begin: Index of the first scan that is kept.
     """
 
     def __init__(self) -> None:
-        """Start before the first scan."""
-        self.begin = 0  # the lists begin with this scan
+        self.begin = 0  # index of the first scan that is kept
         self._scans: list[Scan] = []
         self._poses: list[Pose] = []
         self._ways: list[float] = []

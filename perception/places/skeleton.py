@@ -48,10 +48,8 @@ ONE, NARROW = 0.6, 0.75
 # SHORE widths outside its disc.
 SHORE, WIDE = 3.0, 1.5
 
-# A node of a skeleton with its branches: (n, 2) rows and columns each.
+# A junction or a bend of a skeleton with its branches: (n, 2) rows and columns each.
 Fork = tuple[Node, list[Array]]
-
-Bend = tuple[Node, list[Array]]
 
 # A line bends at a cell if it turns there by at least this many radians. Ways out that differ by
 # less are merged (`visits.MERGED`).
@@ -74,7 +72,7 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
     """
     mask = passable(patch, room)
     # The middle of the robot is `room` away from obstacles, so the disc of a cell is larger.
-    distance = _distances(mask) + room / CELL
+    distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] + room / CELL
     far = SHORE * 2 * room / CELL
     lines, inner = thinned(mask), open_space(distance, far)
     graph = pruned(graph_of(lines, distance))
@@ -88,12 +86,9 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
         if not inner[node.cell]
         and all(math.dist(node.at, o.at) > max(node.radius, o.radius) for o, _ in found)
     ]
+    at = patch.position
     return [
-        Junction(
-            patch.position(node.at),
-            node.radius * CELL,
-            tuple(patch.position(branch) for branch in branches),
-        )
+        Junction(at(node.at), node.radius * CELL, tuple(map(at, branches)))
         for node, branches in found + corners
     ]
 
@@ -161,10 +156,6 @@ def passable(patch: Patch, room: float) -> Bools:
     for side in (holes[0], holes[-1], holes[:, 0], holes[:, -1]):
         small[side] = False
     return np.asarray(reached | small[holes])
-
-
-def _distances(mask: Bools) -> Array:
-    return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1])
 
 
 def pruned(graph: Graph) -> Graph:
@@ -241,7 +232,7 @@ def _branches(graph: Graph, group: set[int], radius: float) -> list[Array]:
     return found
 
 
-def bends(graph: Graph, distance: Array, out: float) -> Iterator[Bend]:
+def bends(graph: Graph, distance: Array, out: float) -> Iterator[Fork]:
     """Yield the node of each bend of a skeleton and its two branches: (n, 2) rows and columns.
 
     `distance` is as in `junctions_merged`. The direction of a line before and after a cell is
@@ -255,7 +246,7 @@ def bends(graph: Graph, distance: Array, out: float) -> Iterator[Bend]:
         yield from _bends_of(edge, first, last, distance, out)
 
 
-def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float) -> Iterator[Bend]:
+def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float) -> Iterator[Fork]:
     """Find the bends of one line outside the discs of its ends, the sharpest first."""
     cells = edge.cells
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(cells, axis=0).T))])

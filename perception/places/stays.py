@@ -58,14 +58,10 @@ class _TurningPoint:
 class Stays:
     """Turns the visits that chains of junctions show into final visits.
 
-    Args:
-        recent: The last scans with their poses.
-        maps: Makes the local map of a visit.
-        half: Half the side of the local map of a visit in metres.
+    The local map of a visit reaches `half` metres to each side.
     """
 
     def __init__(self, recent: Recent, maps: LocalMaps, half: float) -> None:
-        """Start before the first visit."""
         self._recent, self._maps, self._half = recent, maps, half
         self._passing: Visit | None = None  # the last visit, which the next one may replace
         self._found: list[tuple[float, Visit]] = []  # the metres driven up to each visit
@@ -188,10 +184,8 @@ class Stays:
         for turn in sorted(self._turns, key=lambda turn: (turn.stride, -turn.angle, -turn.scan)):
             if turn.scan < limit and self._is_apart(turn):
                 self._add_turn(turn.scan)
-        done = sorted(
-            (visit for _, visit in self._found if self._done <= visit.scan < limit),
-            key=lambda visit: visit.scan,
-        )
+        done = [visit for _, visit in self._found if self._done <= visit.scan < limit]
+        done.sort(key=lambda visit: visit.scan)
         completed = [self._with_gateways(visit) for visit in done]
         # Visits are remembered until turns near them are decided.
         least = self._recent.way(min(limit, self._recent.end - 1)) - NEARBY

@@ -20,11 +20,12 @@ from perception.places.closures import NOISE, VisitMatch, uncertainty
 from perception.places.local_map import CELL, PackedPatch
 from perception.places.track import Array, Track, covariance_turned, points_turned, wrapped
 from perception.places.visits import Visit, patches_of
-from perception.readers.scans import Pose, RobotLog
+from perception.readers.scans import RobotLog
 from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.odometry import (
     Covariance,
     Odometry,
+    Pose,
     displacement_between,
     moved,
     radians_between,
@@ -92,11 +93,8 @@ def to_trace(
 def with_drives(trace: Trace, part: Sequence[int]) -> Trace:
     """Let a drive start where the odometer jumped, as the motion to that step is unknown.
 
-    Several cuts between two visits are an odometer that stood still, and not a jump.
-
-    Args:
-        trace: The trace of a log.
-        part: For each visit, how many cuts of the track are before it.
+    Several cuts between two visits are an odometer that stood still, and not a jump. `part` says
+    for each visit how many cuts of the track are before it.
     """
     steps, drives = list(trace.steps), 1
     for t, (last, step) in enumerate(pairwise(trace.steps)):
@@ -155,7 +153,8 @@ def _step(
     onward = covariance = None
     cuts = [] if last is None else track.cuts_between(last[0].scan, visit.scan)
     if last is not None and not cuts:
-        onward = displacement_between(last[1], pose)
+        x, y, turn = displacement_between(last[1], pose)
+        onward = round(x, 4), round(y, 4), round(turn, 5)
         covariance = _covariance(track, last[0].scan, visit.scan, last[1], pose)
     scan = log.scans[visit.scan]
     extra: dict[str, object] = {"scan": visit.scan, "visit": number}
@@ -172,9 +171,7 @@ def _step(
     return Step(
         image=tuple(map(_millimetres, _image(patch, visit.middle, pose[2]).tolist())),
         star=_star(visit, pose[2]),
-        displacement=None
-        if onward is None
-        else (round(onward[0], 4), round(onward[1], 4), round(onward[2], 5)),
+        displacement=onward,
         covariance=covariance,
         truth=truth,
         extra=extra,
@@ -212,20 +209,13 @@ def _image(patch: PackedPatch, middle: Array, heading: float) -> Array:
     """The ranges that a laser in the middle of a place would measure: (181,), metres."""
     mask = patch.free
     far = np.arange(0.0, min(mask.shape) * CELL / 2, CELL / 2)
-    angles = heading + BEAMS
-    cells = np.rint(
-        (
-            middle
-            + far[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
-            - patch.corner
-        )
-        / CELL
-    ).astype(int)
+    ahead = np.stack([np.cos(heading + BEAMS), np.sin(heading + BEAMS)], axis=1)
+    points = middle + far[None, :, None] * ahead[:, None, :]
+    cells = np.rint((points - patch.corner) / CELL).astype(int)
     inside = ((cells >= 0) & (cells < mask.shape)).all(axis=2)
     cells = np.clip(cells, 0, np.array(mask.shape) - 1)
     free = mask[cells[..., 0], cells[..., 1]] & inside
-    # The middle itself counts as free.
-    free[:, : round(2 * CELL / (CELL / 2))] = True
+    free[:, :4] = True  # The middle itself, within two cells, counts as free.
     return np.asarray(np.where(free.all(axis=1), far[-1], far[np.argmin(free, axis=1)]))
 
 

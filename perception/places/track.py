@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.readers.scans import Pose
+from ssh_abduction.data.odometry import Pose
 
 Array = NDArray[np.float64]
 
@@ -26,29 +26,23 @@ BLOCK = 256
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The trajectory of the robot, by odometry and scan matching.
+    """The trajectory of the robot, by odometry and scan matching."""
 
-    Attributes:
-        poses: (n, 3) x, y in metres and heading in radians, in the frame of the first scan.
-        covariances: (n, 3, 3) covariance of the motion from the previous scan to each scan, in the
-            frame of the robot at the previous scan, by scan matching; zeros for the first scan.
-        shares: (n,) share of the points of each scan that lie on known walls; 1 for the first scan,
-            NaN for a later scan whose beams meet nothing. Empty if nothing was matched.
-        cuts: Indices of scans before which the motion is unknown because the odometer jumped. No
-            displacement crosses a cut.
-        breaks: The scans in `cuts` after which the robot may be anywhere, because the scan shows
-            nothing that was seen before. Neither a path nor a place crosses a break.
-        factor: Number by which the covariances have to be multiplied.
-        is_reliable: Whether scans match, and agree with the odometry, as in good logs. True if
-            nothing was judged.
-    """
-
-    poses: Array
+    poses: Array  # (n, 3) x, y in metres and heading in radians, in the frame of the first scan
+    # (n, 3, 3) covariance of the motion from the previous scan to each scan, in the frame of the
+    # robot at the previous scan, by scan matching; zeros for the first scan.
     covariances: Array
+    # (n,) share of the points of each scan that lie on known walls; 1 for the first scan, NaN for a
+    # later scan whose beams meet nothing. Empty if nothing was matched.
     shares: Array = field(default_factory=lambda: np.ones(0))
+    # Indices of scans before which the motion is unknown because the odometer jumped. No
+    # displacement crosses a cut.
     cuts: tuple[int, ...] = ()
+    # The scans in `cuts` after which the robot may be anywhere, because the scan shows nothing that
+    # was seen before. Neither a path nor a place crosses a break.
     breaks: tuple[int, ...] = ()
-    factor: float = 1.0
+    factor: float = 1.0  # number by which the covariances have to be multiplied
+    # Whether scans match, and agree with the odometry, as in good logs. True if nothing was judged.
     is_reliable: bool = True
 
     def pose(self, scan: int) -> Pose:

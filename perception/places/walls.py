@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from perception.places.track import Array, points_moved, points_turned, wrapped
-from perception.readers.scans import Pose, Scan
+from perception.readers.scans import Scan
+from ssh_abduction.data.odometry import Pose
 
 # Longer beams are not matched, in metres, since neighbouring beams are too far apart to show a
 # wall.

@@ -244,10 +244,8 @@ def _gaps(parts: list[Path]) -> list[str]:
     if not missing:
         return []
     return [
-        (
-            f"{named(parts[-1].name)} is one part of a drive. These parts are not there: "
-            f"{first_few(missing, 5)}. Their scans are missing."
-        )
+        f"{named(parts[-1].name)} is one part of a drive. These parts are not there: "
+        f"{first_few(missing, 5)}. Their scans are missing."
     ]
 
 
@@ -257,21 +255,13 @@ def _beside(path: Path) -> list[str]:
     if number < 0 or not NAMES.search(path.name):
         return []
     # Other parts of the same drive in the same folder.
-    with_it = sorted(
-        (
-            part
-            for part in path.parent.iterdir()
-            if part != path and NAMES.search(part.name) and _drive(part) == _drive(path)
-        ),
-        key=_number,
-    )
+    parts = (part for part in path.parent.iterdir() if part != path and NAMES.search(part.name))
+    with_it = sorted((part for part in parts if _drive(part) == _drive(path)), key=_number)
     if with_it:
         names = first_few([named(part.name) for part in with_it], 3)
         return [
-            (
-                f"{named(path)} is one part of a drive, and is read alone. Beside it lie {names}: "
-                "name the folder to read all of them."
-            )
+            f"{named(path)} is one part of a drive, and is read alone. Beside it lie {names}: "
+            "name the folder to read all of them."
         ]
     return _gaps([path])
 

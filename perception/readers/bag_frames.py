@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from perception.readers.bag_topics import NANO, TRANSFORMS, Bag
 from perception.readers.messages import Damaged
 from perception.readers.poses import RecordedTrack
-from perception.readers.scans import Damage, Pose
-from ssh_abduction.data.odometry import displacement_between
+from perception.readers.scans import Damage
+from ssh_abduction.data.odometry import Pose, displacement_between
 
 # Largest difference of the messages of a fixed transform, from rounding: metres and radians.
 FIXED = (0.01, 0.01)
@@ -57,23 +57,18 @@ def transforms_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
                 damaged.append(message)
                 continue
             for stamped in message.transforms:
-                child, parent = (
-                    frame_name(stamped.child_frame_id),
-                    frame_name(stamped.header.frame_id),
-                )
+                child, parent = map(frame_name, (stamped.child_frame_id, stamped.header.frame_id))
+                transform = stamped.transform
                 try:
-                    edge = _record(frames, child, parent, stamped.transform, is_static)
+                    edge = _record(frames, child, parent, transform, is_static)
                 except Damaged as damage:
                     damaged.append(Damage(number, f"{connection.topic}: {child}: {damage}"))
                     continue
                 if edge.track is not None and (
                     edge.count == 1 or any(child in ancestors(frames, frame) for frame in seen)
                 ):
-                    edge.track.add(
-                        stamp_of(stamped.header),
-                        recorded,
-                        flat_pose(stamped.transform.translation, stamped.transform.rotation),
-                    )
+                    flat = flat_pose(transform.translation, transform.rotation)
+                    edge.track.add(stamp_of(stamped.header), recorded, flat)
     return frames
 
 

@@ -19,23 +19,11 @@ NANO = 1e-9
 
 
 class Bag:
-    """An open bag.
-
-    Attributes:
-        readers: A reader for each part, from the package rosbags or a `Salvage`.
-        format: `ros1`, `ros2` or `mcap`.
-        notes: Sentences about the files that a user should know.
-        source: Name of the bag, for errors.
-        deserialize: Function from the bytes of a message and its kind to a message.
-    """
+    """An open bag. `Files` explains its attributes; `source` is the name of the bag, for errors."""
 
     def __init__(self, files: bag_files.Files, store: Any, source: str) -> None:
-        self.readers, self.format, self.notes, self.source = (
-            files.readers,
-            files.format,
-            files.notes,
-            source,
-        )
+        self.readers, self.format, self.notes = files.readers, files.format, files.notes
+        self.source = source
         self.deserialize = (
             store.deserialize_ros1 if files.format == "ros1" else store.deserialize_cdr
         )
@@ -89,12 +77,8 @@ class Bag:
                 topic = connection.topic
                 numbers[topic] += 1
                 try:
-                    yield (
-                        connection,
-                        numbers[topic],
-                        time * NANO,
-                        self.deserialize(raw, connection.msgtype),
-                    )
+                    message = self.deserialize(raw, connection.msgtype)
+                    yield connection, numbers[topic], time * NANO, message
                 except (SerdeError, ValueError, IndexError) as error:
                     what = (
                         f"{topic}: expected a message {connection.msgtype.rpartition('/')[2]}, "

@@ -19,6 +19,7 @@ times of recording are used (`poses`).
 from __future__ import annotations
 
 import math
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -41,9 +42,9 @@ from perception.readers.bag_frames import (
 from perception.readers.bag_topics import Bag
 from perception.readers.messages import Damaged
 from perception.readers.poses import RecordedTrack, TimedPoses, clock_of, sources_of
-from perception.readers.scans import Damage, LaserScanner, Pose, Scan, SurveyedLog, laser_of
+from perception.readers.scans import Damage, LaserScanner, Scan, SurveyedLog, laser_of
 from ssh_abduction.data.errors import brief
-from ssh_abduction.data.odometry import moved
+from ssh_abduction.data.odometry import Pose, moved
 
 SCANS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan")
 ODOMETRY = ("nav_msgs/msg/Odometry",)
@@ -100,12 +101,8 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
     notes += contradictions
     if above:
         notes.append(f"Corrected poses come from the transforms above {odom}.")
-    where = _ScanPoses(
-        TimedPoses.of(odometer, by_stamp),
-        [TimedPoses.of(track, by_stamp) for track in above],
-        mounts,
-        by_stamp,
-    )
+    corrections = [TimedPoses.of(track, by_stamp) for track in above]
+    where = _ScanPoses(TimedPoses.of(odometer, by_stamp), corrections, mounts, by_stamp)
     return SurveyedLog(bag.format, tuple(notes), _scans(bag, set(scans), where, damaged), assumed)
 
 
@@ -184,11 +181,8 @@ def _odometer(
         except Damaged as damage:
             damaged.append(Damage(number, f"{topic}: {damage}"))
             continue
-        source = (
-            frame_name(message.header.frame_id),
-            frame_name(message.child_frame_id),
-            getattr(connection.ext, "callerid", "") or "",
-        )
+        frame, child = map(frame_name, (message.header.frame_id, message.child_frame_id))
+        source = frame, child, getattr(connection.ext, "callerid", "") or ""
         tracks.setdefault(source, RecordedTrack()).add(stamp_of(message.header), recorded, flat)
     if not tracks:
         raise LogError(
@@ -234,11 +228,7 @@ def _of_one_source(track: RecordedTrack, called: str, notes: list[str]) -> Recor
         return track
     # For the note, measure how far the poses of the two largest sources differ.
     table = track.table()
-    first, second = (RecordedTrack() for _ in range(2))
-    for number in sources[0]:
-        first.numbers.extend(table[number])
-    for number in sources[1]:
-        second.numbers.extend(table[number])
+    first, second = (RecordedTrack(array("d", table[some].ravel())) for some in sources[:2])
     here, there = TimedPoses.of(first, False), TimedPoses.of(second, False)
     apart = max(math.dist(here.at(time)[:2], there.at(time)[:2]) for time in there.times)
     notes.append(
@@ -252,21 +242,16 @@ def _of_one_source(track: RecordedTrack, called: str, notes: list[str]) -> Recor
 
 @dataclass(frozen=True)
 class _ScanPoses:
-    """Poses of the robot and its lasers.
+    """Poses of the robot and its lasers."""
 
-    Attributes:
-        odometry: Poses by the odometer.
-        corrections: The transform from the parent of the odometry's frame to this frame, then that
-            from the grandparent to the parent, and so on; empty if the robot was not localised.
-        mounts: For each frame of scans, the pose of the laser in the frame of the robot, and
-            whether it hangs upside down.
-        by_stamp: Whether times come from the headers of messages; otherwise, they are times of
-            recording.
-    """
-
-    odometry: TimedPoses
+    odometry: TimedPoses  # poses by the odometer
+    # The transform from the parent of the odometry's frame to this frame, then that from the
+    # grandparent to the parent, and so on; empty if the robot was not localised.
     corrections: list[TimedPoses]
+    # For each frame of scans, the pose of the laser in the frame of the robot, and whether it hangs
+    # upside down.
     mounts: dict[str, tuple[Pose, bool]]
+    # Whether times come from the headers of messages; otherwise, they are times of recording.
     by_stamp: bool
 
     def at(self, time: float) -> tuple[Pose, Pose | None]:
@@ -314,10 +299,8 @@ def _measured(
     if message.__msgtype__ == SCANS[0]:
         ranges = np.array(message.ranges, dtype=np.float64)
     else:  # A beam without an echo met nothing.
-        ranges = np.array(
-            [beam.echoes[0] if len(beam.echoes) else np.inf for beam in message.ranges],
-            dtype=np.float64,
-        )
+        echoes = [beam.echoes[0] if len(beam.echoes) else np.inf for beam in message.ranges]
+        ranges = np.array(echoes, dtype=np.float64)
     if not len(ranges):
         raise Damaged("expected at least one range, got none")
     if not math.isfinite(first) or not 0 < abs(step) <= math.tau:

@@ -190,32 +190,24 @@ def _scans(
 
 @dataclass(slots=True)
 class _OdometerPoses:
-    """Computes the pose of the odometer at each scan, from the lines of the log up to that scan.
+    """Computes the pose of the odometer at each scan, from the lines of the log up to that scan."""
 
-    Attributes:
-        found: Findings of the first pass.
-        meaning: Meaning of the poses of the scans.
-        is_corrected: Whether poses of vertices count as corrected.
-        chain: Pose by odometry, computed by adding up the motions between ODOM lines.
-        behind: Value of `chain` before the last ODOM line, or at the last scan if that came later.
-        last: Pose and time of the last ODOM line.
-        before: Pose and time of the ODOM line before the last.
-        restarts: Whether the next ODOM line starts from a corrected pose, and gives no motion.
-        vertex: Index of the last vertex.
-        truth: The last corrected pose, and the pose by odometry at that time.
-        news: A corrected pose that waits for the next scan, which gives its odometry.
-    """
-
-    found: Findings
-    meaning: Meaning
-    is_corrected: bool
+    found: Findings  # findings of the first pass
+    meaning: Meaning  # meaning of the poses of the scans
+    is_corrected: bool  # whether poses of vertices count as corrected
+    # Pose by odometry, computed by adding up the motions between ODOM lines.
     chain: Pose = (0.0, 0.0, 0.0)
+    # Value of `chain` before the last ODOM line, or at the last scan if that came later.
     behind: Pose = (0.0, 0.0, 0.0)
-    last: tuple[Pose, float | None] | None = None
+    last: tuple[Pose, float | None] | None = None  # pose and time of the last ODOM line
+    # Pose and time of the ODOM line before the last.
     before: tuple[Pose, float | None] | None = None
+    # Whether the next ODOM line starts from a corrected pose, and gives no motion.
     restarts: bool = False
-    vertex: int | None = None
+    vertex: int | None = None  # index of the last vertex
+    # The last corrected pose, and the pose by odometry at that time.
     truth: tuple[Pose, Pose] | None = None
+    # A corrected pose that waits for the next scan, which gives its odometry.
     news: Pose | None = None
 
     def read_line(self, tag: bytes, tokens: list[bytes]) -> None:
@@ -285,27 +277,18 @@ class _OdometerPoses:
         if self.meaning != "lines" or isinstance(item, Damage) or self.last is None:
             return item
         (start, began), (end, ended) = self.before or self.last, self.last
-        if (
-            began is None
-            or ended is None
-            or item.time is None
-            or not began <= item.time <= ended
-            or began == ended
-        ):
-            share = 0.0  # Times that are cut or run backwards are useless.
-        else:
-            share = (item.time - began) / (ended - began)
+        share, time = 0.0, item.time  # Times that are cut or run backwards are useless.
+        if not (began is None or time is None or ended is None) and began <= time <= ended > began:
+            share = (time - began) / (ended - began)
         dx, dy, turned = displacement_between(start, end)
         odometry = moved(start, (share * dx, share * dy, share * turned))
         return replace(item, odometry=odometry, corrected=self._corrected(odometry))
 
     def _corrected(self, odometry: Pose) -> Pose | None:
         """The true pose, from the last corrected pose, if any, and the odometry since then."""
-        return (
-            moved(self.truth[0], displacement_between(self.truth[1], odometry))
-            if self.truth is not None
-            else None
-        )
+        if self.truth is None:
+            return None
+        return moved(self.truth[0], displacement_between(self.truth[1], odometry))
 
 
 def _measured(

@@ -60,15 +60,11 @@ MOST_BETWEEN = 100
 
 @dataclass(frozen=True)
 class VertexPoses:
-    """Poses by odometry at the vertices, computed by adding up the motions along the edges.
+    """Poses by odometry at the vertices, computed by adding up the motions along the edges."""
 
-    Attributes:
-        poses: Pose at each vertex, in the order of the file. The first is (0, 0, 0).
-        gaps: Numbers of the vertices to which no edge leads from the vertex before. There, the
-            robot is taken to have stood still.
-    """
-
-    poses: tuple[Pose, ...]
+    poses: tuple[Pose, ...]  # in the order of the file; the first is (0, 0, 0)
+    # Numbers of the vertices to which no edge leads from the vertex before. There, the robot is
+    # taken to have stood still.
     gaps: tuple[int, ...]
 
 
@@ -77,10 +73,6 @@ class PoseGraph:
     """A pose graph: vertices with poses, and edges with motions.
 
     Add all vertices and edges before using the methods, which cache their results.
-
-    Attributes:
-        vertices: Number and pose of each vertex, in the order of the file.
-        edges: Dict from the numbers of two vertices to the motion from the first to the second.
 
     Example:
         >>> graph = PoseGraph()
@@ -92,12 +84,13 @@ class PoseGraph:
         2
     """
 
+    # Number and pose of each vertex, in the order of the file.
     vertices: list[tuple[int, Pose]] = field(default_factory=list)
+    # Dict from the numbers of two vertices to the motion from the first to the second.
     edges: dict[tuple[int, int], Pose] = field(default_factory=dict)
 
     @cached_property
     def chain(self) -> VertexPoses:
-        """Pose by odometry at each vertex, computed by adding up the motions along the edges."""
         poses: list[Pose] = [(0.0, 0.0, 0.0)]
         gaps: list[int] = []
         for (start, _), (end, _) in zip(self.vertices, self.vertices[1:], strict=False):
@@ -375,9 +368,8 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
                 survey = found.kinds.setdefault(line.kind, Survey())
                 _count(survey, line)
                 found.lengths.setdefault(tag, Counter())[line.after] += 1
-                if (
-                    since.get(line.kind, 2) < 2
-                ):  # The first ODOM line after a scan only repeats the pose of the scan.
+                # The first ODOM line after a scan only repeats the pose of the scan.
+                if since.get(line.kind, 2) < 2:
                     survey.unmoved.append(number)
                 since[line.kind] = 0
                 waiting = survey, line, odometer

@@ -208,11 +208,9 @@ def _measured(scan: Scan, meaning: Meaning) -> Scan:
         ranges[scan.ranges <= max(scan.laser.nearest, 0.0)] = np.nan
     for kind in meaning.free:
         ranges[kinds[kind]] = np.inf
-    laser = (
-        scan.laser
-        if scan.laser.reach == meaning.reach
-        else shared(replace(scan.laser, reach=meaning.reach))
-    )
+    laser = scan.laser
+    if laser.reach != meaning.reach:
+        laser = shared(replace(laser, reach=meaning.reach))
     return replace(scan, ranges=ranges, laser=laser)
 
 

@@ -96,15 +96,9 @@ def is_full(error: BaseException) -> bool:
 
 
 class Piped:
-    """A stream whose first bytes were read already and can be read again.
-
-    Args:
-        head: The first bytes.
-        rest: The stream after them.
-    """
+    """A stream whose first bytes, `head`, were read already and can be read again."""
 
     def __init__(self, head: bytes, rest: IO[bytes]) -> None:
-        """Start at the first byte."""
         self._head, self._rest = io.BytesIO(head), rest
 
     def seek(self, offset: int) -> int:
@@ -162,14 +156,8 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
 def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
     """List the errors of `unpacked` data that end early (EOFError) or are damaged, and `others`."""
     zstd = zstd_module()
-    return (
-        EOFError,
-        gzip.BadGzipFile,
-        zlib.error,
-        lzma.LZMAError,
-        *((zstd.ZstdError,) if zstd else ()),
-        *others,
-    )
+    more = (zstd.ZstdError,) if zstd else ()
+    return (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, *more, *others)
 
 
 def zstd_module() -> Any:

@@ -88,13 +88,8 @@ def read_log(
             f"damaged, first: {damaged[0].what if damaged else 'none'}; record the log again"
         )
     meant, found_out = interpret_log(scans, options)
-    log = RobotLog(
-        meant,
-        tuple(damaged),
-        reading.format,
-        os.fspath(path),
-        (*reading.notes, *_assumed(reading, options), *found_out),
-    )
+    notes = (*reading.notes, *_assumed(reading, options), *found_out)
+    log = RobotLog(meant, tuple(damaged), reading.format, os.fspath(path), notes)
     for warning in log.warnings:
         _log.warning("%s: %s", named(path), warning)
     return log
@@ -190,7 +185,7 @@ def _reading(
             f"format: expected one of {', '.join(FORMATS)}, got {brief(format)}"
             "; leave it out to recognise it"
         )
-    if _is_folder(path):
+    if Path(path).is_dir():
         if format in LINES:
             raise LogError(
                 f"{named(path)}: expected a file of the format {format}, got a folder; name "
@@ -212,13 +207,6 @@ def _reading(
             return
     with bag_topics.bag_opened(path, found) as bag:
         yield bags.read(bag, topics, odom_topic)
-
-
-def _is_folder(path: str | os.PathLike[str]) -> bool:
-    try:
-        return Path(path).is_dir()
-    except ValueError:  # A null character in the path; opening the file reports it.
-        return False
 
 
 def _format(file: IO[bytes], source: str) -> str:

@@ -81,11 +81,8 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
     else:
         if len(tokens) < 9:
             raise Damaged(f"expected at least 8 values after {kind}, got {len(tokens) - 1}")
-        start, step, reach = (
-            number_of(tokens[2]),
-            number_of(tokens[4]),
-            number_of(tokens[5], may_be_infinite=True),
-        )
+        start, step = number_of(tokens[2]), number_of(tokens[4])
+        reach = number_of(tokens[5], may_be_infinite=True)
         if not 0 < abs(step) <= math.tau or abs(start) > 2 * math.tau:
             raise Damaged(f"expected a start and a step in radians, got {start:g} and {step:g}")
         shape = start, step, reach if reach > 0 else math.inf
@@ -97,11 +94,9 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
             f"expected {end} to {end + 3} words in a {kind} of {len(beams)} beams, got "
             f"{len(tokens)}"
         )
-    first, second = (
-        (None, None)
-        if kind == "RAWLASER1"
-        else (pose_at(tokens, poses), pose_at(tokens, poses + 3))
-    )
+    first = second = None
+    if kind != "RAWLASER1":
+        first, second = pose_at(tokens, poses), pose_at(tokens, poses + 3)
     return ScanLine(kind, beams, shape, first, second, time_at(tokens, end), len(tokens) - end)
 
 

@@ -37,13 +37,10 @@ SOURCES = 4
 
 @dataclass
 class RecordedTrack:
-    """Poses over time, in the order of their messages.
+    """Poses over time, in the order of their messages."""
 
-    Attributes:
-        numbers: Flat list of five numbers for each pose: stamp in the header (0 if it has none) and
-            time of recording in seconds; x and y in metres; heading in radians.
-    """
-
+    # Flat list of five numbers for each pose: stamp in the header (0 if it has none) and time of
+    # recording in seconds; x and y in metres; heading in radians.
     numbers: array[float] = field(default_factory=lambda: array("d"))
 
     def add(self, stamp: float, recorded: float, pose: Pose) -> None:
@@ -90,32 +87,21 @@ def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
     each topic, (n, 2) stamps and times of recording in seconds, in the order of the bag.
     """
     wrong = [text for name, times in topics.items() if (text := _wrong_stamps(name, times[:, 0]))]
-    held = [
-        text
-        for name, times in topics.items()
-        if (text := _wrong_recording(name, times, bool(wrong)))
-    ]
+    doubts = (_wrong_recording(name, times, bool(wrong)) for name, times in topics.items())
+    held = "; ".join(filter(None, doubts))
     # Clocks that are fine by themselves may still disagree.
     if not held and not wrong:
         wrong = _apart(topics)
-    if not wrong and not held:
-        return True, ()
     if not wrong:
-        return True, (
-            (
-                f"The times of recording are of no use: {'; '.join(held)}. The times in the "
-                "headers are used."
-            ),
-        )
-    said = f"The times in the headers contradict themselves: {'; '.join(wrong)}."
+        said = f"The times of recording are of no use: {held}. The times in the headers are used."
+        return True, (said,) if held else ()
+    used = "The times of recording are used."
     if held:
-        return False, (
-            (
-                f"{said} The times of recording are no better: {'; '.join(held)}. They are used, "
-                "but what is made of them may be wrong."
-            ),
+        used = (
+            f"The times of recording are no better: {held}. They are used, but what is made of "
+            "them may be wrong."
         )
-    return False, (f"{said} The times of recording are used.",)
+    return False, (f"The times in the headers contradict themselves: {'; '.join(wrong)}. {used}",)
 
 
 def _wrong_stamps(name: str, stamps: Array) -> str | None:

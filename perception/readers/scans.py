@@ -23,17 +23,6 @@ from numpy.typing import NDArray
 from ssh_abduction.data.odometry import Pose
 from ssh_abduction.data.words import counted
 
-__all__ = [
-    "Damage",
-    "LaserScanner",
-    "Pose",
-    "RobotLog",
-    "Scan",
-    "SurveyedLog",
-    "laser_of",
-    "shared",
-]
-
 
 @dataclass(frozen=True)
 class LaserScanner:
@@ -152,13 +141,11 @@ class RobotLog:
         if not self.damaged:
             return self.notes
         first, were = self.damaged[0], "was" if len(self.damaged) == 1 else "were"
-        return (
-            *self.notes,
-            (
-                f"{counted(len(self.damaged), 'damaged parts')} of the log {were} skipped; the "
-                f"first is {first.line}: {first.what}; mend them, or go on without them"
-            ),
+        skipped = (
+            f"{counted(len(self.damaged), 'damaged parts')} of the log {were} skipped; the "
+            f"first is {first.line}: {first.what}; mend them, or go on without them"
         )
+        return (*self.notes, skipped)
 
 
 @dataclass(frozen=True, eq=False)

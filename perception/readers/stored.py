@@ -39,7 +39,6 @@ class ScanTable(Sequence[Scan]):
     """
 
     def __init__(self, scans: Iterable[Scan] = ()) -> None:
-        """Fill the table with scans."""
         self._rows = array("d")  # ROW numbers for each scan
         self._lasers: list[LaserScanner] = []
         self._numbers: dict[LaserScanner, int] = {}  # of the lasers
@@ -62,10 +61,9 @@ class ScanTable(Sequence[Scan]):
         row = self._rows[ROW * numbers : ROW * (numbers + 1)].tolist()
         laser, line, chunk, begin = map(int, row[7:])
         scanner = self._lasers[laser]
+        end = begin + scanner.beams
         return Scan(
-            _unknown(scanner.beams)
-            if chunk < 0
-            else self._chunks[chunk][begin : begin + scanner.beams],
+            _unknown(scanner.beams) if chunk < 0 else self._chunks[chunk][begin:end],
             scanner,
             (row[0], row[1], row[2]),
             None if math.isnan(row[3]) else (row[3], row[4], row[5]),
@@ -95,15 +93,9 @@ class ScanTable(Sequence[Scan]):
             self._used += size
         number = self._numbers.setdefault(scan.laser, len(self._lasers))
         self._lasers += [scan.laser] if number == len(self._lasers) else []
-        return (
-            *scan.odometry,
-            *(scan.corrected or (math.nan,) * 3),
-            math.nan if scan.time is None else scan.time,
-            number,
-            scan.line,
-            chunk,
-            begin,
-        )
+        corrected = scan.corrected or (math.nan,) * 3
+        time = math.nan if scan.time is None else scan.time
+        return (*scan.odometry, *corrected, time, number, scan.line, chunk, begin)
 
 
 @lru_cache

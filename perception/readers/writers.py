@@ -213,11 +213,8 @@ def _messages(
                 f"scan {number}: expected a time from 0 on, as bags count it, got "
                 f"{seconds:g}; shift the times"
             )
-        make = _Maker(
-            types,
-            types["builtin_interfaces/msg/Time"](sec=time // NANO, nanosec=time % NANO),
-            {"seq": number} if is_ros1 else {},
-        )
+        stamp = types["builtin_interfaces/msg/Time"](sec=time // NANO, nanosec=time % NANO)
+        make = _Maker(types, stamp, {"seq": number} if is_ros1 else {})
         laser = scan.laser
         # The mount of the laser is static: it is written once.
         if laser.mount not in mounted:
@@ -230,15 +227,8 @@ def _messages(
             yield "/tf_static", time, make.transform(BASE, LASER, laser.mount)
         yield "/tf", time, make.transform(ODOM, BASE, scan.odometry)
         if scan.corrected is not None:
-            yield (
-                "/tf",
-                time,
-                make.transform(
-                    MAP,
-                    ODOM,
-                    moved(scan.corrected, displacement_between(scan.odometry, (0.0, 0.0, 0.0))),
-                ),
-            )
+            back = displacement_between(scan.odometry, (0.0, 0.0, 0.0))
+            yield "/tf", time, make.transform(MAP, ODOM, moved(scan.corrected, back))
         covariance = np.zeros((3, 3)) if covariances is None else covariances[number]
         yield "/odom", time, make.odometry(scan.odometry, covariance)
         yield "/scan", time, make.scan(scan.ranges, laser)

@@ -375,10 +375,5 @@ def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdict
 
 def _joined(one: NDArray[np.bool_], verdicts: Verdicts, things: int) -> MapPairs:
     """Count the judged pairs. `one`, an n x n matrix, is true for pairs that the map joins."""
-    right = int((one & (verdicts == RETURN)).sum())
-    return MapPairs(
-        things,
-        right + int((one & (verdicts == APART)).sum()),
-        right,
-        int((verdicts == RETURN).sum()),
-    )
+    right, wrong = (int((one & (verdicts == kind)).sum()) for kind in (RETURN, APART))
+    return MapPairs(things, right + wrong, right, int((verdicts == RETURN).sum()))

@@ -169,11 +169,8 @@ class Relations:
         other = others[0] if others else node
         if (whole := self._to.get((node, other))) is not None:
             share = (time - self.times[node]) / (self.times[other] - self.times[node])
-            return node, (
-                share * whole[0],
-                share * whole[1],
-                share * math.remainder(whole[2], math.tau),
-            )
+            dx, dy, turned = whole
+            return node, (share * dx, share * dy, share * math.remainder(turned, math.tau))
         return (node, (0.0, 0.0, 0.0)) if abs(self.times[node] - time) <= NEAREST else None
 
 

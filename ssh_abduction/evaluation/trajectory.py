@@ -121,12 +121,9 @@ class Trajectory:
         # Interpolate; turn the shorter way.
         share = (time - self.times[first]) / (self.times[last] - self.times[first])
         (x, y, heading), (u, v, other) = self.poses[first], self.poses[last]
-        turned = math.remainder(other - heading, math.tau)
-        return (
-            x + share * (u - x),
-            y + share * (v - y),
-            math.remainder(heading + share * turned, math.tau),
-        )
+        turned = share * math.remainder(other - heading, math.tau)
+        heading = math.remainder(heading + turned, math.tau)
+        return x + share * (u - x), y + share * (v - y), heading
 
     def told_to(self, trace: Trace) -> Trace:
         """Copy a trace, with the poses of this trajectory as the truth of its steps.

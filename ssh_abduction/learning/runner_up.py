@@ -106,21 +106,13 @@ def second_map(
     other = runner_up(trace)
     if other is None:
         return None
-    solution = solve(
-        other,
-        theory,
-        time_limit=SECONDS if limit is None else min(limit, SECONDS),
-        memory_limit=memory,
-    )
+    limit = SECONDS if limit is None else min(limit, SECONDS)
+    solution = solve(other, theory, time_limit=limit, memory_limit=memory)
     # The maps are the same if they put the same steps at the same dstates and places.
     if {partition(m) for m in maps} & {partition(m) for m in solution.maps}:
         return None
-    return SecondMap(
-        len(set(trace.views)),
-        len(set(other.views)),
-        len(maps[0].dstates) if maps else None,
-        solution,
-    )
+    dstates = len(maps[0].dstates) if maps else None
+    return SecondMap(len(set(trace.views)), len(set(other.views)), dstates, solution)
 
 
 def warn_of_second_map(

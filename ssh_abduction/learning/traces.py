@@ -138,19 +138,12 @@ class Traces:
     def with_images_in(self, file: str) -> Traces:
         """Copy these traces, with image i of all n steps in row i of a sidecar file."""
         rows = self.parts(np.arange(len(self.images)))
-        return Traces(
-            tuple(
-                replace(
-                    trace,
-                    images=file,
-                    steps=tuple(
-                        replace(step, image=int(i))
-                        for step, i in zip(trace.steps, part, strict=True)
-                    ),
-                )
-                for trace, part in zip(self.each, rows, strict=True)
-            )
-        )
+        copies = []
+        for trace, part in zip(self.each, rows, strict=True):
+            numbered = zip(trace.steps, part.tolist(), strict=True)
+            steps = tuple(replace(step, image=i) for step, i in numbered)
+            copies.append(replace(trace, images=file, steps=steps))
+        return Traces(tuple(copies))
 
     def with_views(
         self,
@@ -201,6 +194,5 @@ def _alike(
 
 def _without_images(trace: Trace) -> Trace:
     """Copy a trace without its images, which may be in files of their own."""
-    return replace(
-        trace, steps=tuple(replace(step, image=None) for step in trace.steps), images=None
-    )
+    steps = tuple(replace(step, image=None) for step in trace.steps)
+    return replace(trace, steps=steps, images=None)

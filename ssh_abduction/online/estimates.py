@@ -37,28 +37,22 @@ FACING = 3.0
 
 @dataclass(frozen=True)
 class Links:
-    """Where one action a leads from each of the N dstates.
+    """Where one action a leads from each of the N dstates."""
 
-    Attributes:
-        leads: The probabilities p(x'|x,a), of shape (N, N). Row x' is the end, column x the start.
-            The column of a dstate sums to 1, or is 0 if it is unknown where a leads from there.
-        missing: 1 for each dstate from which it is unknown where a leads, else 0. Shape (N,).
-    """
-
+    # The probabilities p(x'|x,a), (N, N). Row x' is the end, column x the start. The column of a
+    # dstate sums to 1, or is 0 if it is unknown where a leads from there.
     leads: sparse.csr_array
-    missing: NDArray[np.float64]
+    missing: NDArray[np.float64]  # 1 for each dstate from which it is unknown where a leads, else 0
 
 
 class Moves:
     """Where the moves of a robot lead from each of the N dstates of a map.
 
-    Args:
-        trace: The trace that was mapped, to estimate probabilities by counting; None takes all
-            links from the map.
+    The trace that was mapped serves to estimate probabilities by counting. Without it, all links
+    are those of the map.
     """
 
     def __init__(self, ssh_map: SSHMap, trace: Trace | None) -> None:
-        """Count where the actions lead."""
         self._map = ssh_map
         self._links: dict[Move, Links] = {}
         self._links.update(transitions(ssh_map, trace).items())
@@ -88,12 +82,8 @@ class Moves:
         sources, targets, angles = self._pairs
         off = (angles - degrees + 180) % 360 - 180
         near = np.abs(off) <= FACING * SPREAD
-        return _links_of(
-            sources[near],
-            targets[near],
-            np.exp(-((off[near] / SPREAD) ** 2) / 2),
-            len(self._map.dstates),
-        )
+        weights = np.exp(-((off[near] / SPREAD) ** 2) / 2)
+        return _links_of(sources[near], targets[near], weights, len(self._map.dstates))
 
     @cached_property
     def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
@@ -124,11 +114,9 @@ def _links_of(
 ) -> Links:
     """Make the links of one action from the relative weights of n pairs of dstates."""
     totals = np.bincount(sources, weights, number)
-    missing = np.where(totals > 0, 0.0, 1.0)
-    return Links(
-        sparse.csr_array((weights / totals[sources], (targets, sources)), shape=(number, number)),
-        missing,
-    )
+    shares = weights / totals[sources]
+    leads = sparse.csr_array((shares, (targets, sources)), shape=(number, number))
+    return Links(leads, np.where(totals > 0, 0.0, 1.0))
 
 
 def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]:
@@ -172,18 +160,12 @@ class Stars:
     A star fits a step of the mapped trace if the robot may have faced the same way in both. Let
     f(s|x) be the share of the steps at dstate x that a star s fits. Stars that fit each other are
     not equal, so p(s|x) is only proportional to f. An unknown place looks like none of the dstates
-    with a probability of 1 / (N + 1).
-
-    Attributes:
-        misread: The probability that a star does not fit another step of its dstate.
-
-    Args:
-        trace: The trace that was mapped.
-        misread: The least value of the attribute. If it is 0, stars always fit.
+    with a probability of 1 / (N + 1). `misread` is the probability that a star does not fit another
+    step of its dstate. It is estimated from the mapped trace, but at least the given value. If that
+    is 0, stars always fit.
     """
 
     def __init__(self, ssh_map: SSHMap, trace: Trace, misread: float) -> None:
-        """Collect the stars of each dstate, and compare those of one dstate."""
         self._number = len(ssh_map.dstates)
         self._seen = gathered(
             (x, step.gateways)

@@ -227,13 +227,8 @@ class Explorer:
     def trace(self) -> Trace:
         """The steps so far: what was seen and done, with the truth if `look` returned any."""
         trace = self.mapper.trace
-        return replace(
-            trace,
-            steps=tuple(
-                replace(step, truth=truth)
-                for step, truth in zip(trace.steps, self._truths, strict=True)
-            ),
-        )
+        told = zip(trace.steps, self._truths, strict=True)
+        return replace(trace, steps=tuple(replace(step, truth=truth) for step, truth in told))
 
     @property
     def solution(self) -> Solution:

@@ -34,7 +34,6 @@ from ssh_abduction.theory.evidence import said_by
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups, row
-from ssh_abduction.theory.theory import Theory
 
 # After a search that was stopped, the trace grows by this factor before the next one, so that few
 # steps are slow.
@@ -59,10 +58,8 @@ class StepOptions:
 class MapKeeper:
     """Keeps the minimal maps up to date, or the best map that is found in time.
 
-    Args:
-        problem: The steps so far, and the theory: it allows no faults, and no field is "auto".
-        options: The time limit and the other options of a step.
-        before: The keeper of fewer steps that this one replaces; None for the first.
+    `problem` has the steps so far, and the theory: it allows no faults, and no field is "auto".
+    `before` is the keeper of fewer steps that this one replaces; None for the first.
     """
 
     standing = None  # only `Recovery`, for theories with faults, has a standing
@@ -83,27 +80,16 @@ class MapKeeper:
         self._next_search = 0  # no search before the trace has this many steps
         self._spent = 0.0  # seconds that all steps took
 
-    @property
-    def trace(self) -> Trace:
-        """The steps so far."""
-        return self._problem.trace
-
-    @property
-    def theory(self) -> Theory:
-        """The theory, in which no field is "auto"."""
-        return self._problem.theory
-
     def restarted(self, problem: Problem) -> MapKeeper:
         """Make a keeper for the theory of `problem`, which changed with the last step.
 
         The minimal maps so far need not be minimal by the new theory. They become drafts
         (maps to be extended step by step) if the old theory already used displacements.
         """
-        trace = problem.trace
         keeper = MapKeeper(problem, self._options, before=self)
-        if self.theory.displacement == "use":
+        if self._problem.theory.displacement == "use":
             for ssh_map in [m.explained() for m in self.minimal.maps[:DRAFTS]] + self.drafts.maps():
-                keeper.drafts.add(ssh_map, trace)
+                keeper.drafts.add(ssh_map, problem.trace)
         return keeper
 
     def take(self, problem: Problem) -> None:
@@ -126,12 +112,8 @@ class MapKeeper:
 
         `began` is when the step began, by `time.perf_counter`.
         """
-        minimal = self.minimal
-        if (
-            not minimal.is_impossible
-            and not minimal.is_settled(self._options.max_maps)
-            and len(self.trace) >= self._next_search
-        ):
+        is_settled = self.minimal.is_impossible or self.minimal.is_settled(self._options.max_maps)
+        if not is_settled and len(self._problem.trace) >= self._next_search:
             self._ask()
         return self._solution(began)
 
@@ -142,12 +124,12 @@ class MapKeeper:
         If maps are replayed, maps without a proof do not replace the known ones. The best of them
         becomes a draft, which later steps extend.
         """
-        options, steps = self._options, len(self.trace)
+        trace, options = self._problem.trace, self._options
         is_proven = self.minimal.status is Status.OPTIMAL
         search = Search.continuing(
             self.search,
-            self.trace,
-            self.theory,
+            trace,
+            self._problem.theory,
             time_limit=options.time_limit,
             max_maps=options.max_maps,
             speedups=options.speedups,
@@ -158,26 +140,27 @@ class MapKeeper:
         said = search.solution()
         self.search, self._found, self.searches = search, said, self.searches + 1
         was_stopped = search.stopped in ("time limit", "interrupted")
-        self._next_search = max(steps + PAUSE, int(RETRY * steps)) if was_stopped else 0
+        later = max(len(trace) + PAUSE, int(RETRY * len(trace)))
+        self._next_search = later if was_stopped else 0
         proves = said.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
         if proves or not self.minimal.replays:
             self.minimal.replace(found, said.status, said.complete, said.cost)
             self.drafts.clear()
         elif found:
-            self.drafts.add(found[0], self.trace)
+            self.drafts.add(found[0], trace)
 
     def _solution(self, began: float) -> Solution:
         """The solution so far: the minimal maps, else one consistent map, else no map."""
         asked = self._found
         assert asked is not None
-        minimal, steps = self.minimal, len(self.trace)
+        minimal, trace, steps = self.minimal, self._problem.trace, len(self._problem.trace)
         status, cost = minimal.status, minimal.cost
         maps = tuple(m.explained() for m in minimal.maps)
-        if status is Status.UNKNOWN and (best := self.drafts.best(self.trace, self._problem.pairs)):
+        if status is Status.UNKNOWN and (best := self.drafts.best(trace, self._problem.pairs)):
             maps, status, cost = (best,), Status.FEASIBLE, Cost.of(best)
         self._spent += time.perf_counter() - began
         if maps and self._judging.has_time_for(steps, self._spent):
-            self._judging.pass_grown_map(self.trace, maps[0])
+            self._judging.pass_grown_map(trace, maps[0])
         was_asked = asked.steps == steps  # at this step
         return Solution(
             status=status,
@@ -185,7 +168,7 @@ class MapKeeper:
             cost=cost if maps else None,
             bound=asked.bound,
             complete=minimal.complete,
-            theory=self.theory,
+            theory=self._problem.theory,
             steps=steps,
             effort=Effort(
                 prefix=asked.effort.prefix,
@@ -196,8 +179,8 @@ class MapKeeper:
                 ),
                 evidence=said_by(
                     self._problem.evidence,
-                    self.trace,
-                    self.theory,
+                    trace,
+                    self._problem.theory,
                     {name: said["refused"] for name, said in asked.effort.evidence.items()},
                 ),
             ),
@@ -215,12 +198,7 @@ class Draft:
 
 
 class Drafts:
-    """Keeps drafts and sketches: maps of the steps so far that were made without a search.
-
-    Args:
-        problem: The steps so far, and the theory, in which no field is "auto".
-        judging: Judges maps by the evidence and the checker, for this theory.
-    """
+    """Keeps drafts and sketches: maps of the steps so far that were made without a search."""
 
     def __init__(self, problem: Problem, judging: Judging) -> None:
         trace, theory, evidence = problem.trace, problem.theory, problem.evidence
@@ -240,10 +218,6 @@ class Drafts:
             self._sketches = [
                 draft for draft in self._sketches if draft.sketch.extend(before.action, step)
             ]
-
-    def __bool__(self) -> bool:
-        """Whether there are drafts; sketches do not count."""
-        return bool(self._drafts)
 
     def maps(self) -> list[SSHMap]:
         """Return the maps of all drafts, the best first. These maps need not be consistent."""

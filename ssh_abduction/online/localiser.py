@@ -340,12 +340,9 @@ class Localiser:
         moved += (anywhere * (1 - unmapped) + outside * reentered) / self._number
         entered = anywhere * unmapped + sum(part.total for part in away[:1])
         stayed = outside * (1 - reentered) + sum(part.total for part in away[1:])
-        akin = (
-            (AKIN * entered + belief.akin * stayed) / (entered + stayed)
-            if entered + stayed
-            else AKIN
-        )
-        return Belief(moved, entered + stayed, akin=akin, away=tuple(away[:MOST_AWAY]))
+        nowhere = entered + stayed
+        akin = (AKIN * entered + belief.akin * stayed) / nowhere if nowhere else AKIN
+        return Belief(moved, nowhere, akin=akin, away=tuple(away[:MOST_AWAY]))
 
     def _alike(
         self, before: Observation | None, links: Links | None, seen: Observation | None
@@ -363,11 +360,8 @@ class Localiser:
         shares /= total
         # The effective number of dstates in the average (Kish 1965).
         count = (1 - before.novel) / float(shares @ shares)
-        follows = (
-            float((links.leads @ shares)[seen.where] @ seen.ratio)
-            * self._number
-            / (self._number + 1)
-        )
+        n = self._number
+        follows = float((links.leads @ shares)[seen.where] @ seen.ratio) * n / (n + 1)
         return (count * follows + 1 - seen.novel) / (count + 1) + seen.novel
 
     def _weighed(self, expected: Belief, seen: Observation | None, alike: float = 1.0) -> Belief:

@@ -84,17 +84,13 @@ class Away:
 
 
 class DeadReckoning:
-    """Where displacements lead in a map of N dstates with poses.
+    """Where displacements lead in a map of N dstates with poses, (N, 3).
 
-    Args:
-        poses: The poses of the dstates, (N, 3).
-        frame: The number of the frame of each dstate, (N,). Pieces and floors have frames of their
-            own.
-        odometry: The error of a dstate at each visit.
+    `frame` has the number of the frame of each dstate, (N,). Pieces and floors have frames of their
+    own. `odometry` says how far off a dstate the robot is at each visit.
     """
 
     def __init__(self, poses: Array, frame: NDArray[np.intp], odometry: Odometry) -> None:
-        """Put the dstates into a tree."""
         self._poses, self._odometry = poses, odometry
         self._spots = np.column_stack([poses[:, :2], APART * frame])
         self._tree = cKDTree(self._spots)
@@ -122,10 +118,8 @@ class DeadReckoning:
         """Compute p(x'|x,a) p(d|x,a,x') / q(d) for the links of an action a and a motion d, (N, N).
 
         q is the density at an unknown place: as from one of the links, or as broad as all of them
-        together. Each of these cases is equally likely.
-
-        Args:
-            links: p(x'|x,a), (N, N). Row x' is the end, column x the start.
+        together. Each of these cases is equally likely. `links` is p(x'|x,a), (N, N): row x' is the
+        end, column x the start.
         """
         targets, starts = links.nonzero()
         ways = self._ways(starts, targets)
@@ -136,22 +130,16 @@ class DeadReckoning:
         centre = (*ways[:, :2].mean(axis=0), mean)
         off = _off(ways, Motion(centre, error))
         broad = np.diag((off**2).mean(axis=0)) + error
-        usual = (
-            near.sum()
-            + _gaussian(_off(np.array([motion.displacement]), Motion(centre, error)), broad)[0]
-        )
+        off = _off(np.array([motion.displacement]), Motion(centre, error))
+        usual = near.sum() + _gaussian(off, broad)[0]
         weighed = links[targets, starts] * near * ((len(near) + 1) / usual)
         return sparse.csr_array((weighed, (targets, starts)), shape=links.shape)
 
     def arrivals(self, away: Away, unmapped: float) -> tuple[Array, Away]:
         """Compute where a robot may be that went away from a dstate by no link of the map.
 
-        Args:
-            away: The dstates that the robot may have left, and its motion since then.
-            unmapped: The prior probability that the end is at no dstate of the map.
-
-        Returns:
-            The probability of each dstate, (N,), and the part for which it is at none.
+        `unmapped` is the prior probability that the end is at no dstate of the map. Return the
+        probability of each dstate, (N,), and the part for which it is at none.
         """
         starts = np.flatnonzero(away.probabilities > LEAST)
         p, motion = away.probabilities[starts], away.motion
@@ -176,8 +164,7 @@ class DeadReckoning:
         cos, sin = np.cos(self._poses[starts, 2]), np.sin(self._poses[starts, 2])
         dx, dy, _ = motion.displacement
         moves = np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy, np.zeros(len(starts))])
-        ends: Array = self._spots[starts] + moves
-        return ends
+        return np.asarray(self._spots[starts] + moves)
 
     def _ways(self, starts: NDArray[np.intp], targets: NDArray[np.intp]) -> Array:
         """The displacements between n pairs of dstates, in the frame of the first one, (n, 3)."""

@@ -270,13 +270,9 @@ def action_in_words(move: Move) -> str:
 
 def _closed(graph: MoveGraph, avoid: Iterable[int | str]) -> set[Node]:
     """Find the nodes that a route must not visit."""
-    names: Iterable[int | str] = (
-        [avoid]
-        if isinstance(avoid, str | int)
-        else a_list("avoid", avoid, MapError, what="dstates and places")
-    )
+    given = [avoid] if isinstance(avoid, str | int) else avoid
     closed: set[Node] = set()
-    for i, name in enumerate(names):
+    for i, name in enumerate(a_list("avoid", given, MapError, what="dstates and places")):
         closed |= graph.nodes(name, f"avoid[{i}]")[0]
     return closed
 
@@ -388,15 +384,10 @@ class Leg:
 
 
 def coarse_route(ssh_map: SSHMap, start: int, goal: int) -> tuple[Leg, ...]:
-    """Find the regions to leave, the paths to pass and the regions to enter.
+    """Find the regions to leave, the paths to pass and the regions to enter from place to place.
 
-    Args:
-        ssh_map: The map. Without regions, the route has no legs.
-        start: The id of the place where the route starts.
-        goal: The id of the place where it ends.
-
-    Returns:
-        The legs. Regions are left from the smallest on, and entered from the largest on.
+    Regions are left from the smallest on, and entered from the largest on. In a map without
+    regions, the route has no legs.
 
     Reference:
         Kuipers 2000, "The Spatial Semantic Hierarchy": boundary relations guide the search.

@@ -99,17 +99,10 @@ class _LocatedBelief:
 
 
 class Confidence:
-    """Computes how sure the mapper is after each step.
-
-    Args:
-        theory: A theory that allows faults, and in which no field is "auto" any more.
-
-    Attributes:
-        known: The last map that was certain. If none was certain yet, the best map of the first
-            answer. None before the first answer.
-    """
+    """Computes how sure the mapper is after each step, for a theory that allows faults."""
 
     def __init__(self, theory: Theory) -> None:
+        # The last map that was certain. If none was certain yet, the best map of the first answer.
         self.known: SSHMap | None = None
         self._chances = chances_of(theory)
         self._broke: list[tuple[int, str]] = []  # step and sentence, since the map was certain
@@ -147,11 +140,8 @@ class Confidence:
         This needs a later step, and localisation has to agree with the best map: it gives more than
         half of the probability to the dstate where this map has the robot.
         """
-        return (
-            self._broke[-1][0] < len(trace) - 1
-            and where.likeliest == lead.here
-            and where.probability > 0.5
-        )
+        is_later = self._broke[-1][0] < len(trace) - 1
+        return is_later and where.likeliest == lead.here and where.probability > 0.5
 
     def _hypotheses(
         self, rivals: Sequence[ExtendedMap], shares: Sequence[float]

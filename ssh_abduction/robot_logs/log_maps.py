@@ -357,14 +357,11 @@ def map_log(
         solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
     mapping.latest = lambda: outcome(solution)
     if corrections is not None:
-        solution = with_correction_warnings(
-            corrections,
-            solution,
-            allowed,
-            lambda trace, theory, seconds: mapping.solve(
-                trace, theory, time_limit=seconds, max_maps=1
-            ),
-        )
+
+        def best(trace: Trace, theory: Theory, seconds: float) -> Solution:
+            return mapping.solve(trace, theory, time_limit=seconds, max_maps=1)
+
+        solution = with_correction_warnings(corrections, solution, allowed, best)
     seconds["maps"] = round(time.process_time() - begin, 3)
 
     # 4. Ladder: what each kind of evidence is worth.

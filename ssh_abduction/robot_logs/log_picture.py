@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from perception.places.importing import Imported
-from perception.readers.scans import Pose, RobotLog, Scan
+from perception.readers.scans import RobotLog, Scan
 from perception.readers.stored import in_turn
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.odometry import moved
+from ssh_abduction.data.odometry import Pose, moved
 from ssh_abduction.data.star import Star
 from ssh_abduction.output.drawing import ALARM, colour_of, escaped, page, svg_text, titled
 from ssh_abduction.output.layout import fitted_motion

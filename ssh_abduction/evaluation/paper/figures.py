@@ -299,10 +299,8 @@ def draw_outcomes(
                 if o.k == 4 and o.uncertainty > 1 - 1e-9 and o.right and o.rate > 0.999:
                     frame = {"fill": False, "edgecolor": ORANGE, "linewidth": 2}
                     axes.add_patch(pyplot.Rectangle((j - 0.47, i - 0.47), 0.94, 0.94, **frame))
-        x, y = (
-            np.interp(here[1], scales, range(len(scales))),
-            np.interp(here[0], notches, range(len(notches))),
-        )
+        x = np.interp(here[1], scales, range(len(scales)))
+        y = np.interp(here[0], notches, range(len(notches)))
         axes.plot(x, y, "x", color="red", markersize=10, markeredgewidth=2.5)
         axes.set_xticks(range(len(scales)), [f"{1000 * s:.1f}" for s in spreads])
         axes.set_yticks(range(len(notches)), [f"{100 * n:g}" for n in notches])
