@@ -167,6 +167,14 @@ def test_good_log_gets_no_warning_of_a_carry(
     assert "carried" not in notes
 
 
+def test_note_says_if_scans_that_contradict_others_are_far_from_them(
+    scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(log_checks, "_contradictions", lambda log, track: [17])
+    assert "m apart: take all scans" in notes_of([*scans[:17], *scans[21:]])
+    assert "take all scans" not in notes_of(scans)
+
+
 def test_good_log_gets_no_warning(scans: tuple[Scan, ...]) -> None:
     assert notes_of(scans) == ""
 

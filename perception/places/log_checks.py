@@ -7,7 +7,7 @@ of them (docs/measurements/robustness.md). Each check says what is wrong and wha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -276,7 +276,7 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
             f"{log.scans[contradictions[0]].line}) contradict each other"
             f"{f', and so at {len(contradictions) - 1} more' if contradictions[1:] else ''}. The "
             "robot may have been carried there, or the file may hold two drives: cut it there, and "
-            "map each part."
+            f"map each part.{_about_gaps(log, contradictions)}"
         )
     if track.way[-1] > 2 * AWAY and not _returns(track):
         notes.append(
@@ -285,6 +285,18 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
             "Drive each corridor twice, or end where the drive began."
         )
     return replace(track, is_reliable=is_reliable), notes
+
+
+def _about_gaps(log: RobotLog, scans: Sequence[int]) -> str:
+    """Say that scans which contradict those before them are far from these, if most of them are."""
+    places = log.odometry[:, :2]
+    gap = float(np.median([math.dist(places[i - 1], places[i]) for i in scans]))
+    if gap <= SPARSE:
+        return ""
+    return (
+        f" Or matching failed, as these scans are {gap:.1f} m apart: take all scans of the drive, "
+        "at least one per metre."
+    )
 
 
 def _about_darkness(log: RobotLog, track: Track) -> list[str]:
