@@ -157,6 +157,16 @@ def test_report_names_rival_maps_only_if_they_were_sought(house: LogMap) -> None
         assert ("<h2>Rival maps</h2>" in page) == sought
 
 
+def test_report_calls_no_join_sure_if_the_search_ended_early(house: LogMap) -> None:
+    weighed = house.solution.weighed
+    assert weighed is not None
+    for searched, told in ((True, "None: "), (False, "Unknown: a map that costs less")):
+        found = replace(weighed, bound=0.0, searched=searched)
+        solution = replace(house.solution, support=replace(house.solution.support, weighed=found))
+        page = report(house.log, house.imported, solution, (), house.to_dict())
+        assert f"<h2>Doubtful joins</h2><p>{told}" in page
+
+
 def test_picture_shows_probabilities_of_doubtful_joins(
     house: LogMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:

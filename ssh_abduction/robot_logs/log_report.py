@@ -142,6 +142,12 @@ def _ladder(rungs: Sequence[Rung]) -> str:
 def _doubts(solution: Solution) -> str:
     """Make the table of the joins of the first map that are not sure."""
     doubts = doubtful_joins(solution)
+    weighed = solution.weighed
+    if not doubts and weighed and not (weighed.proven or weighed.searched):
+        return _paragraph(
+            "Unknown: a map that costs less may exist, with other joins. To search longer, use "
+            "--time-limit."
+        )
     if not doubts:
         return _paragraph(
             "None: each two visits that the first map puts at one place are there with a "
