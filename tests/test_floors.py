@@ -306,3 +306,12 @@ def test_map_at_the_time_limit_has_the_end_of_a_lift_on_a_path() -> None:
     theory = Theory(all_on_paths=True)
     (ssh_map,) = solve(trace, theory, time_limit=1e-9).maps
     assert check(trace, ssh_map, theory) == ()
+
+
+def test_return_by_a_lift_to_one_known_place_gives_no_probability() -> None:
+    moved = [(9.0, 0.0, 0.0), None, (9.0, 0.0, 0.0), None]
+    trace = Trace.from_steps("abcda", ["travel", UP, "travel", DOWN], displacements=moved)
+    weighed = solve(trace).weighed
+    assert weighed is not None
+    assert weighed.rivals[0].places[0] == weighed.rivals[0].places[4]
+    assert "steps 0 and 4 across a missing displacement" in (weighed.doubt or "")

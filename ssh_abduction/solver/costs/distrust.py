@@ -64,10 +64,10 @@ def misfit_of(problem: Problem, best: SSHMap) -> str | None:
 
 
 def gaps_of(problem: Problem) -> tuple[int, ...]:
-    """List the steps within drives that no measurement connects to the step before."""
+    """List the steps on one floor of a drive that no measurement connects to the step before."""
     part, starts = _measured_parts(problem), starts_of(problem.trace)
-    steps = range(1, len(problem.trace))
-    return tuple(t for t in steps if t not in starts and not part.are_one(t - 1, t))
+    same_floor = (t for t, a in enumerate(problem.trace.actions, 1) if not a.changes_floor)
+    return tuple(t for t in same_floor if t not in starts and not part.are_one(t - 1, t))
 
 
 def _unknown_step(problem: Problem) -> int | None:
@@ -125,7 +125,7 @@ def _unconfirmed_join(problem: Problem, best: SSHMap) -> str | None:
 
 
 def _measured_parts(problem: Problem, wrong: Collection[int] = frozenset()) -> NodeClasses[int]:
-    """Group the steps that displacements, closures, lifts and turns connect.
+    """Group the steps that displacements, closures and turns connect.
 
     `wrong` has the steps whose displacement is wrong.
     """
@@ -133,7 +133,7 @@ def _measured_parts(problem: Problem, wrong: Collection[int] = frozenset()) -> N
     part = NodeClasses[int]()
     for t, action in enumerate(trace.actions, 1):
         is_measured = trace.steps[t].displacement is not None and t not in wrong
-        if is_measured or action.kind in ("lift", "stairs") or (has_places and action.turn):
+        if is_measured or (has_places and action.turn):
             part.merge(t - 1, t)
     for closure in trace.closures:
         part.merge(closure.first, closure.last)
