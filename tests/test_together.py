@@ -417,11 +417,14 @@ def test_drive_that_shares_one_place_gets_four_headings() -> None:
     (known,) = of_mazes(3, 2, [0], truth.Noise(Odometry(**truth.NOISE)), drives=1)
     problem = settle(known.trace, Theory())
     first = Extending(problem, Log(problem.trace, problem.theory, problem.pairs)).first()
-    pieces = Pieces(here=5, of_heading=(0, 5), hinges={5: first.position[0]})
-    found = replace(first, heading=first.heading * 2, pieces=pieces)
+    pieces = Pieces(here=5, of_heading=(0, 5), hinges={5: 0})
+    mean = first.mean.copy()
+    mean[-1] += 0.5  # In its frame, the drive faces any way.
+    heading = [*first.heading, len(mean) - 1]
+    found = replace(first, places=[0, 0], heading=heading, mean=mean, pieces=pieces)
     one, other = zip(*headings_by_turn(found), strict=True)
     assert len({*one}) == 1
-    assert other == pytest.approx([other[0] + k * math.pi / 2 for k in range(4)])
+    assert other == pytest.approx([one[0] + k * math.pi / 2 for k in range(4)])
 
 
 @pytest.mark.parametrize("known", MAZES, ids=[known.name for known in MAZES])

@@ -41,8 +41,7 @@ class Pieces:
         here: The piece that the robot is in.
         of_place: The piece of each place.
         of_heading: The piece of the heading of each dstate.
-        hinges: For each piece that has only a place in common with others: the index of the x of
-            this place in the means.
+        hinges: For each piece that has only a place in common with others: this place.
         joins: How pieces were joined: triples of a piece, and the place and dstate of another piece
             that the robot came to. The dstate is None if only the place was known.
     """
@@ -68,13 +67,14 @@ class Pieces:
 
     def merged(self, other: int) -> Pieces:
         """Make the piece of the robot a part of another piece."""
-        return replace(
-            self,
-            here=other,
-            of_place=tuple(other if piece == self.here else piece for piece in self.of_place),
-            of_heading=tuple(other if piece == self.here else piece for piece in self.of_heading),
-            hinges={piece: at for piece, at in self.hinges.items() if piece != self.here},
-        )
+        of_place = tuple(other if piece == self.here else piece for piece in self.of_place)
+        of_heading = tuple(other if piece == self.here else piece for piece in self.of_heading)
+        hinges = {
+            piece: place
+            for piece, place in self.hinges.items()
+            if piece not in (self.here, of_place[place])
+        }
+        return replace(self, here=other, of_place=of_place, of_heading=of_heading, hinges=hinges)
 
 
 def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothesis:
@@ -91,17 +91,18 @@ def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothes
         return found
     joined = replace(pieces, joins=(*pieces.joins, (pieces.here, place, dstate)))
     mean, n = found.mean, len(found.mean) - 3
-    hinge, at = pieces.hinges.get(pieces.here), found.position[place]
+    hinge = pieces.hinges.get(pieces.here)
     if dstate is not None:
         angle = mean[found.heading[dstate]] - mean[n + 2]
     elif hinge is None:
-        return replace(found, pieces=replace(joined, hinges={**pieces.hinges, pieces.here: at}))
+        return replace(found, pieces=replace(joined, hinges={**pieces.hinges, pieces.here: place}))
     else:
-        ways = [mean[[x, x + 1]] - mean[[hinge, hinge + 1]] for x in (n, at)]
+        at = found.position[hinge]
+        ways = [mean[[x, x + 1]] - mean[[at, at + 1]] for x in (n, found.position[place])]
         if min(math.hypot(*way) for way in ways) < NEAR:
             return found
         angle = math.atan2(*ways[1][::-1]) - math.atan2(*ways[0][::-1])
-    turned = _turned(found, float(angle), n if hinge is None else hinge)
+    turned = _turned(found, float(angle), n if hinge is None else found.position[hinge])
     return replace(turned, pieces=joined.merged(other))
 
 
@@ -109,9 +110,17 @@ def headings_by_turn(found: Hypothesis) -> Iterator[list[float]]:
     """Yield the headings of the dstates in radians, for each way to turn the pieces with hinges.
 
     At a place with four slots, frames differ by quarter turns. Where only a place joins a piece to
-    others, each quarter turn is possible.
+    others, the piece is first turned by up to an eighth, so that its headings there fit the slots.
+    Then each quarter turn is possible.
     """
     pieces, facing = found.pieces, found.mean[found.heading]
+    for piece, hinge in pieces.hinges.items():
+        there = [s for s, place in enumerate(found.places) if place == hinge]
+        own = next(s for s in there if pieces.of_heading[s] == piece)
+        other = next(s for s in there if pieces.of_heading[s] != piece)
+        facing[np.equal(pieces.of_heading, piece)] += math.remainder(
+            facing[other] - facing[own], math.pi / 2
+        )
     for quarters in islice(product(range(4), repeat=len(pieces.hinges)), TURNS):
         turn = dict(zip(pieces.hinges, quarters, strict=True))
         turns = [turn.get(piece, 0) * math.pi / 2 for piece in pieces.of_heading]
@@ -130,7 +139,8 @@ def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
     if other == pieces.here:
         return found
     angle = found.mean[found.heading[dstate]] + turn - found.mean[n + 2]
-    turned = _turned(found, float(angle), pieces.hinges.get(pieces.here, n))
+    hinge = pieces.hinges.get(pieces.here)
+    turned = _turned(found, float(angle), n if hinge is None else found.position[hinge])
     joins = (*pieces.joins, (pieces.here, found.places[dstate], dstate))
     return replace(turned, pieces=replace(pieces, joins=joins).merged(other))
 
