@@ -128,13 +128,20 @@ def test_warning_for_each_kind_of_bad_log(
     assert told in notes_of(change(scans))
 
 
-def test_track_of_a_stuck_laser_is_unreliable(scans: Scans) -> None:
-    """A robot may stand while its laser repeats a scan."""
-    standing = [*scans[:40], *[scans[40]] * 10]
-    for drive, is_good in [(standing, True), (with_stuck_laser(scans), False)]:
-        _, track, notes = tracked(RobotLog(tuple(drive), source="drive"))
-        assert track.is_reliable is is_good
-        assert ("The laser repeats one scan" in " ".join(notes)) is not is_good
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (with_stuck_laser, "The laser repeats one scan"),
+        (kidnapped, "contradict each other"),
+        (lambda scans: [*scans[:40], *[scans[40]] * 10], None),  # A robot may stand.
+    ],
+)
+def test_track_of_a_stuck_laser_or_a_carried_robot_is_unreliable(
+    scans: tuple[Scan, ...], change: Callable[[Scans], Scans], told: str | None
+) -> None:
+    _, track, notes = tracked(RobotLog(tuple(change(scans)), source="drive"))
+    assert track.is_reliable is (told is None)
+    assert any(told in note for note in notes) if told else notes == ()
 
 
 def test_missing_odometry_does_not_turn_wrongly(scans: Scans) -> None:

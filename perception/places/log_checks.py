@@ -278,6 +278,7 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
             "robot may have been carried there, or the file may hold two drives: cut it there, and "
             f"map each part.{_about_gaps(log, contradictions)}"
         )
+        is_reliable = False
     if track.way[-1] > 2 * AWAY and not _returns(track):
         notes.append(
             f"In {track.way[-1]:.0f} m the robot never comes back to where it was before, at least "
