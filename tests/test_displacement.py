@@ -24,6 +24,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.dead_reckoning import ErrorFilter
 from ssh_abduction.checker.geometry import _square_together
 from ssh_abduction.data import DState, Odometry, TheoryError
+from ssh_abduction.data.closure import Closure
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.facts.answer_maps import causal_map
 from ssh_abduction.solver.geometry.fit import Poses, fit
@@ -292,6 +293,11 @@ def test_warning_if_the_noise_model_is_wrong(factor: float, said: str | None) ->
         f"multiply them by {factor:.1g}"[:-1] in warning
         or abs(float(warning.rsplit(" ", 1)[1]) - factor) < 0.2 * factor
     )
+    variances = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))
+    matched = replace(trace, closures=(Closure(0, 1, (0.0, 0.0, 0.0), variances),))
+    of_log = noise_warning(replace(ssh_map, fit=fit(trace, ssh_map)), matched)
+    assert of_log is not None
+    assert of_log.endswith("the track or some joins of the map may be wrong")
 
 
 def test_warning_gives_a_limit_if_displacements_are_exact() -> None:

@@ -18,6 +18,7 @@ from perception.readers.poses import sources_of
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.stored import in_turn
 from ssh_abduction.data.odometry import Pose, displacement_between
+from ssh_abduction.data.words import counted
 
 if TYPE_CHECKING:
     from perception.places.track import Track
@@ -165,7 +166,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
         notes.append(_describe_jumps(log, jumps, far))
     if still:
         notes.append(
-            f"The odometry stands still in {len(still)} steps, from scan {still[0]} "
+            f"The odometry stands still in {counted(len(still), 'steps')}, from scan {still[0]} "
             f"({_where(log, still[0])}) on, while the scans show that the robot moved: it was "
             "carried, or the odometer hung. The trace has no displacement across."
         )

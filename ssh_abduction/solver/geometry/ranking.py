@@ -144,11 +144,13 @@ def noise_warning(ssh_map: SSHMap, trace: Trace) -> str | None:
         # displacement there, which is too much.
         return None
     how, noise = ("smaller", "tight") if factor > 1 else ("larger", "loose")
+    mend = f"multiply them by {factor:.2g}"
+    if trace.closures:  # of a log, whose covariances no user has set
+        mend = "the track or some joins of the map may be wrong"
     return (
         f"the noise model of the odometry is too {noise}: the best map fits with a chi-square of "
         f"{fit.chi2:.0f}, where {fit.dof} is expected. "
-        f"So its standard deviations are {_times(factor)} {how} than the errors; multiply them by "
-        f"{factor:.2g}"
+        f"So its standard deviations are {_times(factor)} {how} than the errors; {mend}"
     )
 
 
