@@ -306,7 +306,9 @@ def _raise_no_route(
             f"avoid: expected a way around what is avoided, got none to {named}; avoid less"
         )
     mend = "drive on (ssh-abduction next says what to try)"
-    if graph.closed:
+    if not any(here & {*piece} and there & {*piece} for piece in graph.map.pieces):
+        mend = "it is in another piece of the map; add a drive that leads there (solve --onto)"
+    elif graph.closed:
         mend = "no route passes a gateway that was last seen closed; drive on if it is open again"
     elif graph.by != "places" and graph.map.places:
         mend = "take --by places, which may lead where the robot has not driven, or drive on"
