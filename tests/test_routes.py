@@ -104,7 +104,7 @@ def test_route_by_places_stays_in_one_piece() -> None:
         near, far = (f"p{ssh_map.place_of(t)}" for t in (1, 2))
         assert len(route(ssh_map, 0, near, by="places").moves) == 1
         for by in ("actions", "places"):
-            with pytest.raises(MapError, match="to 2 dstates.*; it is in another piece"):
+            with pytest.raises(MapError, match=r"to 2 dstates.*; it is in another piece"):
                 route(ssh_map, 0, far, by=by)
 
 
