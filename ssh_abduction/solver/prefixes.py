@@ -51,7 +51,6 @@ from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.facts import readable
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.engines.base import Engine, Found, Task
-from ssh_abduction.solver.engines.refusing import first_accepted
 from ssh_abduction.solver.engines.stepwise import StepEngine, paths_needed
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
@@ -127,17 +126,14 @@ class Prefixes:
 
     def minimise(self) -> Found | None:
         """Find a minimal map of the prefix (first steps) that no evidence rejects, or None."""
-
-        def why_refused(found: Found) -> frozenset[Equality] | None:
-            refusal = self._judging.refusal(found.map)
-            if refusal is None:
-                return None
+        while (found := self._minimise_known()) is not None:
+            if (refusal := self._judging.refusal(found.map)) is None:
+                return found
             name, equalities = refusal
             _log.debug("%s refuses a map, for %d equalities", name, len(equalities))
             self._known.refused[name] = self._known.refused.get(name, 0) + 1
-            return equalities
-
-        return first_accepted(self._minimise_known, why_refused, self._forbid)
+            self._forbid(equalities)
+        return None
 
     def _forbid(self, equalities: frozenset[Equality]) -> None:
         """Forbid all maps with all these equalities, with a `StepEngine` if this engine cannot."""

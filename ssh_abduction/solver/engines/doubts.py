@@ -29,10 +29,7 @@ class Doubts:
     """Asks one control of clingo whether a map contradicts what all known maps share."""
 
     def __init__(
-        self,
-        asker: Asker,
-        control: Control,
-        condition: Callable[[Sort, int, int], str | None],
+        self, asker: Asker, control: Control, condition: Callable[[Sort, int, int], str | None]
     ) -> None:
         """Begin without any doubt.
 

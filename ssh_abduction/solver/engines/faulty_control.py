@@ -181,5 +181,6 @@ class FaultyControl:
         """Read an answer of clingo."""
         where, slips, lost = faulty_lp.read_faulty(model)
         used = set(where.values())
-        rests = frozenset(view for name, view in faulty_lp.faulty_rests(self.names) if name in used)
+        rest_of = {view: name for name, view in faulty_lp.faulty_names(self.names)}  # the last name
+        rests = frozenset(view for view, rest in rest_of.items() if rest in used)
         return FaultyAnswer(model.cost[0] if model.cost else 0, where, slips, lost, rests)

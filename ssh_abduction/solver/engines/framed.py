@@ -40,7 +40,7 @@ from ssh_abduction.solver.engines.base import Found, Task, listing, next_charted
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.framed_paths import Fitted, FramedPaths, NodeLabels
 from ssh_abduction.solver.engines.framed_sides import FramedSides
-from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted
+from ssh_abduction.solver.engines.refusing import all_accepted
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality
@@ -83,9 +83,8 @@ class FramedEngine:
         return self._visits.chart
 
     def over(self, task: Task) -> FramedEngine:
-        self._task = self._fitting.task = task
+        self._task = self._fitting.task = self._visits.task = task
         self.asker.watch = task.watch
-        self._visits.work_on(task)
         self.asker.ground_seconds = self.asker.solve_seconds = 0.0
         return self
 
@@ -122,15 +121,11 @@ class FramedEngine:
 
     def _first_with_paths(self) -> Fitted | None:
         """Find a smallest map of the prefix, and its labels; None if the prefix has no map."""
-        fitted: list[Fitted] = []
-
-        def why_not(labels: list[int]) -> list[int] | None:
-            found = self._fitting.some(self._chart, labels)
-            fitted.extend([found] if found else [])
-            return None if found else labels
-
-        first_accepted(self._visits.fewest, why_not, self._refuse)
-        return fitted[0] if fitted else None
+        while (labels := self._visits.fewest()) is not None:
+            if fitted := self._fitting.some(self._chart, labels):
+                return fitted
+            self._refuse(labels)
+        return None
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         if not self._framed:
@@ -161,14 +156,13 @@ class FramedEngine:
         known: set[Hashable] = {tuple(besides)}
         fitted: dict[tuple[int, ...], Fitted] = {}
 
-        def why_not(labels: list[int]) -> list[int] | None:
-            if (found := self._fitting.some(self._chart, labels)) is None:
-                return labels
-            fitted[tuple(labels)] = found
-            return None
+        def fits(labels: list[int]) -> bool:
+            if found := self._fitting.some(self._chart, labels):
+                fitted[tuple(labels)] = found
+            return found is not None
 
         every = all_accepted(
-            lambda: self._visits.all_of(dstates), why_not, self._refuse, key=tuple, known=known
+            lambda: self._visits.all_of(dstates), fits, self._refuse, key=tuple, known=known
         )
         for labels in every:
             yield fitted.pop(tuple(labels)).node_labels

@@ -1,10 +1,7 @@
 """Adds the axioms of order and sides to the search for visits. The engine with frames uses it.
 
-sides_framed.lp has the axioms about the order of places on a path, and about its sides. One path
-takes a rule for each pair of visits that may be at one place. So the axioms are added only for
-paths that an answer contradicts. In a half explored world the causal axioms allow fewer dstates
-than order and sides do, in too many ways to forbid them one by one. But the axioms of a few paths
-exclude nearly all of them.
+sides_framed.lp has the axioms about the order of places on a path, and about its sides. They are
+added only for paths that an answer contradicts; `engines/framed.py` says why.
 """
 
 from __future__ import annotations
@@ -47,10 +44,7 @@ class FramedSides:
             self._asker.control.ground([("paths", number_symbols(batch)), *paths])
 
     def say_of_path(
-        self,
-        contrary: Iterable[int],
-        twice: Iterable[int],
-        standing: Mapping[int, tuple[int, int]],
+        self, contrary: Iterable[int], twice: Iterable[int], standing: Mapping[int, tuple[int, int]]
     ) -> bool:
         """Add the axioms of a path that labels contradict, and return whether there was one.
 

@@ -127,7 +127,7 @@ class FramelessEngine:
         """Yield all labels with this many dstates, except `besides`, that places and paths fit."""
         return all_accepted(
             ask=lambda: self._named.all_of(dstates, 0),
-            refuse=self._fitting.why_not,
+            fits=self._fitting.fits,
             forbid=self._fitting.forbid,
             key=lambda labels: tuple(numbered(labels)),
             known={tuple(numbered(besides))},

@@ -196,10 +196,6 @@ class PlacesAndPaths:
                 if len(best.map.paths) <= fewest:
                     return best
 
-    def why_not(self, labels: list[int]) -> list[int] | None:
-        """Return the labels themselves if no places and paths fit them, else None."""
-        return None if self.fits(labels) else labels
-
     def _has_paths(self, control: Control) -> bool:
         """Whether a control has an answer, that is, places and paths."""
         return next(self._asker.answers(lambda _: True, "ignore", 1, control=control), False)

@@ -11,50 +11,31 @@ from contextlib import closing
 from typing import TypeVar
 
 Answer = TypeVar("Answer")
-Reason = TypeVar("Reason")
-
-
-def first_accepted(
-    ask: Callable[[], Answer | None],
-    refuse: Callable[[Answer], Reason | None],
-    forbid: Callable[[Reason], None],
-) -> Answer | None:
-    """Ask for answers until one is accepted; None if there is no answer left.
-
-    `refuse` returns a reason to reject an answer, or None. `forbid` forbids all answers to which
-    this reason applies.
-    """
-    while (answer := ask()) is not None:
-        reason = refuse(answer)
-        if reason is None:
-            return answer
-        forbid(reason)
-    return None
 
 
 def all_accepted(
     ask: Callable[[], Generator[Answer, None, object]],
-    refuse: Callable[[Answer], Reason | None],
-    forbid: Callable[[Reason], None],
+    fits: Callable[[Answer], bool],
+    forbid: Callable[[Answer], None],
     key: Callable[[Answer], Hashable],
     known: set[Hashable],
 ) -> Generator[Answer, None, None]:
-    """Yield all accepted answers, each once. See `first_accepted` for `refuse` and `forbid`.
+    """Yield all answers that fit, each once. If one does not fit, forbid it, and ask again.
 
     `key` is equal for answers that are the same. Answers with `known` keys are left out, and the
     keys of accepted answers are added to them.
     """
     while True:
-        reason: Reason | None = None
+        refused: Answer | None = None
         with closing(ask()) as answers:
             for answer in answers:
                 if key(answer) in known:
                     continue
-                reason = refuse(answer)
-                if reason is not None:
+                if not fits(answer):
+                    refused = answer
                     break
                 known.add(key(answer))
                 yield answer
-        if reason is None:
+        if refused is None:
             return
-        forbid(reason)
+        forbid(refused)

@@ -10,9 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence, Set
 from typing import TypeAlias
 
-import clingo
-
-from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.steps.chart import FramedChart
 
 # After finding this many triples of visits, stop looking for more, and give them to clingo.
@@ -59,14 +56,6 @@ def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> 
         if len(found) >= AT_A_TIME:
             break
     return list(found)
-
-
-class PairOf(dict[clingo.Symbol, Pair]):
-    """A dict from each atom `same` to its pair of visits. An atom is read when first looked up."""
-
-    def __missing__(self, symbol: clingo.Symbol) -> Pair:
-        pair = self[symbol] = visits_lp.read_same(symbol)
-        return pair
 
 
 def take(turned: Turned, pair: Pair) -> None:

@@ -17,9 +17,8 @@ others. When the trace grows, new nodes are put last. So the rules that clingo h
 that it learned, still hold. When the number of nodes has grown by a tenth, a new control begins
 with a new clique.
 
-*Transitivity.* If visits I and J are at one place, and J and K, then so are I and K. Clingo gets
-this rule only for visits at which an answer violates it (`engines/transitive.py`). Without these
-rules clingo solves a relaxation, so its bounds hold.
+*Transitivity.* Clingo gets the rules of transitivity only for visits at which an answer violates
+them (`engines/transitive.py`). Without them clingo solves a relaxation, so its bounds hold.
 
 *Few visits.* Of a long trace, clingo first gets the visits of the clique, and some of the first
 visits, such that few pairs of them may be at one place. Mostly an answer also determines the places
@@ -53,21 +52,17 @@ class VisitLabels:
     """Finds labels with the fewest dstates for the first `size` steps of a trace.
 
     Attributes:
+        task: The problem. Its trace may be replaced by a longer one.
         bound: A proven lower bound on the number of dstates; None if none is known.
         clique: Nodes that are pairwise distinct.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        asker: Asker,
-        sides: FramedSides,
-    ) -> None:
+    def __init__(self, task: Task, asker: Asker, sides: FramedSides) -> None:
         """Begin without any steps. `sides` adds axioms to each new control and batch of visits."""
         self.bound: int | None = None
         self.clique: list[int] = []
         self.size = 0
-        self._task, self._asker, self._sides = task, asker, sides
+        self.task, self._asker, self._sides = task, asker, sides
         self._program: VisitProgram | None = None
         self._nodes_at_start = 0  # the number of nodes when the control was made
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
@@ -84,10 +79,6 @@ class VisitLabels:
         """The visits and nodes of the first steps."""
         return self.program.chart
 
-    def work_on(self, task: Task) -> None:
-        """Go on with a longer trace. It begins with the steps of the previous trace."""
-        self._task = task
-
     def grow(self, size: int) -> bool:
         """Chart the first `size` steps, and give clingo their new visits.
 
@@ -97,7 +88,7 @@ class VisitLabels:
         if size == self.size:
             return True
         with self._asker.grounding_timed():
-            chart = Chart.framed(self._task.trace, self._task.log, size)
+            chart = Chart.framed(self.task.trace, self.task.log, size)
             if chart is None:
                 return False
             if self.size and len(chart.seen) <= GROWN * self._nodes_at_start:
@@ -117,15 +108,15 @@ class VisitLabels:
         """Find the clique. Return its nodes, then the others: first those apart from most nodes."""
         apart = chart.apart()
         self._asker.watch.check()
-        self.clique = clique(apart, chart.seen) if self._task.speedups.clique else []
+        self.clique = clique(apart, chart.seen) if self.task.speedups.clique else []
         others = set(range(len(apart))) - set(self.clique)
         return [*self.clique, *sorted(others, key=lambda node: (-int(apart[node].sum()), node))]
 
     def _first_visits(self, chart: FramedChart) -> set[int]:
         """Return the visits that clingo gets first: all, or those of the clique and early ones."""
         # Clingo has to know all visits that the user says are at one place.
-        said = self._task.log.pairs.one or self._task.theory.same_place
-        is_lazy = self._task.speedups.lazy and not said
+        said = self.task.log.pairs.one or self.task.theory.same_place
+        is_lazy = self.task.speedups.lazy and not said
         first = chart.visits_with(FIRST_PAIRS) if is_lazy else len(chart.stars)
         return {*range(first), *(chart.facing[node][0] for node in self.clique)}
 
@@ -137,7 +128,7 @@ class VisitLabels:
         fits = fits_in_time(self._asker.watch, chart, visits, known)
         size, self.size = self.size, 0  # an error may leave this prefix incomplete
         if anew:
-            self._program = VisitProgram(self._task, self._asker, chart, self._sides)
+            self._program = VisitProgram(self.task, self._asker, chart, self._sides)
             self._nodes_at_start = len(chart.seen)
         self.program.give(chart, visits, order, fits)
         self._raise_bound(self.program.least)

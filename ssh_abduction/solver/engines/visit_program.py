@@ -18,7 +18,7 @@ from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.framed_sides import FramedSides
-from ssh_abduction.solver.engines.transitive import Pair, PairOf, Three, intransitive
+from ssh_abduction.solver.engines.transitive import Pair, Three, intransitive
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.solver.steps.localising import Located, State, faced, located
 from ssh_abduction.theory.pairs import pairs_in
@@ -72,7 +72,6 @@ class VisitProgram:
         asker.control = new_control("visits", "", ["--heuristic=Domain", *cores])
         self.least = 0
         self.known = GivenVisits()
-        self._pair_of = PairOf()
         self._closed = 0  # how often rules of transitivity were given
         sides.begin()
 
@@ -149,7 +148,7 @@ class VisitProgram:
 
     def read(self, model: clingo.Model) -> list[Pair]:
         """Read the pairs of visits that are at one place in an answer."""
-        return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
+        return list(map(visits_lp.read_same, model.symbols(shown=True)))
 
     def add_rules(self, rules: str, part: str | None = None, number: int = 0) -> None:
         """Give clingo more rules. Then ground the program part `part(number)`, if given.

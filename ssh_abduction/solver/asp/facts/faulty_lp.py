@@ -29,13 +29,6 @@ def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
         first += count + 1
 
 
-def faulty_rests(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
-    """Yield the rest of each view, with the view. `names` is as for `faulty_names`."""
-    named = dict(names)
-    last = {view: name for name, view in faulty_names(named)}
-    return ((name, view) for view, name in last.items())
-
-
 def at_most_faults(most: int) -> str:
     """Return the rule that the steps given so far have at most this many faults."""
     return f":- #count {{ T,misread : misreads(T); T,slipped : slips(T) }} > {most}."

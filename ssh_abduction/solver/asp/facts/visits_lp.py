@@ -8,6 +8,7 @@ directions. Slots are numbered clockwise from the heading on arrival. A *pair* o
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from itertools import product
 
 from clingo import Function, Symbol
@@ -47,8 +48,9 @@ def visit_facts(
     )
 
 
+@lru_cache(maxsize=2**16)
 def read_same(atom: Symbol) -> tuple[int, int, int]:
-    """Read the pair of visits (I, J, R) from an atom of `same`."""
+    """Read the pair of visits (I, J, R) from an atom of `same`. Answers share most atoms."""
     first, second, turned = (argument.number for argument in atom.arguments)
     return first, second, turned
 
