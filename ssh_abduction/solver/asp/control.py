@@ -156,37 +156,25 @@ class Control(clingo.Control):
         parts: Sequence[tuple[str, Sequence[clingo.Symbol]]] = (("base", ()),),
         context: Any = None,
     ) -> None:
+        """Ground program parts, and add up the time and the memory that this takes."""
         asked = _GroundingCheck(self._check)
         with self._alone():
-            self._ground_alone(parts, context, asked)
-
-    def _ground_alone(
-        self,
-        parts: Sequence[tuple[str, Sequence[clingo.Symbol]]],
-        context: Any,
-        asked: _GroundingCheck,
-    ) -> None:
-        """Ground program parts, and add up the time and the memory that this takes."""
-        began, before = time.perf_counter(), peak_memory()
-        try:
-            super().ground(parts, context or asked)
-        except BaseException:
-            if asked.raised is not None:
-                # Clingo raises a copy of the exception that lacks its attributes. Raise the
-                # exception itself.
-                raise asked.raised from None
-            raise
-        finally:
-            seconds, mebibytes = time.perf_counter() - began, peak_memory() - before
-            self.seconds += seconds
-            self.mebibytes += mebibytes
-            if seconds > SLOW:
-                _log.debug(
-                    "clingo grounded %s in %.2f s, %.0f MiB",
-                    ", ".join(dict.fromkeys(name for name, _ in parts)),
-                    seconds,
-                    mebibytes,
-                )
+            began, before = time.perf_counter(), peak_memory()
+            try:
+                super().ground(parts, context or asked)
+            except BaseException:
+                if asked.raised is not None:
+                    # Clingo raises a copy of the exception that lacks its attributes. Raise the
+                    # exception itself.
+                    raise asked.raised from None
+                raise
+            finally:
+                seconds, mebibytes = time.perf_counter() - began, peak_memory() - before
+                self.seconds += seconds
+                self.mebibytes += mebibytes
+                if seconds > SLOW:
+                    names = ", ".join(dict.fromkeys(name for name, _ in parts))
+                    _log.debug("clingo grounded %s in %.2f s, %.0f MiB", names, seconds, mebibytes)
 
 
 class _GroundingCheck:
@@ -334,10 +322,7 @@ def mapped(
 
 
 def new_control(
-    encoding: str,
-    base: str,
-    options: Sequence[str] = (),
-    check: Callable[[], None] = lambda: None,
+    encoding: str, base: str, options: Sequence[str] = (), check: Callable[[], None] = lambda: None
 ) -> Control:
     """Make a control as `Control` does, and ground an encoding with facts `base`."""
     control = Control(options, check)

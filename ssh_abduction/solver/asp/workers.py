@@ -51,13 +51,13 @@ class Worker:
         """Start a process that makes its temporary files in a folder."""
         self.deadline: float | None = None
         self._late = False
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             command(__name__),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
         )
-        _under_way.add(self._process)
+        _under_way.add(self.process)
         self._send(search_path())
         self._send(folder)
         self._begun = False
@@ -65,17 +65,12 @@ class Worker:
     def end(self) -> None:
         """Kill the process, and close its pipes."""
         self.kill()
-        self._process.wait()
-        _under_way.discard(self._process)
-        for end in (self._process.stdin, self._process.stdout):
+        self.process.wait()
+        _under_way.discard(self.process)
+        for end in (self.process.stdin, self.process.stdout):
             with suppress(OSError):  # unread output
                 assert end
                 end.close()
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether the process runs."""
-        return self._process.poll() is None
 
     def done(self, number: int, work: Callable[..., Any], arguments: tuple[object, ...]) -> Any:
         """Let the process call `work`. Return the result of `work`, or Lost if the process ends.
@@ -84,7 +79,7 @@ class Worker:
         it gets a function that returns whether to stop early.
         """
         self._send((work, arguments))
-        output = self._process.stdout
+        output = self.process.stdout
         assert output
         try:
             while not self._begun:
@@ -94,7 +89,7 @@ class Worker:
                     return self._lost(number)
             answer, ends = pickle.load(output)
             if ends:  # it must not get another task while it ends
-                self._process.wait()
+                self.process.wait()
             return answer
         except (EOFError, pickle.UnpicklingError):
             return self._lost(number)
@@ -103,8 +98,8 @@ class Worker:
 
     def _lost(self, number: int) -> Lost:
         """Wait for the end of the process, and return Lost for a task."""
-        self._process.kill()
-        self._process.wait()
+        self.process.kill()
+        self.process.wait()
         return Lost(number, self._late)
 
     def give_up(self) -> None:
@@ -119,13 +114,13 @@ class Worker:
 
     def kill(self) -> None:
         """Kill the process."""
-        self._process.kill()
+        self.process.kill()
 
     def _send(self, message: object) -> None:
-        assert self._process.stdin
+        assert self.process.stdin
         with suppress(OSError, ValueError):  # it has ended
-            pickle.dump(message, self._process.stdin)
-            self._process.stdin.flush()
+            pickle.dump(message, self.process.stdin)
+            self.process.stdin.flush()
 
 
 def answers(
@@ -151,7 +146,8 @@ def answers(
     ready = queue.Queue[Any]()
     workers: list[Worker | None] = [None] * processes
     over = threading.Event()  # set when the caller wants no more answers
-    folder = _new_folder()
+    folder = tempfile.TemporaryDirectory(prefix="ssh-abduction-", ignore_cleanup_errors=True)
+    _folders.add(folder)
 
     def run(place: int) -> None:
         try:
@@ -269,22 +265,16 @@ def end_all() -> None:
         _delete(folder)
 
 
-def _new_folder() -> tempfile.TemporaryDirectory[str]:
-    folder = tempfile.TemporaryDirectory(prefix="ssh-abduction-", ignore_cleanup_errors=True)
-    _folders.add(folder)
-    return folder
-
-
 def _delete(folder: tempfile.TemporaryDirectory[str]) -> None:
     folder.cleanup()
     _folders.discard(folder)
 
 
 def _living(worker: Worker | None, folder: str) -> Worker:
-    """Return this worker if it is alive, else start a new one."""
-    if worker is not None and worker.is_alive:
-        return worker
+    """Return this worker if its process still runs, else start a new one."""
     if worker is not None:
+        if worker.process.poll() is None:
+            return worker
         worker.end()
     return Worker(folder)
 
@@ -304,8 +294,8 @@ class _Work:
 
     def __init__(self, folder: str) -> None:
         self._folder = folder
-        self._given_up = False
-        self._waiting = queue.SimpleQueue[tuple[Callable[..., Any], tuple[object, ...]]]()
+        self.given_up = threading.Event()  # set if the current task should end soon
+        self.waiting = queue.SimpleQueue[tuple[Callable[..., Any], tuple[object, ...]]]()
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
@@ -313,20 +303,12 @@ class _Work:
             while True:
                 message = pickle.load(sys.stdin.buffer)
                 if message is None:
-                    self._given_up = True
+                    self.given_up.set()
                 else:
-                    self._waiting.put(message)
+                    self.waiting.put(message)
         finally:  # the parent process has exited
             shutil.rmtree(self._folder, ignore_errors=True)
             os._exit(1)
-
-    def is_given_up(self) -> bool:
-        """Whether the parent process asked to end the current task soon."""
-        return self._given_up
-
-    def next(self) -> tuple[Callable[..., Any], tuple[object, ...]]:
-        """Wait for the next task, and return its function and arguments."""
-        return self._waiting.get()
 
 
 _outputs: list[BinaryIO] = []  # the stream for answers, in a worker process
@@ -361,5 +343,5 @@ def serve() -> None:
     tempfile.tempdir = pickle.load(sys.stdin.buffer)
     pieces = _Work(tempfile.tempdir)
     while True:
-        work, arguments = pieces.next()
-        _send(work(*arguments, pieces.is_given_up), ends=False)
+        work, arguments = pieces.waiting.get()
+        _send(work(*arguments, pieces.given_up.is_set), ends=False)

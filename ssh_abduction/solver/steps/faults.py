@@ -35,11 +35,8 @@ def faults_of(
         elif kind == "slipped":
             found.append(Fault(t, "slipped", trace.actions[t].name, cost=cost))
         elif kind == "jumped":
-            found.append(
-                Fault(
-                    t, "jumped", in_words(trace.steps[t].displacement or (0.0, 0.0, 0.0)), cost=cost
-                )
-            )
+            moved = trace.steps[t].displacement or (0.0, 0.0, 0.0)
+            found.append(Fault(t, "jumped", in_words(moved), cost=cost))
         else:
             found.append(Fault(t, "misseen", cost=cost))
     return tuple(found)
@@ -88,7 +85,8 @@ def with_changes(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSHMap | None
     faults = []
     for t, label in enumerate(ssh_map.dstate_at):
         drive, s = bisect_right(begins, t), ssh_map.dstates[label]
-        seen = turned_to_frame(trace.steps[t].openings or (), s.heading or 0)
+        openings = trace.steps[t].openings or ()  # ahead, right, back and left
+        seen = tuple(openings[(slot - (s.heading or 0)) % 4] for slot in range(len(openings)))
         before, known = last.setdefault(s.place, (drive, seen))
         if seen != known and before == drive:
             return None
@@ -116,11 +114,9 @@ def _with_changed_bearings(ssh_map: SSHMap, trace: Trace, theory: Theory) -> SSH
         cost = theory.fault_tenths("changed", trace.steps[found.step]) / 10
         at = found.place, None, None, found.bearing
         faults.append(Fault(found.step, "changed", now, was, cost, *at))
-    return replace(ssh_map, faults=tuple(sorted(faults, key=_in_order)))
-
-
-def _in_order(fault: Fault) -> tuple[int, int]:
-    return fault.step, fault.bearing or 0
+    return replace(
+        ssh_map, faults=tuple(sorted(faults, key=lambda fault: (fault.step, fault.bearing or 0)))
+    )
 
 
 def with_compass(ssh_map: SSHMap) -> SSHMap:
@@ -141,11 +137,6 @@ def with_compass(ssh_map: SSHMap) -> SSHMap:
             towards = COMPASS[quarters % 4]
         faults.append(replace(fault, towards=towards))
     return replace(ssh_map, faults=tuple(faults))
-
-
-def turned_to_frame(openings: tuple[bool, ...], heading: int) -> tuple[bool, ...]:
-    """Turn openings ahead, right, back and left into slots of a place, given the slot ahead."""
-    return tuple(openings[(slot - heading) % 4] for slot in range(len(openings)))
 
 
 def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) -> SSHMap:
@@ -172,8 +163,5 @@ def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) ->
     named = faults_of(faults, dict(enumerate(ssh_map.dstate_at)), shows, trace, theory)
     dstates = tuple(replace(s, view=shows[s.id]) for s in ssh_map.dstates)
     return replace(
-        ssh_map,
-        dstates=dstates,
-        links=links_of(ssh_map.dstate_at, trace, faults),
-        faults=named,
+        ssh_map, dstates=dstates, links=links_of(ssh_map.dstate_at, trace, faults), faults=named
     )

@@ -98,22 +98,27 @@ def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
     opposite directions of it, it may face the opposite way ("opposite"). Arguments are as for
     `rotation_bits`.
     """
-    found = rotation_bits(first, then, shift)
-    return [
-        way
-        for way, towards in WAYS.items()
-        if (found and _looks(first, then, shift, towards)) or way == _declared(first, then, shift)
-    ]
+    return _ways(first, then, shift, bool(rotation_bits(first, then, shift)))
 
 
 def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
-    """Return the way that the robot has to face, as in `may_face`: a list of at most one."""
+    """Return the way that the robot has to face, as in `may_face`: a list of at most one.
+
+    Bearings decide only if the set of rotations contains neither 90 nor 270 degrees. Stars without
+    known gateways allow nearly all rotations, so that no direction is sure.
+    """
     found = rotation_bits(first, then, shift)
+    is_sure = bool(found) and not found >> 90 & 1 and not found >> 270 & 1
+    return _ways(first, then, shift, is_sure)
+
+
+def _ways(first: Frame, then: Frame, shift: int, by_bearings: bool) -> list[str]:
+    """List the ways to face that slots declared opposite give, or bearings, if these may decide."""
+    declared = _declared(first, then, shift)
     return [
         way
         for way, towards in WAYS.items()
-        if (_is_sure(found) and _looks(first, then, shift, towards))
-        or way == _declared(first, then, shift)
+        if way == declared or (by_bearings and _looks(first, then, shift, towards))
     ]
 
 
@@ -175,11 +180,8 @@ def _turned_by(action: Action, first: Frame) -> int:
         return 1 << 180 | (
             0 if behind is None else _about(first.bearings[behind], first.spreads[behind])
         )
-    return (
-        _between(LEAST_TURN + 1, 179 - LEAST_TURN)
-        if action.turn == "right"
-        else _between(181 + LEAST_TURN, 359 - LEAST_TURN)
-    )
+    begin = 0 if action.turn == "right" else 180
+    return _of(range(begin + LEAST_TURN + 1, begin + 180 - LEAST_TURN))
 
 
 def _declared(first: Frame, then: Frame, shift: int) -> str | None:
@@ -220,24 +222,11 @@ def _near(degrees: float, spread: float) -> bool:
     return abs((degrees + 180) % 360 - 180) <= spread + ROUNDING
 
 
-def _is_sure(found: int) -> bool:
-    """Whether a set of rotations is not empty, and contains neither 90 nor 270 degrees.
-
-    Stars without known gateways allow nearly all rotations, so that no direction is sure.
-    """
-    return bool(found) and not found >> 90 & 1 and not found >> 270 & 1
-
-
 @lru_cache(maxsize=2**14)
 def _about(degrees: float, spread: float) -> int:
     """Return the rotations within `spread` of `degrees`, as a set. It is rounded outwards."""
     least, most = floor(degrees - spread + ROUNDING), ceil(degrees + spread - ROUNDING)
     return _of(r % 360 for r in range(least, most + 1))
-
-
-def _between(least: int, most: int) -> int:
-    """Return the set of rotations from `least` to `most` degrees, both included."""
-    return _of(range(least, most + 1))
 
 
 def _of(degrees: Iterable[int]) -> int:

@@ -77,7 +77,11 @@ def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
     before, up_to_there = len(_clique(views, actions, short)), len(_clique(views, actions, long))
     if up_to_there < MOST * long or not 1 < before <= FALL * up_to_there:
         return None
-    without = len(_clique(views, _cut_off(actions, short), len(views)))
+    # Replace the actions to and from the step by actions that occur only once. Then neither its
+    # view nor any later step distinguishes earlier steps.
+    other = max(actions, default=0) + 1
+    cut_off = [other + t if t in (short - 1, short) else action for t, action in enumerate(actions)]
+    without = len(_clique(views, cut_off, len(views)))
     return Noise(short, up_to_there, without) if without <= FALL * up_to_there else None
 
 
@@ -87,12 +91,3 @@ def _clique(views: Sequence[int], actions: Sequence[int], steps: int) -> list[in
     from ssh_abduction.solver.steps.apart import Continuations
 
     return Continuations(views[:steps], actions[: steps - 1]).clique()
-
-
-def _cut_off(actions: Sequence[int], step: int) -> list[int]:
-    """Replace the actions to and from one step by actions that occur only once.
-
-    Then neither the view of that step nor any later step distinguishes earlier steps.
-    """
-    other = max(actions, default=0) + 1
-    return [other + t if t in (step - 1, step) else action for t, action in enumerate(actions)]
