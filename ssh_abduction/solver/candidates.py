@@ -242,7 +242,7 @@ class Candidates:
         if has_no_frames(theory):
             kinds.append(self._offer_separate)
         if theory.misread or theory.slipped or theory.jumped:
-            kinds.append(partial(self._offer_mended))
+            kinds.append(self._offer_mended)
         return [self.merge, *kinds]
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
@@ -259,13 +259,13 @@ class Candidates:
             self._offer_or_blame(ssh_map)
             return
         # The first steps of a trace contradict no more than all steps.
-        wrong = bisect_left(range(len(trace)), True, lo=1, key=self._has_no_separate_map) - 1
-        self.contradicting[wrong] = None
-
-    def _has_no_separate_map(self, size: int) -> bool:
-        """Whether the axioms force steps that look different to share a dstate, up to a size."""
-        theory = self._task.theory.of_steps(0, size)
-        return separate_map(self._trace.prefix(size), theory) is None
+        wrong = bisect_left(
+            range(len(trace)),
+            True,
+            lo=1,
+            key=lambda size: separate_map(trace.prefix(size), theory.of_steps(0, size)) is None,
+        )
+        self.contradicting[wrong - 1] = None
 
     def _offer_or_blame(self, ssh_map: SSHMap) -> None:
         """Offer a map. If no map is known then, note the steps at which this one breaks axioms."""

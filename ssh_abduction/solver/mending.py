@@ -65,7 +65,6 @@ class Mending:
         self._best: Found | None = None
         self._cheapest: list[Trace] = []  # traces mended by all cheapest causal maps
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
-        self._causal_labels: tuple[int, ...] = ()  # the labels of the last causal map
         # The log (the trace as integers) still belongs to the theory with places. So stars, and
         # pairs of steps at different places, distinguish dstates here, too.
         self._causal = FaultyEngine(replace(task, problem=task.problem.changed(theory=causal)))
@@ -82,10 +81,11 @@ class Mending:
             merging.merge()
             yield from self._by_missing_displacements(merging.labels(), merging.places())
         yield from self._by_merging(self._task.trace)
-        for mended in self._by_causal_maps():
-            yield from self._improving(self._minimal(mended)[0])
+        self._causal.grow(len(self._task.trace))
+        for causal in self._causal.improving_maps():
+            yield from self._improving(self._minimal(self._mended(causal.map))[0])
             if self._task.theory.jumped:
-                labels = self._causal_labels
+                labels = causal.map.dstate_at
                 yield from self._by_missing_displacements(labels, [None] * len(labels))
         for mended in self._by_cheapest_causal_maps():
             yield from self._improving(self._minimal(mended)[0])
@@ -155,13 +155,6 @@ class Mending:
             labels = self._best.map.dstate_at
             places = [self._best.map.dstates[label].place for label in self._best.map.dstate_at]
 
-    def _by_causal_maps(self) -> Iterator[Trace]:
-        """Yield the traces that causal maps mend, each map cheaper than the one before."""
-        self._causal.grow(len(self._task.trace))
-        for found in self._causal.improving_maps():
-            self._causal_labels = found.map.dstate_at
-            yield self._mended(found.map)
-
     def _by_cheapest_causal_maps(self) -> Iterator[Trace]:
         """Yield the distinct traces that the cheapest causal maps mend."""
         causal: list[SSHMap] = []
@@ -217,15 +210,10 @@ class Mending:
 
     def _maps_of(
         self, mended: Trace, most: int, seconds: float = math.inf
-    ) -> tuple[list[SSHMap], bool]:
-        """Solve a mended trace within some seconds.
-
-        Returns up to `most` minimal maps (0: all) and True, or the best map and False.
-        """
-        maps, proven = self._solver(
-            mended, self._without_faults, most, min(seconds, SHARE * self._task.watch.left())
-        )
-        return list(maps), proven
+    ) -> tuple[tuple[SSHMap, ...], bool]:
+        """Solve a mended trace within some seconds, as `Solver` does."""
+        seconds = min(seconds, SHARE * self._task.watch.left())
+        return self._solver(mended, self._without_faults, most, seconds)
 
     def _believed_again(self, ssh_map: SSHMap, mended: Trace) -> Trace:
         """Restore the missing displacements of a mended trace that agree with its map."""

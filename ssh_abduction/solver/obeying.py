@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from statistics import median
 
@@ -62,11 +62,8 @@ def obeyed(corrections: Corrections, trace: Trace, theory: Theory) -> tuple[Trac
 def with_names(corrections: Corrections, solution: Solution, trace: Trace) -> Solution:
     """Return a solution whose maps have the names that a person gave."""
     drives = drives_of(trace)
-
-    def named(maps: Iterable[SSHMap]) -> tuple[SSHMap, ...]:
-        return tuple(corrections.named(ssh_map, drives) for ssh_map in maps)
-
-    return replace(solution, maps=named(solution.maps))
+    maps = tuple(corrections.named(ssh_map, drives) for ssh_map in solution.maps)
+    return replace(solution, maps=maps)
 
 
 def with_correction_warnings(

@@ -27,13 +27,7 @@ from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.answer import Answer
-from ssh_abduction.solver.asp.limits import (
-    LimitError,
-    StageTimeError,
-    Stop,
-    Watch,
-    now,
-)
+from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop, Watch, now
 from ssh_abduction.solver.asp.rule_checks import check_rules
 from ssh_abduction.solver.fallback import (
     CLASHING,

@@ -83,10 +83,7 @@ class Overlap:
         return self._tied.count(self._tied[drive]) > 1
 
     def crowding(
-        self,
-        labels: Mapping[int, int],
-        places: Sequence[Hashable],
-        at: Sequence[Sequence[float]],
+        self, labels: Mapping[int, int], places: Sequence[Hashable], at: Sequence[Sequence[float]]
     ) -> float:
         """Return the price of places at one position.
 
@@ -108,10 +105,7 @@ class Overlap:
         yield from self.crowded(dict(enumerate(ssh_map.dstate_at)), places, at)
 
     def crowded(
-        self,
-        labels: Mapping[int, int],
-        places: Sequence[Hashable],
-        at: Sequence[Sequence[float]],
+        self, labels: Mapping[int, int], places: Sequence[Hashable], at: Sequence[Sequence[float]]
     ) -> Iterator[tuple[int, int, float]]:
         """Yield the first steps at two places at one position, and the share of the price to pay.
 

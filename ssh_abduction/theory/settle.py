@@ -147,10 +147,7 @@ def displacement_of(problem: Problem) -> Displacement | None:
 def _no_view(trace: Trace) -> TraceError:
     got, mend = "none in any step", "give the views that are known, or one view to all steps"
     if any(step.image is not None for step in trace.steps):
-        got, mend = (
-            "only an image",
-            "cluster the images into views first (ssh-abduction cluster)",
-        )
+        got, mend = ("only an image", "cluster the images into views first (ssh-abduction cluster)")
     return TraceError(f"{trace.at(0)}: view: expected one, got {got}; {mend}")
 
 

@@ -52,10 +52,7 @@ class Beams:
     """
 
     def __init__(
-        self,
-        parts: Parts,
-        add: Callable[[SSHMap], float],
-        keep_best: Callable[[], None],
+        self, parts: Parts, add: Callable[[SSHMap], float], keep_best: Callable[[], None]
     ) -> None:
         """Prepare the beam searches.
 
@@ -92,8 +89,11 @@ class Beams:
             self._parts.candidates.sketch(SKETCH_SHARE * time.seconds)
             self._keep_best()
         may_have_map = self._search_widths(time, clashes)
-        if may_have_map:
-            self._search_without_axioms(time)
+        # If `broken` is unknown, find it with the widest beam that ended.
+        is_open = may_have_map and self._best[1] < math.inf and math.isinf(self.broken)
+        with suppress(StageTimeError), watch.stage(time.end(BREAKING)):
+            if is_open and (beam := self._parts.candidates.beam(self._ended)):
+                self.broken = self._best[1] - beam.nats_without_axioms()
         return may_have_map
 
     def _search_widths(self, time: _Time, clashes: Callable[[], bool]) -> bool:
@@ -132,13 +132,6 @@ class Beams:
                     return False
                 first = watch.elapsed() - began
         return True
-
-    def _search_without_axioms(self, time: _Time) -> None:
-        """If `broken` is unknown, find it with the widest beam that ended."""
-        is_open = self._best[1] < math.inf and math.isinf(self.broken)
-        with suppress(StageTimeError), self._parts.watch.stage(time.end(BREAKING)):
-            if is_open and (beam := self._parts.candidates.beam(self._ended)):
-                self.broken = self._best[1] - beam.nats_without_axioms()
 
     def _ends(self, beam: Beam, width: int, end: float) -> bool:
         """Keep the maps that a beam ends with. Return whether it ended by `end` on the clock."""

@@ -9,7 +9,7 @@ one action leads to from one dstate stay together, because actions are determini
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, TypeAlias
@@ -132,7 +132,11 @@ def estimated(
     """
     watch = Watch().part(seconds)
     tried: set[Course] = {(best.dstates, best.places)}
-    apart = ((_apart(best, drive), CHANCE * CERTAIN) for drive in drives)
+    steps = range(len(best.dstates))
+    apart = (
+        (_with_new_place(best, [drive.first <= t < drive.stop for t in steps]), CHANCE * CERTAIN)
+        for drive in drives
+    )
     for course, most in chain(apart, ((moved, CERTAIN) for moved in _all_moved(best, begins))):
         if course in tried:
             continue
@@ -147,16 +151,6 @@ def estimated(
             yield Rival(nats, *course, True, best.faults)
 
 
-def _apart(best: Rival, drive: Drive) -> Course:
-    """Return the dstates and places of a map after a drive gets dstates and places of its own."""
-    more = len(best.dstates)
-    dstates, places = (
-        tuple(numbered(name + more * (drive.first <= t < drive.stop) for t, name in enumerate(of)))
-        for of in (best.dstates, best.places)
-    )
-    return dstates, places
-
-
 def _all_moved(best: Rival, begins: Sequence[int]) -> Iterator[Course]:
     """Yield the dstates and places of each map in which some visits to a place get a new place."""
     at = best.places or best.dstates
@@ -164,14 +158,15 @@ def _all_moved(best: Rival, begins: Sequence[int]) -> Iterator[Course]:
     for firsts in visits.values():
         singly = [{begin} for begin in firsts[1:]]
         from_then_on = [set(firsts[i:]) for i in range(1, len(firsts) - 1)]
-        yield from (_moved(best, begins, moved) for moved in (*singly, *from_then_on))
+        for moved in (*singly, *from_then_on):
+            yield _with_new_place(best, [begin in moved for begin in begins])
 
 
-def _moved(best: Rival, begins: Sequence[int], moved: Collection[int]) -> Course:
-    """Return the dstates and places of a map after some visits get a new place."""
-    more = len(begins)
+def _with_new_place(best: Rival, moved: Sequence[bool]) -> Course:
+    """Return the dstates and places of a map after some steps get others, which are new."""
+    more = len(best.dstates)
     dstates, places = (
-        [name + more * (begin in moved) for name, begin in zip(of, begins, strict=False)]
+        [name + more * is_moved for name, is_moved in zip(of, moved, strict=False)]
         for of in (best.dstates, best.places)
     )
     return tuple(numbered(dstates)), tuple(numbered(places))

@@ -358,8 +358,7 @@ def _dominating(moves: Array) -> Array:
     sizes = (moves**2).sum((1, 2))
     order = np.argsort(-sizes)
     for a in moves[order[:LARGEST]]:
-        values, vectors = np.linalg.eigh(a.T @ a - form)
-        form += (vectors * values.clip(0.0)) @ vectors.T
+        form += _positive(a.T @ a - form)
     if len(order) > LARGEST:
         form += sizes[order[LARGEST]] * np.identity(len(form))
     return form

@@ -67,13 +67,7 @@ from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.solver.solution.weighed import (
-    CHANCE,
-    EQUAL,
-    IMPROBABLE,
-    Rival,
-    Weighed,
-)
+from ssh_abduction.solver.solution.weighed import CHANCE, EQUAL, IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Status
 from ssh_abduction.theory.evidence import Equality
@@ -126,7 +120,12 @@ class Weighing:
         """Prepare the search. `guess` and `search` run it."""
         self._parts = parts
         self._misfit = Misfit(parts.task.problem)
-        self._prices = _prices_of(parts.task.theory)
+        # The price in nats of one unit of each count, that of the count minimised first in front.
+        # If faults are allowed, that count is the cost of dstates and faults in tenths of dstates.
+        dstate, place, path = parts.task.theory.prices
+        has_faults = parts.task.theory.has_faults
+        first = {"tenths": dstate / 10} if has_faults else {"dstates": dstate}
+        self._prices = {**first, "places": place, "paths": path}
         self._least: dict[str, int] = {}
         self._base = 0.0
         self._within = max(WITHIN, parts.limits.within)
@@ -187,7 +186,11 @@ class Weighing:
         try:
             last = prefixes.minimise()
         finally:
-            self._take_bound(prefixes.engine.bound)
+            if self.candidates and "dstates" in self._prices:
+                # Clingo proved that each map left has at least this many dstates.
+                counts = {**self._least, "dstates": prefixes.engine.bound or 0}
+                proven = self._price(counts) + self._base
+                self.bound = max(self.bound, min(proven, self.candidates[0].nats))
         if last is None and not self.candidates:
             parts.known.status = Status.UNSATISFIABLE
             return
@@ -195,12 +198,6 @@ class Weighing:
         self.proven = True
         parts.known.status = Status.OPTIMAL
         self.keep_best()
-
-    def _take_bound(self, least: int | None) -> None:
-        """Raise the bound if clingo proved that each cheap map has at least `least` dstates."""
-        if self.candidates and "dstates" in self._prices:
-            nats = self._price({**self._least, "dstates": least or 0}) + self._base
-            self.bound = max(self.bound, min(nats, self.candidates[0].nats))
 
     def _with_forced_joins(self, task: Task) -> Task:
         """Find joins that all cheap maps have. Raise the bound, and assert the joins for clingo."""
@@ -431,17 +428,6 @@ class Weighing:
         for rival in rivals_of(*of_best, seconds):
             if rival.nats >= least and (rival.dstates, rival.places) not in known:
                 yield rival
-
-
-def _prices_of(theory: Theory) -> dict[str, float]:
-    """Return the price in nats of one unit of each count. The count minimised first comes first.
-
-    If faults are allowed, the first count is "tenths": the cost of dstates and faults in tenths of
-    dstates.
-    """
-    dstate, place, path = theory.prices
-    first = {"tenths": dstate / 10} if theory.has_faults else {"dstates": dstate}
-    return {**first, "places": place, "paths": path}
 
 
 def _exactly(ssh_map: SSHMap) -> list[Equality]:

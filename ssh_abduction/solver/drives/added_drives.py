@@ -45,7 +45,7 @@ from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.weighed import Weighed
-from ssh_abduction.solver.values import Cost, Effort, Level, Status
+from ssh_abduction.solver.values import Cost, Level, Status
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -119,10 +119,11 @@ def solve_onto(
     # 4. The minimal maps of this trace that keep the old map.
     pinned = _pinned(theory, digest, ssh_map)
     found = solving.solve(part, pinned, tuple(_sketched(digest, ssh_map, part, in_use)))
-    kept = tuple(m for m in found.maps if _keeps(m, digest, ssh_map))
+    kept = [m for m in found.maps if not any(_broken(m.dstate_at, _places_in(m), digest, ssh_map))]
 
     # 5. Their labels for all steps of all drives.
-    maps = tuple(_of_all_drives(m, digest, ssh_map, joint, in_use) for m in kept)
+    labelled = (replace(m, dstate_at=digest.labels_of_all(m, ssh_map)) for m in kept)
+    maps = tuple(_begun(m, joint, in_use) for m in labelled)
     if not maps and found.stopped in _LIMITS and (grown := _grown(ssh_map, old, problem)):
         found, maps = replace(found, status=Status.FEASIBLE, cost=Cost.of(grown)), (grown,)
     if not maps:
@@ -148,19 +149,15 @@ def _of_joint_trace(
         # The theory for the digest has assertions about its steps.
         theory=found.theory.replace(**{kind: getattr(theory, kind) for kind in ASSERTIONS}),
         steps=len(joint),
-        effort=_effort(found, len(joint), watch),
+        effort=replace(
+            found.effort,
+            prefix=min(found.effort.prefix, len(joint)),  # a digest may have more steps
+            seconds=replace(found.seconds, total=watch.elapsed()),
+        ),
         levels=(Level(found.cost, len(maps), found.complete),) if found.within else (),
         shared=None,
         trace=joint,
     )
-
-
-def _of_all_drives(
-    found: SSHMap, digest: Digest, ssh_map: SSHMap, joint: Trace, theory: Theory
-) -> SSHMap:
-    """Make a map of all drives from a map of a digest and a new drive."""
-    labels = digest.labels_of_all(found, ssh_map)
-    return _begun(replace(found, dstate_at=labels), joint, theory)
 
 
 def _begun(found: SSHMap, joint: Trace, theory: Theory) -> SSHMap:
@@ -191,15 +188,6 @@ def _laid_in_time(
             raise
         return unproven(grown, ssh_map, old, problem, watch, "interrupted")
     return None
-
-
-def _effort(found: Solution, steps: int, watch: Watch) -> Effort:
-    """Return the effort of solving a digest and a new drive, for all the steps of the drives.
-
-    A digest may have more steps than the old drives.
-    """
-    seconds = replace(found.seconds, total=watch.elapsed())
-    return replace(found.effort, prefix=min(found.effort.prefix, steps), seconds=seconds)
 
 
 def _named(solution: Solution, ssh_map: SSHMap, corrections: Corrections | None) -> Solution:
@@ -302,11 +290,6 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap) -> Theory:
         (t, i) for s, i in first.items() if place[s] is not None and (t := first_at[place[s]]) != i
     ]
     return theory.replace(**moved)
-
-
-def _keeps(found: SSHMap, digest: Digest, ssh_map: SSHMap) -> bool:
-    """Whether a map of a digest and a new drive has the dstates and places of the existing map."""
-    return not any(_broken(found.dstate_at, _places_in(found), digest, ssh_map))
 
 
 def _places_in(found: SSHMap) -> list[int | None]:

@@ -18,12 +18,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of
-from ssh_abduction.solver.costs.estimating import (
-    ESTIMATING,
-    may_join_more,
-    rival_of,
-    rivals_of,
-)
+from ssh_abduction.solver.costs.estimating import ESTIMATING, may_join_more, rival_of, rivals_of
 from ssh_abduction.solver.derived_regions import Deriving
 from ssh_abduction.solver.drives.digest import Digest
 from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning

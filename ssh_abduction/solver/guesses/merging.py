@@ -89,10 +89,7 @@ def dstates_merged(chart: Chart, labels: Sequence[int]) -> list[int]:
     excluded = [(dstates[i], dstates[j]) for i, j in chart.excluded]
     root = np.array(
         thinned_map(
-            np.asarray(chart.seen)[first].tolist(),
-            links,
-            np.bincount(dstates).tolist(),
-            excluded,
+            np.asarray(chart.seen)[first].tolist(), links, np.bincount(dstates).tolist(), excluded
         )
     )
     return numbered(root[dstates].tolist())
@@ -119,9 +116,7 @@ def thinned_map(
 
 
 def _apart_in_map(
-    seen: NDArray[np.int_],
-    links: Sequence[Link],
-    excluded: Sequence[tuple[int, int]],
+    seen: NDArray[np.int_], links: Sequence[Link], excluded: Sequence[tuple[int, int]]
 ) -> Matrix:
     """Find the pairs of dstates of a map that are apart, as a matrix of dstates x dstates.
 
@@ -157,10 +152,7 @@ class Classes:
     """
 
     def __init__(
-        self,
-        apart: Matrix,
-        links: Iterable[Link],
-        nodes: NDArray[np.int_] | None = None,
+        self, apart: Matrix, links: Iterable[Link], nodes: NDArray[np.int_] | None = None
     ) -> None:
         """Begin with a class for each step.
 

@@ -80,16 +80,7 @@ class Part:
         position, heading = 2 * np.arange(n), 2 * n + np.arange(len(places))
         numbers = [frozenset(shows) for shows in seen]
         return cls(
-            labels,
-            list(places),
-            numbers,
-            stars,
-            links,
-            shown,
-            position,
-            heading,
-            *poses,
-            nats,
+            labels, list(places), numbers, stars, links, shown, position, heading, *poses, nats
         )
 
     @property

@@ -135,10 +135,7 @@ class Sampler:
     """
 
     def __init__(
-        self,
-        options: States,
-        leaves: Sequence[tuple[int, int]],
-        random: np.random.Generator,
+        self, options: States, leaves: Sequence[tuple[int, int]], random: np.random.Generator
     ) -> None:
         """Draw a state (a number for a placing) at random for each visit.
 
