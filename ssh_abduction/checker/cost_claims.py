@@ -82,10 +82,7 @@ def count_checked_rivals(steps: int, rivals: int, theory: Theory) -> int:
 def false_costs(
     trace: Trace, answer: Mapping[str, Any], maps: Sequence[SSHMap], theory: Theory
 ) -> Iterator[str]:
-    """Check what an answer claims about the costs of its maps in nats.
-
-    In the theory no field is "auto".
-    """
+    """Check the costs in nats that an answer claims for its maps, by a theory without "auto"."""
     weighed = answer.get("weighed")
     if not isinstance(weighed, Mapping) or not maps:
         return

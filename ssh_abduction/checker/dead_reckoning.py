@@ -109,10 +109,7 @@ class ErrorFilter:
         return covariance
 
     def repeated_since(self, first: Any, last: Any) -> Array:
-        """Compute the closing errors that one standard deviation of scale, and of drift, causes.
-
-        The shape is (m, 3, 2).
-        """
+        """Compute closing errors, (m, 3, 2), by one standard deviation of scale, and of drift."""
         moved: Array = (
             self.repeated[last] - self.onward(first, last) @ self.repeated[first]
         ) * self.sigma

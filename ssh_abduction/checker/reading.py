@@ -156,10 +156,7 @@ class Reading:
 
     @cached_property
     def along_travels(self) -> list[tuple[MapLink, Course, int, int]]:
-        """The travels that keep their course and change the place.
-
-        Each is a tuple of the travel, its course, the place it leaves and the place it reaches.
-        """
+        """The travels that keep their course: travel, course, place, next place."""
         found = []
         for m in self.travels:
             course, p, q = course_of(m.source), m.source.place, m.target.place

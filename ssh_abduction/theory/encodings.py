@@ -76,20 +76,14 @@ def folder() -> Path:
 
 
 def path(name: str) -> str:
-    """Return the path of an encoding by its name.
-
-    Encodings of axioms come first. Those in the subfolders `derived` and `fast` come next.
-    """
+    """Return the path of an encoding by its name, in the folder of axioms or a subfolder."""
     files = [folder() / part / f"{name}.lp" for part in ("", "derived", "fast")]
     return str(next((file for file in files if file.exists()), files[-1]))
 
 
 @cache
 def levels() -> tuple[str, ...]:
-    """Return the names of all encodings with axioms, in the order to load them.
-
-    Encodings that users add to the folder are included.
-    """
+    """Return the names of all encodings with axioms, also of users, in the order to load them."""
     found = [
         file.stem
         for file in folder().glob("*.lp")

@@ -107,10 +107,7 @@ class Control(clingo.Control):
 
     @contextmanager
     def searching(self, **options: Any) -> Iterator[clingo.SolveHandle]:
-        """Run a search of clingo in its own thread, with the arguments of `solve`.
-
-        Leaving the context stops the search.
-        """
+        """Run a search of clingo in a thread, as `solve` does. Leaving the context stops it."""
         with ExitStack() as stack:
             with _held_back_interrupts():
                 handle = stack.enter_context(self.solve(async_=True, **options))

@@ -251,10 +251,7 @@ def _attempted(
 
 
 def end_all() -> None:
-    """Kill all processes that were started here, and delete their temporary files.
-
-    Call this before this process exits.
-    """
+    """Kill all processes started here, and delete their files. Call this before exiting."""
     killed = list(_under_way)
     for process in killed:
         process.kill()

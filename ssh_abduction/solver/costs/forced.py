@@ -154,10 +154,7 @@ class Visits:
         return merged
 
     def returns(self, of: Ints) -> list[Equality]:
-        """List the returns of all maps that have the visits of each class at one place.
-
-        `of` has the class of each visit.
-        """
+        """List the returns of all maps that have the visits of each class at one place."""
         found: list[Equality] = []
         first: dict[object, int] = {}
         for t, (a, x) in enumerate(
@@ -274,10 +271,7 @@ class _Joined:
         return not self._apart[0, a, b]
 
     def counts_lacking(self, a: int, b: int) -> tuple[int, int] | None:
-        """Return the least numbers of dstates and places if two classes are not joined.
-
-        Return None if no map lacks this join.
-        """
+        """Return the least numbers of dstates and places without a join; None if none lacks it."""
         added = self._lack(a, b)
         fails = any(not r and c == d for r, c, d in added)
         node = self._node

@@ -80,10 +80,7 @@ class Misfit:
     def nats_of_course(
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
     ) -> float:
-        """Return half the misfit of a whole course, as `of_course`, and the price of crowding.
-
-        Crowding is that two places are at one position.
-        """
+        """Return half the misfit of a whole course, and the price of two places at one position."""
         headings, positions, _ = groups = _groups_of(dstates, places, wrong)
         square, at = self._of_groups(groups)
         if not self._overlap.near or not self._overlap.nats(positions):
@@ -124,10 +121,7 @@ class Misfit:
         return [] if suffices([]) else minimal_part(suffices, list(returns))
 
     def _of_groups(self, groups: _Groups) -> tuple[float, Array]:
-        """Return the misfit if steps share headings and positions, and the poses of the headings.
-
-        Both are computed once and kept.
-        """
+        """Return the misfit and the positions if steps share headings and positions. Keep both."""
         if groups not in self._known:
             headings, positions, wrong = groups
             said = self.trace.without_displacements_at(wrong) if wrong else self._equations

@@ -30,10 +30,7 @@ class FramedSides:
         self._batch = -1
 
     def extend(self, batch: int) -> None:
-        """Ground the axioms of all paths added so far for the visits of a new batch.
-
-        A batch is the visits that clingo gets in one call.
-        """
+        """Ground the axioms of all paths added so far for a new batch: the visits of one call."""
         self._batch = batch
         if self._said:
             paths = [
@@ -65,10 +62,7 @@ class FramedSides:
         return False
 
     def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides_framed.lp for these arguments, unless it is ground already.
-
-        Returns whether it was ground now.
-        """
+        """Ground a part of sides_framed.lp for these arguments once. Return whether it was new."""
         if (part, arguments) in self._said:
             return False
         control, batches = self._asker.control, range(self._batch + 1)

@@ -246,10 +246,7 @@ class NameProgram:
         return {view for view, spare in self._known.spare.items() if spare[-1] in used}
 
     def resting(self, value: bool) -> tuple[clingo.Symbol, bool]:
-        """Return the assumption that some node has a rest as its name (True), or none (False).
-
-        A rest is the last spare name of a view. It stands for all further dstates with that view.
-        """
+        """Return the assumption that some node has a rest as its name (True), or none (False)."""
         return names_lp.resting(self._known.batches - 1), value
 
     def follow(self, answer: dict[int, int]) -> tuple[list[int], list[Link]]:

@@ -160,10 +160,7 @@ class NamedLabels:
         self._program.give_links(links)
 
     def _first_spares(self, pinned: Pinned) -> dict[int, int]:
-        """Return how many spare names each view gets.
-
-        That is `SPARES`, or one more than the given map needs if that is more.
-        """
+        """Return the numbers of spare names: SPARES, or one more than the given map needs."""
         seen = pinned.chart.seen
         found = Counter(dict(zip(self._given_map, seen, strict=False)).values())
         taken = Counter(seen[node] for node in pinned.clique)

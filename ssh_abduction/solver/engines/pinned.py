@@ -27,10 +27,7 @@ class Pinned:
 
     @classmethod
     def of_steps(cls, log: Log, steps: int, *, largest: bool = True) -> Pinned:
-        """Chart the first steps, and give each step of a largest clique a name of its own.
-
-        If `largest` is False, only the first step gets one.
-        """
+        """Chart the first steps, and name a largest clique of them, or else only the first step."""
         chart = Chart.of_steps(log, steps)
         clique = chart.continuations.clique() if largest else [0]
         apart = np.stack([chart.continuations.apart_from(step) for step in clique], axis=1)

@@ -335,10 +335,7 @@ class Overlay:
         return not twists or any(abs(off) < TURNED or square < FAR for off, square in twists)
 
     def _twist(self, s: int, x: int, turn: float = 0.0) -> tuple[float, float]:
-        """Compute how far the heading of s, after a turn, is off that of x, and its chi-square.
-
-        The turn and the result are in radians.
-        """
+        """Compute how far, in radians, s faces off x after a turn of s, and its chi-square."""
         state, i, j = self._state, self._both.heading[s], self._both.heading[x]
         c = state.covariance
         off = math.remainder(state.mean[i] + turn - state.mean[j], math.tau)

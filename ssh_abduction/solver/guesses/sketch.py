@@ -292,10 +292,7 @@ class Sketch:
         return s.path, s.direction
 
     def _course_through(self, here: int) -> tuple[int, int] | None:
-        """Return the known path, and direction, that leaves the place of a dstate in its heading.
-
-        Without frames there are no slots, so every such path is new.
-        """
+        """Return the known path and direction in the heading of a dstate; None without frames."""
         s = self._states[here]
         return self._slots.get((s.place, s.heading))
 
@@ -307,10 +304,7 @@ class Sketch:
         self.certain = self._tree
 
     def _set_course(self, here: int, path: int, direction: int) -> None:
-        """Give a dstate a path and direction.
-
-        Dstates that a turn around links with it get the same path in the reverse direction.
-        """
+        """Give a dstate a course, and those that a turn around links with it the reverse one."""
         s = self._states[here]
         if (s.path, s.direction) == (path, direction):
             return

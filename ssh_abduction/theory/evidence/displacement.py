@@ -117,10 +117,7 @@ class Displacement(Evidence):
         return replace(self, known=known.known)
 
     def count_returns(self, trace: Trace) -> int:
-        """Return the number of returns that may be true, rounded up to a power of two.
-
-        It may be larger than the number of steps.
-        """
+        """Return the number of returns that may be true, rounded up to a power of two."""
         return replace(self, returns=0).returns_of(trace).count()
 
     def returns_of(self, trace: Trace) -> Returns:

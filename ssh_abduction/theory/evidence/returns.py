@@ -90,10 +90,7 @@ class Returns:
 
     @cached_property
     def arrivals(self) -> list[int]:
-        """The first step of each visit to a place.
-
-        If it is not known which actions are turns, each step counts as a visit.
-        """
+        """The first steps of visits; all steps if it is not known which actions are turns."""
         return [0, *(t for t, action in enumerate(self.trace.actions, 1) if action.kind != "turn")]
 
     def _tested(self, since: int = 0) -> _Tested:
@@ -302,10 +299,7 @@ class Returns:
     def refused_alone_at(
         self, labels: Sequence[int], places: Sequence[int | None], step: int
     ) -> list[Equality]:
-        """List the returns that end at a step and are rejected alone.
-
-        `labels` has the dstate of each step, and `places` the place.
-        """
+        """List the returns that end at a step and are rejected alone, by dstates and places."""
         elsewhere = [
             Equality(i, step, "place")
             for i in self.pairs.elsewhere.get(step, ())

@@ -40,10 +40,7 @@ def rests_on(axiom: str, t: int, other: str) -> str:
 
 
 def one_in_doubt(number: int, condition: str | None) -> str:
-    """Return the rule that two things are one if a condition, the body of a rule, holds.
-
-    If `condition` is None, they never are.
-    """
+    """Return the rule that two things are one if a condition holds; never if it is None."""
     one = f"one_in_doubt({number})"
     return f"{one} :- {condition}." if condition else f"#external {one}."
 
