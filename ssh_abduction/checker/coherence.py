@@ -19,10 +19,8 @@ def labels_are_dstates(m: Reading) -> Found:
     """Check that each step has a label, and that each label is the id of a dstate."""
     steps, labels = len(m.trace), len(m.map.dstate_at)
     if steps != labels:
-        yield (
-            [min(steps, labels)] if labels < steps else [],
-            f"The map labels {labels} steps, but the trace has {steps}.",
-        )
+        why = f"The map labels {labels} steps, but the trace has {steps}."
+        yield [min(steps, labels)] if labels < steps else [], why
     for label, i in m.first.items():
         if label not in m.records:
             yield [i], f"Step {i} is labelled {label}, but the map has no dstate {label}."
@@ -45,10 +43,8 @@ def numbered_by_first_visit(m: Reading) -> Found:
         if (course := course_of(s)) and course[0] not in faced:
             faced.add(course[0])
             if course[1] != 1:
-                yield (
-                    [i],
-                    f"Path {course[0]} is first faced at step {i}, in direction -1 instead of +1.",
-                )
+                why = f"Path {course[0]} is first faced at step {i}, in direction -1 instead of +1."
+                yield [i], why
 
 
 def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | None]]) -> Found:
@@ -113,15 +109,11 @@ def has_what_the_theory_has(m: Reading) -> Found:
         yield [], "The map has places or paths, but the theory is causal."
     for s in m.map.dstates:
         if causal and (s.place, s.path, s.direction) != (None, None, None):
-            yield (
-                m.steps_of(s.id),
-                f"Dstate {s.id} has a place, path or direction, but the theory is causal.",
-            )
+            why = f"Dstate {s.id} has a place, path or direction, but the theory is causal."
+            yield m.steps_of(s.id), why
         if m.theory.star not in ("frame", "gateways") and s.heading is not None:
-            yield (
-                m.steps_of(s.id),
-                f"Dstate {s.id} has a heading, but the places of the theory have no frames.",
-            )
+            why = f"Dstate {s.id} has a heading, but the places of the theory have no frames."
+            yield m.steps_of(s.id), why
     if m.map.excused and m.theory.boundary != "defeasible":
         yield [], "The map excuses pairs of paths, but the theory excuses none."
 
@@ -154,10 +146,8 @@ def frames_start_at_first_visit(m: Reading) -> Found:
     for p, i in m.place_seen.items():
         s = m.states[m.map.dstate_at[i]]
         if heading := s.heading if m.theory.star == "gateways" else heading_of(s):
-            yield (
-                [i],
-                f"Place {p} is first visited at step {i} with heading {heading} instead of 0.",
-            )
+            why = f"Place {p} is first visited at step {i} with heading {heading} instead of 0."
+            yield [i], why
 
 
 def faults_are_allowed(m: Reading) -> Found:

@@ -158,10 +158,8 @@ def region_behind(m: Reading) -> Found:
     yield from _missing(m, {p: f"All links to them lead through place {doors[p]}." for p in doors})
     for region in m.map.regions or ():
         if region.door not in (None, doors.get(frozenset(region.places))):
-            yield (
-                _steps(m, region.places),
-                f"Region {region.id} is not cut off by place {region.door}.",
-            )
+            why = f"Region {region.id} is not cut off by place {region.door}."
+            yield _steps(m, region.places), why
         elif region.door is None and frozenset(region.places) in doors:
             yield _steps(m, region.places), f"Region {region.id} lists no door."
 

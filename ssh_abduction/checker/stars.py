@@ -50,10 +50,8 @@ def _one_star(m: Reading, how: str, *, any_turn: bool) -> Found:
         star = min(_rotated(framed, k) for k in range(4)) if any_turn else framed
         first, at = known.setdefault(there, (star, i))
         if star != first:
-            yield (
-                (at, i),
-                f"The stars seen at place {there[0]} at steps {at} and {i} differ, {how}.",
-            )
+            why = f"The stars seen at place {there[0]} at steps {at} and {i} differ, {how}."
+            yield (at, i), why
 
 
 def gateways_by_drive(m: Reading) -> Iterator[tuple[int, str, list[tuple[Openings, int]]]]:
@@ -112,10 +110,8 @@ def one_heading(m: Reading) -> Found:
             yield m.steps_of(s), f"Dstate {s} has several headings."
         for r in records:
             if heading_of(r) is None:
-                yield (
-                    m.steps_of(s),
-                    f"Dstate {s} has the heading {r.heading}, which is none of the slots 0 to 3.",
-                )
+                why = f"Dstate {s} has the heading {r.heading}, which is none of the slots 0 to 3."
+                yield m.steps_of(s), why
 
 
 def turn_rotates(m: Reading) -> Found:
@@ -146,10 +142,8 @@ def one_dstate_per_heading(m: Reading) -> Found:
         if s.place is not None and heading is not None:
             first = known.setdefault((s.place, heading), s.id)
             if first != s.id:
-                yield (
-                    m.steps_of(first, s.id),
-                    f"Dstates {first} and {s.id} both face slot {heading} of place {s.place}.",
-                )
+                why = f"Dstates {first} and {s.id} both face slot {heading} of place {s.place}."
+                yield m.steps_of(first, s.id), why
 
 
 def path_goes_straight(m: Reading) -> Found:

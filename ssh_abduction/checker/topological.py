@@ -17,10 +17,8 @@ def functional_view(m: Reading) -> Found:
     for (s, view), i in m.views.items():
         first, at = known.setdefault(s, (view, i))
         if view != first:
-            yield (
-                (at, i),
-                f"Dstate {s} looks like {first!r} at step {at} and like {view!r} at step {i}.",
-            )
+            why = f"Dstate {s} looks like {first!r} at step {at} and like {view!r} at step {i}."
+            yield (at, i), why
 
 
 def deterministic(m: Reading) -> Found:
@@ -50,10 +48,8 @@ def turn_stays(m: Reading) -> Found:
     """Check that a turn stays at its place (T2)."""
     for t in m.turns:
         if t.source.place != t.target.place:
-            yield (
-                t.steps,
-                f"{t} is a turn, but leads from place {t.source.place} to place {t.target.place}.",
-            )
+            why = f"{t} is a turn, but leads from place {t.source.place} to place {t.target.place}."
+            yield t.steps, why
 
 
 def travel_leaves(m: Reading) -> Found:
@@ -93,10 +89,8 @@ def turn_around_reverses(m: Reading) -> Found:
     for t in m.turns:
         course, other = course_of(t.source), course_of(t.target)
         if t.action.turn == "around" and other != (course and opposite(course)):
-            yield (
-                t.steps,
-                f"{t} is a turn around, but leads from {going(t.source)} to {going(t.target)}.",
-            )
+            why = f"{t} is a turn around, but leads from {going(t.source)} to {going(t.target)}."
+            yield t.steps, why
 
 
 def turn_changes_path(m: Reading) -> Found:
@@ -104,10 +98,8 @@ def turn_changes_path(m: Reading) -> Found:
     for t in m.turns:
         course, other = course_of(t.source), course_of(t.target)
         if t.action.turn in ("right", "left") and course and other and course[0] == other[0]:
-            yield (
-                t.steps,
-                f"{t} is a turn {t.action.turn}, but both dstates are along path {course[0]}.",
-            )
+            why = f"{t} is a turn {t.action.turn}, but both dstates are along path {course[0]}."
+            yield t.steps, why
 
 
 def one_dstate_per_course(m: Reading) -> Found:
@@ -186,10 +178,8 @@ def path_order_total(m: Reading) -> Found:
         for p in sorted(places - order.position.keys(), key=str):
             if apart := places - {p, *order.after(p, 1), *order.after(p, -1)}:
                 q = min(apart, key=str)
-                yield (
-                    [*m.steps_at(p), *m.steps_at(q)],
-                    f"Places {p} and {q} are on path {h}, but neither comes before the other.",
-                )
+                why = f"Places {p} and {q} are on path {h}, but neither comes before the other."
+                yield [*m.steps_at(p), *m.steps_at(q)], why
                 break
 
 
