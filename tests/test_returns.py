@@ -128,7 +128,8 @@ def test_bounds_on_returns_change_no_refusal(noise: str, bend: float) -> None:
         )
         trace = walk.trace
         returns, ssh_map = Returns(evidence_of(trace), trace), seen(trace, walk.truth)
-        rows = returns._returns_of(ssh_map.labels, tuple(s.place for s in ssh_map.dstates))
+        places = [ssh_map.dstates[label].place for label in ssh_map.labels]
+        rows = returns._returns_among(ssh_map.labels, places)
         thresholds = {4: 3.0, 5: 4.0, 6: 5.0}
         expected, together = (
             joint_excess(returns, rows, thresholds),

@@ -89,10 +89,8 @@ class Refused:
     def __str__(self) -> str:
         """Say how far apart the steps of a single return are, or how far off two loops close."""
         if len(self.closings) == 2:
-            ways, sizes = (
-                " and ".join(f"{value:{form}} m" for value in values)
-                for form, values in self._of_loops()
-            )
+            ways = " and ".join(f"{closing.way:.0f} m" for closing in self.closings)
+            sizes = " and ".join(f"{closing.size:.1f} m" for closing in self.closings)
             return f"the loops of {ways} close {sizes} off"
         closing, (_, _, freedom) = self.closings[0], self.returns[0]
         turned = (
@@ -101,11 +99,6 @@ class Refused:
             else ""
         )
         return f"they are {closing.size:.1f} ± {closing.size_sigma:.1f} m{turned} apart"
-
-    def _of_loops(self) -> Iterator[tuple[str, list[float]]]:
-        """Yield the lengths of the loops, then their closing errors, each with a number format."""
-        yield ".0f", [closing.way for closing in self.closings]
-        yield ".1f", [closing.size for closing in self.closings]
 
 
 def refused_returns(

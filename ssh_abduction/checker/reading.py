@@ -248,8 +248,9 @@ class Order:
         try:
             TopologicalSorter(self._next[1]).prepare()
         except CycleError:
-            rings = [ring for p, q in self.backward if (ring := self._way_back(p, q))]
-            return list({frozenset(ring): ring for ring in reversed(rings)}.values())[::-1]
+            # Shortest ways along travels back from q to p; empty if there is none.
+            back = [way(q, p, lambda r: self._next[1].get(r, ())) for p, q in self.backward]
+            return list({frozenset(ring): ring for ring in reversed(back) if ring}.values())[::-1]
         return []
 
     def allows(self, ring: Sequence[int]) -> bool:
@@ -272,10 +273,6 @@ class Order:
         if agrees and i is not None and j is not None and abs(i - j) <= 1:
             return set()  # neighbours in the list: no need to walk along the path
         return set(self.after(p, direction)) & set(self.after(q, -direction)) - {p, q}
-
-    def _way_back(self, p: int, q: int) -> list[int]:
-        """Find a shortest way along travels from q to p, as places; empty if there is none."""
-        return way(q, p, lambda r: self._next[1].get(r, ()))
 
     def ring_steps(self, ring: Sequence[int]) -> list[int]:
         """List the steps of the travels that lead around a ring of places in this order."""

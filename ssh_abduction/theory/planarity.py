@@ -164,9 +164,8 @@ def _leaves_room(
     following = {
         end: ends[i - len(ends) + 1] for ends in drawn.values() for i, end in enumerate(ends)
     }
-    met: dict[
-        int, list[int]
-    ] = {}  # the ends of each part, in the order in which its face meets them
+    # The ends of each part, in the order in which its face meets them.
+    met: dict[int, list[int]] = {}
     left = set(following)
     while left:
         here = start = left.pop()

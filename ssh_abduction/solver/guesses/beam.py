@@ -45,7 +45,6 @@ from ssh_abduction.solver.guesses.sights import nats_of_misread, right_view
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
-from ssh_abduction.theory.theory import Theory
 
 # The checker checks the beam after each CHECKED_EVERY steps.
 CHECKED_EVERY = 8
@@ -239,7 +238,11 @@ class Beam:
         look_at_clock()
         steps = len(found.labels)
         trace, theory = self._mended(found), self._bare.of_steps(0, steps)
-        ssh_map = next(self._completed(found, trace, theory), None)
+        # Unrelated frames can be rotated against each other.
+        ways = headings_by_turn(found)
+        turned = ways if theory.star == "frame" else islice(ways, 1)
+        maps = (valid_map(trace, theory, found.labels, found.places, way) for way in turned)
+        ssh_map = next(filter(None, maps), None)
         if ssh_map is None or any(e.refuse(trace, ssh_map, since) for e in self._problem.evidence):
             return None
         if not self._fault:
@@ -247,13 +250,6 @@ class Beam:
         whole, theory = self._trace.prefix(steps), self._problem.theory.of_steps(0, steps)
         ssh_map = with_faults(ssh_map, whole, trace, theory)
         return None if next(violations(whole, ssh_map, theory), None) else ssh_map
-
-    def _completed(self, found: Hypothesis, trace: Trace, theory: Theory) -> Iterator[SSHMap]:
-        """Yield the valid maps of a hypothesis, one for each way to rotate its unrelated frames."""
-        ways = headings_by_turn(found)
-        for facing in ways if theory.star == "frame" else islice(ways, 1):
-            if ssh_map := valid_map(trace, theory, found.labels, found.places, facing):
-                yield ssh_map
 
     def _believed(self, found: Hypothesis) -> Trace:
         """Return the trace of a hypothesis, without the displacements that it treats as wrong."""

@@ -211,7 +211,8 @@ class GatewaySketch(Sketch):
         return fitted is not None
 
     def _travel(self, here: int, step: Step) -> int:
-        if "gateway_end" not in self._axioms or _leads_on(self._star_seen, 0):
+        leads_on = any(leads(frame, 0) for frame in self._star_seen.frames)
+        if "gateway_end" not in self._axioms or leads_on:
             return super()._travel(here, step)
         path, direction = self._find_course(here)
         place, order = self._states[here].place, self._orders[path]
@@ -268,8 +269,3 @@ class GatewaySketch(Sketch):
 
 def _turn_of(action: Action | None) -> Action | None:
     return action if action is not None and action.kind == "turn" else None
-
-
-def _leads_on(star: Star, towards: int) -> bool:
-    """Whether some gateway of a star may lead on ahead (`towards` 0) or behind (180)."""
-    return any(leads(frame, towards) for frame in star.frames)

@@ -41,13 +41,6 @@ class KeptApart:
                 self._apart[labels[t], labels[u]] = self._apart[labels[u], labels[t]] = True
 
     @staticmethod
-    def of_dstates(
-        problem: Problem, labels: Mapping[int, int], kept: Iterable[tuple[int, int]]
-    ) -> KeptApart:
-        """List the dstates that the evidence about pairs of steps, or a map, keeps apart."""
-        return KeptApart(labels, pairs_in(problem.pairs.apart), kept)
-
-    @staticmethod
     def of_places(
         problem: Problem, labels: Mapping[int, int], kept: Iterable[tuple[int, int]]
     ) -> KeptApart:

@@ -27,6 +27,7 @@ from ssh_abduction.solver.guesses.placed_map import Part
 from ssh_abduction.solver.guesses.reckoning import BLUR, conditioned
 from ssh_abduction.solver.guesses.sights import Sight, Sights
 from ssh_abduction.solver.guesses.ties import relation_of, tied, ties_between
+from ssh_abduction.theory.pairs import pairs_in
 from ssh_abduction.theory.settle import Problem
 
 Array = NDArray[np.float64]
@@ -96,7 +97,7 @@ class Overlay:
             both.nats + (problem.overlap.between(standing.labels, drive.labels) if drive else 0.0),
         )
         at = {t: both.places[s] for t, s in both.labels.items()}
-        self._dstates_apart = KeptApart.of_dstates(problem, both.labels, both.kept)
+        self._dstates_apart = KeptApart(both.labels, pairs_in(problem.pairs.apart), both.kept)
         places = ((both.places[s], piece) for s, piece in both.kept)
         self._places_apart = KeptApart.of_places(problem, at, places)
         # The cost of changed gateways if two places are one; inf if they cannot be.

@@ -113,7 +113,8 @@ class Loops:
         metres and radians, and their covariances m x 3 x 3.
         """
         i, j = np.asarray(first, dtype=int), np.asarray(last, dtype=int)
-        closing = self._closing(i, j)
+        closing = self.poses[j] - self.poses[i]
+        closing[:, 2] = np.remainder(closing[:, 2] + math.pi, math.tau) - math.pi
         covariance = self.noise(i, j) + self.repeated(i, j)
         lost = self._heading_variance(i, j)
         moved_by_heading = self._moved_by_heading(i, j)
@@ -188,11 +189,6 @@ class Loops:
         bent, other_bent = (self._by_bend(*pair) for pair in (loops, others))
         by_scale: Array = self.odometry.scale**2 * scaled[:, :, None] * other_scaled[:, None, :]
         return by_scale + self.drift**2 * bent[:, :, None] * other_bent[:, None, :]
-
-    def _closing(self, i: Steps, j: Steps) -> Array:
-        closing = self.poses[j] - self.poses[i]
-        closing[:, 2] = np.remainder(closing[:, 2] + math.pi, math.tau) - math.pi
-        return closing
 
     def _by_bend(self, i: Steps, j: Steps) -> Array:
         """Return how far a drift of 1 radian per metre moves the end of each loop, m x 3."""

@@ -215,20 +215,14 @@ class Returns:
                     (s, t) for i in others for s in range(i, end[i]) if views[s] == views[t]
                 )
 
-    def _returns_of(
-        self, labels: tuple[int, ...], places: tuple[int | None, ...], since: int = 0
-    ) -> Steps:
-        """List the returns of a map: pairs of visits whose first steps are at one place or dstate.
-
-        Each row has the first step, the last step, and 1 for a dstate or 0 for a place, by last
-        step.
-        """
-        return self._returns_among(labels, [places[label] for label in labels], since)
-
     def _returns_among(
         self, labels: Sequence[int], places: Sequence[int | None], since: int = 0
     ) -> Steps:
-        """List returns as `_returns_of`, but `places` has the place of each step."""
+        """List returns: pairs of visits whose first steps are at one place or dstate.
+
+        `labels` has the dstate of each step, and `places` the place. Each row has the first step,
+        the last step, and 1 for a dstate or 0 for a place, by last step.
+        """
         import numpy as np
 
         at_dstate: dict[int, list[int]] = defaultdict(list)
@@ -259,14 +253,12 @@ class Returns:
         tested = PlacedLabels.of(labels, places)
         if tested in self._accepted:
             return None
-        if (
-            known := next(
-                (found for found in reversed(self._refused) if hold(found, labels, places)), None
-            )
-        ) is not None:
-            return known
+        for known in reversed(self._refused):
+            if hold(known, labels, places):
+                return known
         before = self._accepted.pop(PlacedLabels.of(labels[:since], places), None)
-        rows = self._returns_of(labels, places, since if before else 0)
+        at = [places[label] for label in labels]
+        rows = self._returns_among(labels, at, since if before else 0)
         if before:
             rows = np.concatenate([before.rows, rows])
         together = self._together(rows, before)

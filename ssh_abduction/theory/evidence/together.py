@@ -70,8 +70,6 @@ class _ReturnsAlone:
 class Together:
     """The returns of one map, and tests of pairs of them.
 
-    A return is two steps that the map has at one place or dstate.
-
     Attributes:
         rows: One row for each return, sorted by last step: its first step, its last step, and 1
             for a return to a dstate or 0 for one to a place.
@@ -143,7 +141,7 @@ class Together:
         alone, rows = self._of_each(0), self.rows
         first = rows[later, 0]
         inverse = alone.inverse[later]
-        loops = self._loops(0)
+        loops = self._reckoning.loops(0)
         gathered = loops.of_ends(end) @ inverse.T
         before = np.arange(end + 1)[:, None] < first
         # Steps before the beginning of a loop do not count.
@@ -185,7 +183,7 @@ class Together:
 
     def _excess(self, number: int, end: int, later: Steps, earlier: Steps) -> Array:
         """Return chi-square minus threshold of each pair of returns, at least 0, for one drift."""
-        alone, rows, loops = self._of_each(number), self.rows, self._loops(number)
+        alone, rows, loops = self._of_each(number), self.rows, self._reckoning.loops(number)
         squares = alone.square[later] + alone.square[earlier]
         # The stretch that both loops share.
         begin, stop = (np.maximum(rows[earlier, 0], rows[later, 0]), rows[earlier, 1])
@@ -240,7 +238,7 @@ class Together:
         known = self._alone.get(number)
         if known is None or len(known.square) < len(self.rows):
             loops, rows = (
-                self._loops(number),
+                self._reckoning.loops(number),
                 self.rows[0 if known is None else len(known.square) :],
             )
             new = _alone(
@@ -250,9 +248,6 @@ class Together:
             )
             known = self._alone[number] = known.followed_by(new) if known else new
         return known
-
-    def _loops(self, number: int) -> Loops:
-        return self._reckoning.loops(number)
 
 
 def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
