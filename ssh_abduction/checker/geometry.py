@@ -70,9 +70,6 @@ class LoopGap:
 class Refused:
     """One return, or a pair of returns, that the displacements reject.
 
-    A return is two steps that the map has at one place or dstate. Its loop is the way between these
-    steps.
-
     Attributes:
         returns: For each return, its two steps and its degrees of freedom (2 for a place, 3 for a
             dstate).
@@ -106,10 +103,9 @@ def refused_returns(
 ) -> Iterator[Refused]:
     """Find the single returns and the pair of returns that displacements reject most clearly.
 
-    A return is two steps that the map has at one place or dstate. Yields at most one return to a
-    place, one return to a dstate, and then one pair of returns. In the theory no field is "auto",
-    and `returns` is the number of tests. Skips returns before step `since` that no displacement
-    relates to that step, such as those of earlier drives.
+    Yields at most one return to a place, one return to a dstate, and then one pair of returns. In
+    the theory no field is "auto", and `returns` is the number of tests. Skips returns before step
+    `since` that no displacement relates to that step, such as those of earlier drives.
     """
     if not trace.has_displacements:
         return

@@ -35,7 +35,7 @@ from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.framed_sides import FramedSides
-from ssh_abduction.solver.engines.transitive import Pair
+from ssh_abduction.solver.engines.transitive import Pair, intransitive
 from ssh_abduction.solver.engines.visit_program import VisitProgram, fits_in_time
 from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
@@ -163,7 +163,7 @@ class VisitLabels:
         """
         while (pairs := ask()) is not None:
             program = self.program
-            if threes := program.intransitive(pairs):
+            if threes := intransitive(pairs, program.known.fits, program.chart):
                 program.close(threes)
             elif (located := program.located(pairs)).missed:
                 self._give_more(located.missed)

@@ -18,7 +18,7 @@ from ssh_abduction.solver.asp.facts.atoms import number_symbols
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.framed_sides import FramedSides
-from ssh_abduction.solver.engines.transitive import Pair, Three, intransitive
+from ssh_abduction.solver.engines.transitive import Pair, Three
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.solver.steps.localising import Located, State, faced, located
 from ssh_abduction.theory.pairs import pairs_in
@@ -165,10 +165,6 @@ class VisitProgram:
         """Give clingo the rules of transitivity for these triples of visits."""
         self._closed += 1
         self.add_rules(visits_lp.three_facts(self._closed, threes), "closed", self._closed)
-
-    def intransitive(self, pairs: Sequence[Pair]) -> list[Three]:
-        """Find the triples of visits at which an answer is not transitive."""
-        return intransitive(pairs, self.known.fits, self.chart)
 
     def located(self, pairs: Iterable[Pair]) -> Located:
         """Locate all visits by the pairs in a transitive answer; else return the missed visits."""
