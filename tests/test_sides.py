@@ -129,8 +129,10 @@ def test_explain_prints_sides_of_a_place(
     assert "expected a place of the first minimal map, got 9" in capsys.readouterr().err
     written("a T b A c A d").save("none.jsonl")
     assert main(["explain", "none.jsonl", "p0"]) == 20
-    assert main(["explain", "corner.jsonl", "p2", "path0", "path1"]) == 1
-    assert "or a place and a path, as in p7 path2" in capsys.readouterr().err
+    for words in (["p2", "path0", "path1"], ["region0"]):
+        assert main(["explain", "corner.jsonl", *words]) == 1
+        told = capsys.readouterr().err
+        assert "in which regions it is, or a place and a path, as in p7 path2" in told
 
 
 def test_show_lists_regions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -157,8 +157,10 @@ def _place_asked(words: Sequence[str], listing: Listing | None) -> tuple[int, in
         texts = [name.text for name in names]
         hints = (meant(word, texts, 3) for word, kind in zip(words, kinds, strict=True) if not kind)
         raise AbductionError(
-            f"steps: expected two steps, or none, got {brief(' '.join(words))}; name the two steps "
-            f"that are to be explained, or a place and a path, as in p7 path2{''.join(hints)}"
+            f"steps: expected two steps, a place, or a place and a path, got "
+            f"{brief(' '.join(words))}; name two steps, or a place, as in p7, to learn on which "
+            f"side of each path and in which regions it is, or a place and a path, as in "
+            f"p7 path2{''.join(hints)}"
         )
     return None
 
