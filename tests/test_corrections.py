@@ -188,6 +188,8 @@ def test_solve_obeys_recorded_corrections(folder: Path, capsys: pytest.CaptureFi
         "name 'kitchen' of the place of monday:1",
         "different: monday:1, tuesday:0",
     ]
+    assert main(["correct", building, "--different", "monday:1,tuesday:0"]) == 0
+    assert capsys.readouterr().out == "nothing changed: this was said before\n"
     assert main(solving(folder)) == 0
     told = capsys.readouterr()
     assert "obeying 2 corrections of" in told.err

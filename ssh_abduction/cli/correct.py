@@ -72,6 +72,9 @@ def run(options: argparse.Namespace) -> int:
             saved = saved.named(said)
         else:
             said = said.with_gateway(kind == "open", saved.gateway(value))
+    if said == before and options.said:
+        print("nothing changed: this was said before")
+        return 0
     if said == before:
         print("\n".join(map(printable, sentences_of(said))) or "nothing was said")
         return 0
