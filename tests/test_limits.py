@@ -507,3 +507,20 @@ def test_first_map_has_poses_after_a_limit_on_a_busy_machine(
     solution = solve(trace, time_limit=1e-9)
     assert solution.stopped == "time limit"
     assert solution[0].fit is not None
+
+
+def test_late_second_opinion_does_not_cost_the_other_warnings(tmp_path: Path) -> None:
+    """The guard ends a process whose second opinion ignores the time limit."""
+    script = """
+import sys, time
+from ssh_abduction.cli import guard, main, outcome
+guard.LATE = (1.0, 0.2)
+outcome.second_map = lambda *_: time.sleep(60)
+main(sys.argv[1:])
+"""
+    rectangle(8).save(tmp_path / "r.jsonl")
+    words = ["solve", str(tmp_path / "r.jsonl"), "--set", "weigh=cost", "--time-limit", "1"]
+    command = [sys.executable, "-c", script, *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=SOON, check=True)
+    assert "optimal" in done.stdout
+    assert "warning: weigh: maps are counted instead of weighed" in done.stderr

@@ -74,8 +74,8 @@ def send(number: int = signal.SIGTERM) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        "waits = iter([100])\n"
-        "solve.warn = lambda _: print(file=sys.stderr) or time.sleep(next(waits, 0))",
+        "waits = iter([0, 100])  # the second call may follow a long search\n"
+        "solve.warn = lambda _: next(waits) and (print(file=sys.stderr) or time.sleep(100))",
         "solve.save_solution = lambda *_: print(file=sys.stderr) or time.sleep(0.6)",
     ],
     ids=["warnings", "saving"],

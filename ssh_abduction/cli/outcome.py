@@ -104,11 +104,15 @@ class Warnings:
 
     def of(self, solution: Solution) -> list[str]:
         """List the warnings about a solution of the search."""
+        return [*self.at_once(solution), *self.second_opinion(solution)]
+
+    def at_once(self, solution: Solution) -> list[str]:
+        """List the warnings that need no further search."""
         if solution.stopped == "interrupted" and len(self._search.trace) > SOON:
             return []
-        return [*solution.warnings, *self._second_opinion(solution)]
+        return [*solution.warnings]
 
-    def _second_opinion(self, solution: Solution) -> list[str]:
+    def second_opinion(self, solution: Solution) -> list[str]:
         """Warn if the runner-up's views give another map, if there is time to solve it."""
         if self._second is None:
             search, limits = self._search, self._search.limits
