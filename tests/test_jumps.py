@@ -131,6 +131,15 @@ def test_standing_robot_is_not_called_carried(scans: tuple[Scan, ...]) -> None:
     assert unknown_steps(RobotLog((*scans[:60], *stands, *scans[60:]))) == Unknown()
 
 
+def test_robot_that_is_carried_without_a_pause_is_not_called_standing(
+    scans: tuple[Scan, ...],
+) -> None:
+    untimed = [replace(scan, time=None) for scan in (*scans[:40], *scans[90:])]
+    track, notes = track_and_notes(stepwise(untimed, lambda i, step: START if i == 40 else step))
+    assert (track.cuts, track.breaks) == ((40,), (40,))
+    assert "The scans show nothing of what was seen before, once: from scan 40" in notes
+
+
 @pytest.mark.slow
 def test_carried_robot_gives_a_slipped_action(scans: tuple[Scan, ...]) -> None:
     """The laser is off while the robot is carried, and the odometer is where it was."""

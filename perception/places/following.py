@@ -79,9 +79,8 @@ def follow(log: RobotLog) -> Track:
     standing = frozenset(
         k
         for first, last in steps.still
+        if _stands(log, track, first, last)
         for k in range(first, last + 1)
-        if np.hypot(*(track.poses[first : last + 1, :2] - track.poses[first - 1, :2]).T).max()
-        <= CARRIED
     )
     if standing:
         steps = steps.without(standing)
@@ -89,6 +88,33 @@ def follow(log: RobotLog) -> Track:
     if more := frozenset(_carried(log, track)):
         track = _track_of(log, replace(steps, carried=steps.carried | more))
     return track
+
+
+def _stands(log: RobotLog, track: Track, first: int, last: int) -> bool:
+    """Whether the robot stood or turned on the spot while its odometer stood still.
+
+    `first` and `last` are scans of this stretch. If the robot was carried, the scans from `last` on
+    do not match the walls that were seen before.
+    """
+    off = track.poses[first : last + 1, :2] - track.poses[first - 1, :2]
+    if np.hypot(*off.T).max() > CARRIED:
+        return False
+    known, begin = _known_before(log, track, first, track.breaks), log.scans[first - 1].odometry
+    wide = np.diag(UNKNOWN) ** 2
+    shares = [
+        _matched(seen, known, track.pose(first - 1), displacement_between(begin, odometry), wide)[2]
+        for odometry, seen in (
+            (scan.odometry, surfaces_in(scan)) for scan in log.scans[last : last + IN_A_ROW]
+        )
+        if len(seen)
+    ]
+    return not shares or float(np.median(shares)) >= SURE
+
+
+def _known_before(log: RobotLog, track: Track, scan: int, breaks: Iterable[int]) -> list[Surfaces]:
+    """List what the scans before a scan show, back to the last break, in the frame of the track."""
+    begin = max(0, scan - RECENT, *(b for b in breaks if b < scan))
+    return [surfaces_in(log.scans[k]).moved(track.poses[k]) for k in range(begin, scan)]
 
 
 def _track_of(log: RobotLog, steps: Unknown) -> Track:
@@ -230,8 +256,7 @@ def _carried(log: RobotLog, track: Track) -> list[int]:
             or (found and i < found[-1] + IN_A_ROW)
         ):
             continue
-        begin = max(0, i - RECENT, *(b for b in (*track.breaks, *found) if b <= i))
-        known = [surfaces_in(log.scans[k]).moved(track.poses[k]) for k in range(begin, i)]
+        known = _known_before(log, track, i, (*track.breaks, *found))
         if not any(map(len, known)):
             continue
         wide = np.diag(UNKNOWN) ** 2
