@@ -220,8 +220,8 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
 
         def save() -> None:
             options.json = False  # the JSON is complete: a later error must not follow it
-            warn(found.at_once(solution))  # here, as the guard may end the process after finish()
             save_solution(solution, options.output)
+            warn(found.at_once(solution))  # here, as the guard may end the process after finish()
 
         guard.finish(exit_code(solution), printed.end(solution, explanation), save)
         warn(found.second_opinion(solution))
