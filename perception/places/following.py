@@ -55,8 +55,9 @@ UNKNOWN = (0.5, 0.5, 0.5)
 TURNED = math.radians(60)
 # A robot whose odometer stands still was carried if scans moved by more than this many metres.
 CARRIED = 1.0
-# Share of points on walls that a match needs without odometry.
-SURE = 0.7
+# Share of points on walls that a match needs without odometry. It is WELL if the robot turned by
+# more than HELD radians, while its odometer stood still.
+SURE, HELD, WELL = 0.7, 0.15, 0.9
 # A match contradicts the odometer from this chi-square on (3 degrees of freedom). If less than the
 # share CLEAR of the points lies on walls then, either may be right. So the covariance is widened by
 # the difference of the two.
@@ -100,15 +101,16 @@ def _stands(log: RobotLog, track: Track, first: int, last: int) -> bool:
     if np.hypot(*off.T).max() > CARRIED:
         return False
     known, begin = _known_before(log, track, first, track.breaks), log.scans[first - 1].odometry
-    wide = np.diag(UNKNOWN) ** 2
-    shares = [
-        _matched(seen, known, track.pose(first - 1), displacement_between(begin, odometry), wide)[2]
-        for odometry, seen in (
-            (scan.odometry, surfaces_in(scan)) for scan in log.scans[last : last + IN_A_ROW]
-        )
-        if len(seen)
-    ]
-    return not shares or float(np.median(shares)) >= SURE
+    wide, turns, shares = np.diag(UNKNOWN) ** 2, [], []
+    for scan in log.scans[last : last + IN_A_ROW]:
+        if len(seen := surfaces_in(scan)):
+            onward = displacement_between(begin, scan.odometry)
+            pose, _, share = _matched(seen, known, track.pose(first - 1), onward, wide)
+            turns.append(abs(wrapped(pose[2] - track.poses[first - 1, 2] - onward[2])))
+            shares.append(share)
+    if not shares:  # the laser sees nothing
+        return True
+    return float(np.median(shares)) >= (SURE if np.median(turns) <= HELD else WELL)
 
 
 def _known_before(log: RobotLog, track: Track, scan: int, breaks: Iterable[int]) -> list[Surfaces]:
