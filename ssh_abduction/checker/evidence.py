@@ -289,8 +289,8 @@ AXIOMS: dict[str, Check] = {
         closure,
         one_pose,
         other_floor,
-        one_landing,
         path_in_one_piece,
+        one_landing,
         planar,
     )
 }

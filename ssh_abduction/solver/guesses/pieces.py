@@ -102,8 +102,7 @@ def fitted(found: Hypothesis, place: int, dstate: int | None = None) -> Hypothes
         if min(math.hypot(*way) for way in ways) < NEAR:
             return found
         angle = math.atan2(*ways[1][::-1]) - math.atan2(*ways[0][::-1])
-    turned = _turned(found, float(angle), n if hinge is None else found.position[hinge])
-    return replace(turned, pieces=joined.merged(other))
+    return replace(_turned(found, float(angle)), pieces=joined.merged(other))
 
 
 def headings_by_turn(found: Hypothesis) -> Iterator[list[float]]:
@@ -139,15 +138,15 @@ def closed(found: Hypothesis, dstate: int, turn: float) -> Hypothesis:
     if other == pieces.here:
         return found
     angle = found.mean[found.heading[dstate]] + turn - found.mean[n + 2]
-    hinge = pieces.hinges.get(pieces.here)
-    turned = _turned(found, float(angle), n if hinge is None else found.position[hinge])
     joins = (*pieces.joins, (pieces.here, found.places[dstate], dstate))
-    return replace(turned, pieces=replace(pieces, joins=joins).merged(other))
+    return replace(_turned(found, float(angle)), pieces=replace(pieces, joins=joins).merged(other))
 
 
-def _turned(found: Hypothesis, angle: float, centre: int) -> Hypothesis:
-    """Turn all poses of the robot's piece about a centre (index of its x), by radians."""
+def _turned(found: Hypothesis, angle: float) -> Hypothesis:
+    """Turn all poses of the robot's piece by radians, about its hinge or else about the robot."""
     n, pieces = len(found.mean) - 3, found.pieces
+    hinge = pieces.hinges.get(pieces.here)
+    centre = n if hinge is None else found.position[hinge]
     places = zip(found.position, pieces.of_place, strict=True)
     headings = zip(found.heading, pieces.of_heading, strict=True)
     x = np.array([n, *(at for at, piece in places if piece == pieces.here)])

@@ -7,14 +7,11 @@ the same place of the other floor.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
-
-if TYPE_CHECKING:
-    from ssh_abduction.theory.theory import Theory
 
 
 @dataclass(frozen=True)
@@ -24,12 +21,8 @@ class Landings(Evidence):
     name: ClassVar[str] = "landings"
     axiom: ClassVar[str] = "one_landing"
 
-    @classmethod
-    def of(cls, theory: Theory) -> Landings:
-        return cls()
-
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
+        places = [ssh_map.place_of(t) for t in range(len(ssh_map.dstate_at))]
         first: dict[tuple[int | None, str], int] = {}  # the first step after each lift
         for t in range(1, len(places)):
             action = trace.actions[t - 1]

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise, product
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from ssh_abduction.data.floors import stretches_of
 from ssh_abduction.data.groups import gathered, way
@@ -20,9 +20,6 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.pairs import Pairs
 
-if TYPE_CHECKING:
-    from ssh_abduction.theory.theory import Theory
-
 
 @dataclass(frozen=True)
 class Floors(Evidence):
@@ -30,10 +27,6 @@ class Floors(Evidence):
 
     name: ClassVar[str] = "floors"
     axiom: ClassVar[str] = "other_floor"
-
-    @classmethod
-    def of(cls, theory: Theory) -> Floors:
-        return cls()
 
     def pairs(self, trace: Trace) -> Pairs:
         return _pairs(stretches_of(trace), _lifted(trace))

@@ -47,8 +47,8 @@ class Evidence(Protocol):
 
     @classmethod
     def of(cls, theory: Theory) -> Evidence:
-        """Make the evidence for a theory."""
-        ...
+        """Make the evidence for a theory, by default from none of its fields."""
+        return cls()
 
     def remembering(self, known: Any) -> Evidence:
         """Return this evidence, with the results that earlier evidence of its kind computed."""
