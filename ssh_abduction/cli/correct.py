@@ -108,7 +108,7 @@ def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
         hint = "" if about_places else "; places are for --elsewhere and --same-place"
         raise MapError(f"{flag}: {error}{hint}") from None
     if len(steps) != 2 or steps[0] == steps[1]:
-        what = "steps, such as monday:12,tuesday:3"
-        what = "places, such as kitchen,p7" if about_places else what
+        places, others = "places, such as kitchen,p7", "steps, such as monday:12,tuesday:3"
+        what = places if about_places else others
         raise MapError(f"{flag}: expected two different {what}, got {brief(pair)}; name two")
     return steps[0], steps[1]

@@ -151,8 +151,12 @@ class Experiment:
         if count == 1:
             return f"1 map: there is nothing to tell apart; {_untried_in_words(plan.untried)}"
         if plan.branches:
-            left = f"leaves {plan.worst} of them in the worst case, as known links do not tell them"
-            left = "leaves one of them" if plan.worst == 1 else f"{left} apart"
+            left = "leaves one of them"
+            if plan.worst != 1:
+                left = (
+                    f"leaves {plan.worst} of them in the worst case, as known links do not tell "
+                    "them apart"
+                )
             whole = "this"
             if any(branch.plan.branches for branch in plan.branches):
                 whole = f"the whole plan takes {plan.longest} actions at most and"
