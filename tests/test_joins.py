@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -216,16 +217,18 @@ def test_maps_of_logs_name_doubtful_joins() -> None:
         solution=solution,
         imported=imported,
         log=log,
-        seconds={},
+        seconds={"track": 3.0},  # processor time
         notes=(),
         joined="",
         files=lambda: dict(files),
     )
     question = MapQuestion(None, {}, {}, 0.5, None, 0, ladder=False)
-    assert told in question._answer(0, ["a.log"], done, None).line
+    line = question._answer(0, ["a.log"], done, None, time.monotonic() - 60).line
+    assert told in line
+    assert line.endswith("; 60.0 s")
     # Neither the second part of x nor the log that is named like one confuses their sources.
     drives = [{"name": name} for name in ("x", "x part 3", "x part 2")]
     files["run.json"] = json.dumps({"log": {}, "drives": drives}).encode()
-    answer = question._answer(0, ["x.log", "x part 2.log"], done, None)
+    answer = question._answer(0, ["x.log", "x part 2.log"], done, None, time.monotonic())
     run = json.loads(dict(answer.files)["run.json"])
     assert [drive["source"] for drive in run["drives"]] == ["x.log", "x.log", "x part 2.log"]

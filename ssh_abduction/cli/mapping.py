@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import json
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -154,6 +155,7 @@ class MapQuestion(FileQuestion):
         `content` is the digest of the logs before they are read. If a log changes later, the next
         call sees another digest and maps them again. `keep` writes the answer; None in a worker.
         """
+        started = time.monotonic()
         begun: list[LogMapping] = []  # one entry, once the logs are read
         names = [named_after(path) for path in paths]
 
@@ -169,7 +171,7 @@ class MapQuestion(FileQuestion):
         def last_words(_: Stop) -> tuple[str, int, Callable[[], None]]:
             answer = self._given_up(number, paths[0])
             if begun and begun[0].search is not None:
-                answer = self._answer(number, paths, begun[0].known(), content)
+                answer = self._answer(number, paths, begun[0].known(), content, started)
             return "", interrupted_code(), partial(keep or workers.reply, answer)
 
         guard = Guard(interrupt, last_words, given_up=given_up)
@@ -198,15 +200,23 @@ class MapQuestion(FileQuestion):
             )
             if self.corrections:
                 say_obeyed(self.corrections, done.imported.trace)
-            answer = self._answer(number, paths, done, content)
+            answer = self._answer(number, paths, done, content, started)
             if keep:
                 guard.finish(answer.code, save=partial(keep, answer))
         return answer
 
     def _answer(
-        self, number: int, paths: Sequence[str], done: LogMap, content: str | None
+        self,
+        number: int,
+        paths: Sequence[str],
+        done: LogMap,
+        content: str | None,
+        started: float,
     ) -> FileAnswer:
-        """Make the answer for a log that was mapped, or for several that were mapped together."""
+        """Make the answer for a log that was mapped, or for several that were mapped together.
+
+        `started` is the time at which reading the logs began.
+        """
         files, log = done.files(), done.log
         run = json.loads(files["run.json"])
         run["log"]["source"] = " + ".join(paths)
@@ -228,7 +238,7 @@ class MapQuestion(FileQuestion):
         joins = joins_in_words(solution.by_minimality, solution.count)
         visits = counted(len(done.imported.visits), "visits")
         way = f"{counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m"
-        seconds = f"{sum(done.seconds.values()):.1f} s"
+        seconds = f"{time.monotonic() - started:.1f} s"
         parts = [found, how, joins, solution.joined, f"{visits} in {way}", seconds]
         line = f"{' + '.join(map(named, paths))}: {'; '.join(filter(None, parts))}"
         code = interrupted_code() if done.interrupted else exit_code(solution)
