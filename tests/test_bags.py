@@ -389,9 +389,9 @@ def two_lasers(m: Messages, *topics: str) -> list[tuple[str, float, Any]]:
 def test_each_scan_has_the_mount_of_its_own_frame(tmp_path: Path) -> None:
     log = read_log(bag(tmp_path / "one", lambda m: two_lasers(m, "/scan")))
     assert [round(scan.laser.mount[2], 3) for scan in log.scans] == [3.142, 0.0] * 4
-    assert "The scans are of several frames (4 of rear, 4 of front)" in notes(log)
+    assert "The scans are of several frames (4 of rear, 4 of front)" in " ".join(log.sources)
     path = bag(tmp_path / "two", lambda m: two_lasers(m, "/front", "/rear"))
-    with pytest.raises(LogError, match=r"name one with --scan-topic, once for each"):
+    with pytest.raises(LogError, match=r"name one with --set scan_topic=TOPIC, once for each"):
         read_log(path)
     both = read_log(path, scan_topic=["/front", "rear"])
     assert [scan.laser.mount for scan in both.scans] == [scan.laser.mount for scan in log.scans]

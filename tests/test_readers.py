@@ -626,12 +626,12 @@ def test_error_lists_several_scan_topics(tmp_path: Path) -> None:
     )
     with pytest.raises(
         LogError,
-        match=r"got 2: /front \(1 messages\), /rear \(2 messages\); name one with --scan-topic",
+        match=r"/front \(1 messages\), /rear \(2 messages\); name one with --set scan_topic=TOPIC",
     ):
         read_log(path)
-    with pytest.raises(LogError, match=r"/odom .*/truth .*--odom-topic"):
+    with pytest.raises(LogError, match=r"/odom .*/truth .*--set odom_topic"):
         read_log(path, scan_topic="rear")
-    with pytest.raises(LogError, match=r"--odom-topic: expected a topic of Odometry, got '/front'"):
+    with pytest.raises(LogError, match=r"odom_topic: expected a topic of Odometry, got '/front'"):
         read_log(path, scan_topic="rear", odom_topic="/front")
     log = read_log(path, scan_topic="rear", odom_topic="/truth")
     assert [scan.odometry[0] for scan in log.scans] == [2, 2]

@@ -43,6 +43,7 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
         ", ".join(dict.fromkeys(log.format for log in logs)),
         ", ".join(log.source for log in logs),
         _named(names, [log.notes for log in logs]),
+        _named(names, [log.sources for log in logs]),
     )
     begins = [0, *accumulate(len(part.track.poses) for part in parts)][: len(parts)]
     track, shifts = _joint_track([part.track for part in parts], begins)

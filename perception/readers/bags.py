@@ -66,29 +66,17 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
     frame = seen.most_common(1)[0][0]
 
     # 1. Odometry: from its topic or, if there is none, from transforms.
-    said = " and ".join(scans)
     if odometers is not None:
         odometer, odom, base = _odometer(bag, odometers, damaged, notes)
-        notes.insert(len(bag.notes), f"Scans come from {said}, odometry from {odometers}.")
         called = odometers
     else:
         odometer, odom, base = _odometer_of_transforms(bag, frames, frame)
-        notes.append(
-            f"Scans come from {said}. There are no Odometry messages, so odometry is the "
-            f"transform from {odom} to {base}."
-        )
         called = f"the transforms from {odom} to {base}"
     odometer = _of_one_source(odometer, called, notes)
 
     # 2. Where each frame of scans is on the robot.
     assumed: dict[str, str] = {}
     mounts = {frame: mount_of(frames, odom, base, frame, notes, assumed) for frame in seen}
-    if len(seen) > 1:
-        notes.append(
-            "The scans are of several frames "
-            f"({', '.join(f'{count} of {name}' for name, count in seen.most_common())}): each "
-            "is mounted as its own frame says."
-        )
 
     # 3. Corrected poses: from the transforms above the frame of the odometry.
     tracks = (parent_of(frames, child).track for child in ancestors(frames, odom))
@@ -99,11 +87,19 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
     clocks |= {f"the transforms above {odom}": track.table()[:, :2] for track in above}
     by_stamp, contradictions = clock_of(clocks)
     notes += contradictions
+    sources = [f"Scans come from {' and '.join(scans)}, odometry from {called}."]
+    if len(seen) > 1:
+        sources.append(
+            "The scans are of several frames "
+            f"({', '.join(f'{count} of {name}' for name, count in seen.most_common())}): each "
+            "is mounted as its own frame says."
+        )
     if above:
-        notes.append(f"Corrected poses come from the transforms above {odom}.")
+        sources.append(f"Corrected poses come from the transforms above {odom}.")
     corrections = [TimedPoses.of(track, by_stamp) for track in above]
     where = _ScanPoses(TimedPoses.of(odometer, by_stamp), corrections, mounts, by_stamp)
-    return SurveyedLog(bag.format, tuple(notes), _scans(bag, set(scans), where, damaged), assumed)
+    items = _scans(bag, set(scans), where, damaged)
+    return SurveyedLog(bag.format, tuple(notes), items, assumed, tuple(sources))
 
 
 def _scan_topics(bag: Bag, named: Sequence[str]) -> list[str]:
@@ -129,7 +125,7 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
         match = [topic for topic in counts if topic.strip("/") == name.strip("/")]
         if not match:
             raise LogError(
-                f"{bag.source}: --{option}-topic: expected a topic of {short}, got "
+                f"{bag.source}: {option}_topic: expected a topic of {short}, got "
                 f"{brief(name)}; those in the bag: {listed}"
             )
         return match[0]
@@ -138,7 +134,7 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
         several = ", once for each that is to be read" if option == "scan" else ""
         raise LogError(
             f"{bag.source}: expected one topic of {short}, got {len(counts)}: {listed}; name "
-            f"one with --{option}-topic{several}"
+            f"one with --set {option}_topic=TOPIC{several}"
         )
     return next(iter(counts), None)
 

@@ -89,7 +89,8 @@ def read_log(
         )
     meant, found_out = interpret_log(scans, options)
     notes = (*reading.notes, *_assumed(reading, options), *found_out)
-    log = RobotLog(meant, tuple(damaged), reading.format, os.fspath(path), notes)
+    source = os.fspath(path)
+    log = RobotLog(meant, tuple(damaged), reading.format, source, notes, reading.sources)
     for warning in log.warnings:
         _log.warning("%s: %s", named(path), warning)
     return log

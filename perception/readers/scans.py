@@ -118,6 +118,7 @@ class RobotLog:
         source: Path of the file or folder.
         notes: Sentences about the log that a user should know, for example that its odometry was
             reconstructed.
+        sources: Sentences that say which parts of a bag the scans and poses come from.
     """
 
     scans: Sequence[Scan]
@@ -125,6 +126,7 @@ class RobotLog:
     format: str = ""
     source: str = ""
     notes: tuple[str, ...] = ()
+    sources: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -160,3 +162,4 @@ class SurveyedLog:
     # Notes on what the reader assumed. The key of a note is the field of
     # `perception.readers.echoes.LaserOptions` by which a user can say otherwise.
     assumed: Mapping[str, str] = field(default_factory=dict)
+    sources: tuple[str, ...] = ()  # as in `RobotLog`

@@ -159,6 +159,7 @@ class LogMap:
                 "scans": len(self.log),
                 "metres": round(float(self.imported.track.way[-1]), 1),
                 "damaged": len(self.log.damaged),
+                "sources": list(self.log.sources),
                 "notes": list(self.log.notes),
             },
             "width": self.imported.width,

@@ -202,7 +202,7 @@ def _time(run: Mapping[str, Any]) -> str:
 
 def _log(log: RobotLog) -> str:
     """List what the reader of the log noticed: its format, notes, and damaged parts."""
-    said = [f"{log.source}: {log.format}, {len(log)} scans.", *log.notes]
+    said = [f"{log.source}: {log.format}, {counted(len(log), 'scans')}.", *log.sources, *log.notes]
     if log.damaged:
         said.append(
             f"Skipped: {counted(len(log.damaged), 'damaged parts')} of the log. The first ones:"
