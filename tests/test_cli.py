@@ -286,7 +286,7 @@ def test_check_reads_one_saved_map(tmp_path: Path, capsys: pytest.CaptureFixture
     ssh_map.save(tmp_path / "map.json")
     assert SSHMap.load(tmp_path / "map.json") == ssh_map
     assert main(["check", str(tmp_path / "map.json"), saved(trace, tmp_path)]) == 0
-    assert "1 of 1 maps satisfy the 21 axioms" in capsys.readouterr().out
+    assert "1 of 1 map satisfies the 21 axioms" in capsys.readouterr().out
 
 
 def test_show_draws_and_exports_a_map(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:

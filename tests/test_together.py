@@ -509,7 +509,7 @@ def test_verbs_read_the_trace_in_a_file_of_maps(
     maps = str(tmp_path / "maps.json")
     solve([MONDAY, TUESDAY]).save(maps)
     assert main(["check", maps]) == 0
-    assert "1 of 1 maps satisfy" in capsys.readouterr().out
+    assert "1 of 1 map satisfies" in capsys.readouterr().out
     assert main(["next", maps]) == 0
     assert main(["explain", maps, "monday:0", "tuesday:1"]) == 0
     told = capsys.readouterr().out

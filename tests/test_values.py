@@ -33,6 +33,7 @@ from ssh_abduction import (
     export_map,
     solve,
 )
+from ssh_abduction.cli.text import headline
 from ssh_abduction.data import (
     Action,
     Corrections,
@@ -44,7 +45,8 @@ from ssh_abduction.data import (
     save_corrections,
 )
 from ssh_abduction.learning.labels import LearnerError
-from ssh_abduction.solver import Certificate, Search, Status
+from ssh_abduction.robot_logs import log_report
+from ssh_abduction.solver import Certificate, Progress, Search, Status
 from ssh_abduction.solver.judging import InternalError
 from ssh_abduction.theory import Speedups
 
@@ -160,6 +162,20 @@ def test_reprs_cut_long_theories_and_images() -> None:
     assert len(repr(Theory.causal().replace(same=pairs))) < 2 * LONG
     assert repr(Trace.from_steps(["a" * 1000], [])) == "<Trace: 1 step, 1 view, 0 actions>"
     assert len(repr(Certificate(tuple(range(1000))))) <= LONG
+
+
+def test_counts_of_one_are_singular() -> None:
+    one = solve(Trace.from_steps(["a"], []))
+    assert one.cost is not None
+    run = {"log": {"scans": 1, "metres": 1.0}, "visits": 1, "steps": 1}
+    for text, said in (
+        (Progress(1, 1, one.cost, one.bound, 1, 0.0).sentence, "1 of 1 step; best 1 dstate, 1 pl"),
+        (headline(one, 1, None), "1 of 1 step given to clingo"),
+        (log_report._summary(one, run), "1 scan along 1 m; 1 visit to distinctive places, 1 step."),
+        (log_report._summary(one, run), " 1 place, 0 paths, 1 distinctive state: "),
+        (repr(OnlineMapper("a")), "<OnlineMapper: 1 step, optimal, 1 dstate>"),
+    ):
+        assert said in text
 
 
 def test_solution_is_a_sequence_of_its_maps() -> None:

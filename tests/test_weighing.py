@@ -342,7 +342,7 @@ def test_check_finds_a_false_probability(
     assert said in capsys.readouterr().out
     assert main(["check", "--bound", *map(str, files)]) == 20
     told = capsys.readouterr().out
-    assert "1 of 1 maps satisfy" in told
+    assert "1 of 1 map satisfies" in told
     assert "more is left out: a claim about costs is false" in told
 
 
@@ -355,7 +355,7 @@ def test_check_finds_false_counts_of_a_weighed_map(
     file.write_text(json.dumps(data))
     trace.save(tmp_path / "trace.jsonl")
     assert main(["check", str(file), str(tmp_path / "trace.jsonl")]) == 1
-    assert "maps[0].cost: expected 2 dstates, 2 places, 1 paths, as" in capsys.readouterr().err
+    assert "maps[0].cost: expected 2 dstates, 2 places, 1 path, as" in capsys.readouterr().err
 
 
 def test_check_computes_the_costs_of_all_rivals_or_counts_the_others(

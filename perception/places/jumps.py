@@ -172,7 +172,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
         )
     if track.breaks:
         notes.append(
-            f"The scans show nothing of what was seen before, {_times(len(track.breaks))}: from "
+            f"The scans show nothing of what was seen before, {times(len(track.breaks))}: from "
             f"scan {track.breaks[0]} ({_where(log, track.breaks[0])}) on. The robot may have been "
             "carried there. The rest is mapped as a separate drive."
         )
@@ -180,7 +180,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
         first = gaps[0]
         step = math.dist(log.scans[first - 1].odometry[:2], log.scans[first].odometry[:2])
         notes.append(
-            f"The scans show nothing of what was seen before, {_times(len(gaps))}, while the "
+            f"The scans show nothing of what was seen before, {times(len(gaps))}, while the "
             f"odometry goes on: by {step:.1f} m before scan {first} ({_where(log, first)}). The "
             "odometry alone connects the parts. If scans are missing there, or the robot was "
             "carried, cut the log there, and map each part."
@@ -188,7 +188,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
     if turned:
         first, angle = turned[0]
         notes.append(
-            f"Scans turn differently from the odometry, {_times(len(turned))}: at scan {first} "
+            f"Scans turn differently from the odometry, {times(len(turned))}: at scan {first} "
             f"({_where(log, first)}) by {abs(math.degrees(angle)):.0f} degrees. The track follows "
             "the scans. If the robot was carried there, cut the log there, and map each part."
         )
@@ -200,7 +200,7 @@ def _describe_jumps(log: RobotLog, jumps: list[int], far: Mapping[int, float]) -
     first, most = jumps[0], max(jumps, key=far.__getitem__)
     starts_anew = math.hypot(*log.scans[first].odometry[:2]) < ANEW
     return (
-        f"The odometry jumps {_times(len(jumps))} in {len(log)} scans: by {far[first]:.1f} m "
+        f"The odometry jumps {times(len(jumps))} in {len(log)} scans: by {far[first]:.1f} m "
         f"before scan {first} ({_where(log, first)})"
         + (", where it starts anew from 0" if starts_anew else "")
         + (f", and by {far[most]:.1f} m at most" if len(jumps) > 1 else "")
@@ -221,7 +221,8 @@ def _gaps(log: RobotLog, track: Track) -> list[int]:
     ]
 
 
-def _times(count: int) -> str:
+def times(count: int) -> str:
+    """Say how often something is the case: "once", "3 times"."""
     return "once" if count == 1 else f"{count} times"
 
 

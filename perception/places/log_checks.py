@@ -21,6 +21,7 @@ from perception.readers.scans import RobotLog, Scan
 from perception.readers.stored import in_turn
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.data.words import counted
 
 # In a shuffled log, scans some steps apart are about as far apart as neighbours: the quartiles of
 # their distances differ by at most this factor. In a drive, they grow with the number of steps. If
@@ -153,7 +154,7 @@ def refuse_shuffled(log: RobotLog) -> None:
     if next_to == 0 or not all(next_to / ALIKE < far < next_to * ALIKE for far in apart):
         return
     back = jumps.times_back(log)
-    clock = f", and their times run back {back} times" if back else ""
+    clock = f", and their times run back {jumps.times(back)}" if back else ""
     raise LogError(
         f"{named(log.source)}: expected scans in the order of the drive, got {len(log)} in random "
         f"order: by the odometry, a scan is as far from the next one as from the eighth after it"
@@ -215,8 +216,8 @@ def _about_order(log: RobotLog) -> list[str]:
     back = jumps.times_back(log)
     if back > jumps.RUNS_BACK * len(log):
         notes.append(
-            f"The times of the scans run back {back} times in {len(log)} scans. If the log is "
-            "not in the order of time, sort it."
+            f"The times of the scans run back {jumps.times(back)} in {len(log)} scans. If the log "
+            "is not in the order of time, sort it."
         )
     if usual > FAR_OFF:
         notes.append(
@@ -233,10 +234,11 @@ def _about_odometry(log: RobotLog, unseen: bool | None) -> list[str]:
     back_and_forth = jumps.goes_back_and_forth(log)
     if jumps.is_missing(log) and (jumps.moves_unseen(log) if unseen is None else unseen):
         missing = jumps.stands_still(log)
+        steps = f"{missing.sum()} of {counted(len(missing), 'steps')}"
         return [
-            f"The odometry stands still in {missing.sum()} of {len(missing)} steps, while the "
-            "scans show that the robot moved. So the map rests on the scans alone. Record the "
-            "odometry, or name its topic (--set odom_topic)."
+            f"The odometry stands still in {steps}, while the scans show that the robot "
+            "moved. So the map rests on the scans alone. Record the odometry, or name its topic "
+            "(--set odom_topic)."
         ]
     if back_and_forth < TO_AND_FRO and 0 < usual <= FAR_OFF:
         return [
@@ -308,9 +310,10 @@ def _about_darkness(log: RobotLog, track: Track) -> list[str]:
     if not dark:
         return []
     (begin, end), more = dark[0], len(dark) - 1
+    again = "one more stretch" if more == 1 else f"{more} more stretches"
     return [
         f"The laser sees no wall in {end - begin} scans, from scan {begin} (line or message "
-        f"{log.scans[begin].line}) on{f', and in {more} more stretches' if more else ''}. The "
+        f"{log.scans[begin].line}) on{f', and in {again}' if more else ''}. The "
         "odometry alone says how the robot moved there. If the laser was covered while the robot "
         "was carried, cut the log there, and map each part."
     ]

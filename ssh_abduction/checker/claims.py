@@ -17,6 +17,7 @@ from typing import Any
 
 from ssh_abduction.data.errors import brief, is_whole
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.words import counted
 from ssh_abduction.theory.fields import COUNTS
 from ssh_abduction.theory.theory import Theory
 
@@ -192,22 +193,22 @@ class _Claims:
         by more than `within`. Maps of one level must be equally good. Each map and each level must
         have the claimed cost.
         """
-        counted = next((name for name in self.theory.priorities if name != "excuses"), None)
+        sort = next((name for name in self.theory.priorities if name != "excuses"), None)
         if not is_whole(within) or within < 0:
             yield f"within: expected a whole number, 0 or more, got {brief(within)}"
             return
         for i, counts in enumerate(self.counts):
             last = self.counts[max(i - 1, 0)]
-            most = self.counts[0][counted] + within if counted else 0
+            most = self.counts[0][sort] + within if sort else 0
             # maps are sorted by level, and maps of one level are equally good
-            if counted and not last[counted] <= counts[counted] <= most:
+            if sort and not last[sort] <= counts[sort] <= most:
                 yield (
-                    f"maps: expected {last[counted]} to {most} {counted} in map {i + 1}, as within "
-                    f"is {within}, got {counts[counted]}"
+                    f"maps: expected {last[sort]} to {most} {sort} in map {i + 1}, as within "
+                    f"is {within}, got {counts[sort]}"
                 )
-            elif (not counted or last[counted] == counts[counted]) and self._preferred(
-                i
-            ) != self._preferred(max(i - 1, 0)):
+            elif (not sort or last[sort] == counts[sort]) and self._preferred(i) != self._preferred(
+                max(i - 1, 0)
+            ):
                 best, here = self._preferred(i - 1), self._preferred(i)
                 preferred = ", ".join(self.theory.priorities)
                 yield (
@@ -329,7 +330,7 @@ def _is(value: Any, number: int) -> bool:
 def _text(counts: Any) -> str:
     """Put claimed counts into words."""
     return (
-        ", ".join(f"{value} {name}" for name, value in counts.items())
+        ", ".join(counted(value, name) for name, value in counts.items())
         if isinstance(counts, Mapping) and counts
         else brief(counts)
     )

@@ -83,7 +83,9 @@ class _Judgement:
             if more := some[SHOWN:]:
                 yield f"map {i}: and {counted(len(more), 'more violations')}"
         sound = sum(not some for some in self.violations)
-        yield f"{sound} of {len(self.violations)} maps satisfy the {self.checked} axioms"
+        maps = counted(len(self.violations), "maps")
+        satisfy = "satisfies" if 1 in (sound, len(self.violations)) else "satisfy"
+        yield f"{sound} of {maps} {satisfy} the {self.checked} axioms"
         if self.not_checked:
             names = printable(", ".join(self.not_checked))
             yield f"not checked, as they come from a user's own rules: {names}"

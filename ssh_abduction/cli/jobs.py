@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Protocol
 
 from ssh_abduction.cli import EXIT_ERROR
 from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c
+from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, SolverError, printable
 from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
 from ssh_abduction.solver import workers
@@ -107,11 +108,11 @@ def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> 
     `asked` is the number of files, and `files` the word for them in messages, such as "traces".
     """
     if stop.is_set():
-        missing = f"{asked - sum(code <= SIGNALLED for code in codes)} of {asked} {files}"
+        missing = f"{asked - sum(code <= SIGNALLED for code in codes)} of {counted(asked, files)}"
         print(f"ssh-abduction: interrupted: {missing} not finished", file=sys.stderr)
         return interrupted_code()
     if errors := codes.count(EXIT_ERROR):
-        where = f"{errors} of {asked} {files}, on their lines"
+        where = f"{errors} of {counted(asked, files)}, on their lines"
         print(f"ssh-abduction: errors in {where}", file=sys.stderr)
         return EXIT_ERROR
     return max(codes, default=0)

@@ -19,7 +19,7 @@ from ssh_abduction.cli.options import (
 )
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.parsing import Verbs
-from ssh_abduction.cli.text import table
+from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named, printable, said_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
@@ -116,13 +116,13 @@ def _lines(experiment: Experiment) -> Iterator[str]:
         )
         yield table(["action", *heads], rows)
         if more:
-            yield f"  and {more} more predictions (--json has all)"
+            yield f"  and {counted(more, 'more predictions')} (--json has all)"
         lines = list(_tree(plan, "  "))
         if any(branch.plan.branches or branch.plan.untried for branch in plan.branches):
             yield "the plan"
             yield from lines[:SHOWN_LINES]
             if len(lines) > SHOWN_LINES:
-                yield f"  and {len(lines) - SHOWN_LINES} more lines (--json has all)"
+                yield f"  and {counted(len(lines) - SHOWN_LINES, 'more lines')} (--json has all)"
     elif plan.untried and experiment.count > 1:
         yield from _expected(plan.untried)
 

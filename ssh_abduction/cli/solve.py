@@ -378,7 +378,8 @@ def _lines(
     if solution.cost is None:
         if partial_map := solution.partial:
             steps = len(partial_map.dstate_at)
-            yield f"\nbest map of the first {steps} steps\n{describe(partial_map)}"
+            first = "step" if steps == 1 else f"{steps} steps"
+            yield f"\nbest map of the first {first}\n{describe(partial_map)}"
         return
     yield first_map(solution, search.count)
     if backbone and (search.count > 1 or not solution.complete):

@@ -68,7 +68,7 @@ def _as_text(front: Front, most: int) -> str:
         lines.append("no knee: each further fault saves about as many dstates")
     if front.stopped:
         why = "interrupted" if program.raised else "stopped by the time limit"
-        lines.append(f"{why} at {front.points[-1].faults} faults")
+        lines.append(f"{why} at {counted(front.points[-1].faults, 'faults')}")
     if first := front.points[0].faults:
         fewest = counted(first, "faults")
         lines.append(f"no map with the asserted pairs of steps has fewer than {fewest}")

@@ -54,14 +54,14 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
             reason = f"; the reason was not found in time ({solution.stopped})"
         return f"unsatisfiable: no map satisfies the axioms{reason}"
     why = f" ({solution.stopped})" if solution.stopped else ""
-    given = f"{solution.effort.prefix} of {solution.steps} steps given to clingo"
+    given = f"{solution.effort.prefix} of {counted(solution.steps, 'steps')} given to clingo"
     seconds = f"{solution.seconds.total:.2f} s, {given}"
     bound = ", ".join(
         f"at least {counted(v, k)}" if k != "cost" else f"a cost of at least {v:g} dstates"
         for k, v in solution.bound.to_dict().items()
     )
     if solution.cost is None:
-        none = f"no map of all {solution.steps} steps yet"
+        none = f"no map of all {counted(solution.steps, 'steps')} yet"
         return f"{solution.status.value}{why}: {none}; {_proven(bound)}; {seconds}"
     counts = ", ".join(
         counted(v, k) if k != "faults" else f"faults that cost {v:g} dstates"

@@ -9,6 +9,7 @@ from typing import Generic, TypedDict, TypeVar
 
 from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_maps
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import counted
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.solver import (
     Cost,
@@ -141,7 +142,7 @@ class LimitedQuestion(ABC, Generic[_Answer]):
             return (*said, "no map without changes was found in time")
         best = "the best map" if without.status is Status.OPTIMAL else "the best map found"
         changed = f"{cost.dstates} and changes for {cost.faults:g}"
-        more = f"has {without.cost.dstates} dstates, not {changed}"
+        more = f"has {counted(without.cost.dstates, 'dstates')}, not {changed}"
         if nats is not None and without.nats is not None:
             more = f"costs {without.nats:.1f} nats, not {nats:.1f}"
         return (*said, f"without changes, {best} {more}")

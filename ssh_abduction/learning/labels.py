@@ -18,6 +18,7 @@ from ssh_abduction.data.drives import Drive, drives_of, joined_drives, pieces_in
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import counted
 from ssh_abduction.learning.traces import Traces
 from ssh_abduction.solver import Solution, Status
 
@@ -86,7 +87,7 @@ def labels_of(
         )
     elif not agreed.all() or not complete:
         one = len(maps) == 1
-        number = f"{'' if complete else 'at least '}{len(maps)} minimal map{'' if one else 's'}"
+        number = f"{'' if complete else 'at least '}{counted(len(maps), 'minimal maps')}"
         warnings.warn(
             f"{number} remain{'s' if one else ''}, and agree on {agreed.sum()} of {len(agreed)} "
             "labels: only these are learnt from; choose a map, or explore more",

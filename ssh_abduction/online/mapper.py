@@ -71,6 +71,7 @@ from typing import TYPE_CHECKING, Any
 from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
+from ssh_abduction.data.words import counted
 from ssh_abduction.online.keeper import MapKeeper, StepOptions
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Solution, check_limit, preload_engine
@@ -178,9 +179,10 @@ class OnlineMapper:
 
     def __repr__(self) -> str:
         cost = self.solution.cost
-        dstates = cost.dstates if cost else "no"
+        steps = counted(len(self._steps), "steps")
+        dstates = counted(cost.dstates, "dstates") if cost else "no map"
         status = self.solution.status.value
-        return f"<OnlineMapper: {len(self._steps)} steps, {status}, {dstates} dstates>"
+        return f"<OnlineMapper: {steps}, {status}, {dstates}>"
 
     def observe(
         self,

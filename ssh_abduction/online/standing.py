@@ -153,7 +153,7 @@ class Confidence:
             PossibleMap(shares[i], rivals[i].explained(), self._said(rivals[i])) for i in first
         ]
         if rest := order[len(first) :]:
-            others = f"one of {len(rest)} others"
+            others = "the one other" if len(rest) == 1 else f"one of {len(rest)} others"
             listed.append(PossibleMap(sum(shares[i] for i in rest), None, others))
         return tuple(listed)
 

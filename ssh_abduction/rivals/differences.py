@@ -26,7 +26,7 @@ from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.groups import firsts, gathered, indices_of
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
-from ssh_abduction.data.words import attributes_of, noun_of
+from ssh_abduction.data.words import attributes_of, counted, noun_of
 from ssh_abduction.rivals.known_sides import Beside, only_in
 from ssh_abduction.rivals.table import NONE, Table
 from ssh_abduction.solver import Sort, stretches
@@ -109,7 +109,7 @@ class Difference:
         """The difference in words, line by line; causes come before effects."""
         lines = []
         counts = zip(("dstates", "places", "paths", "links"), *self.sizes, strict=True)
-        if unequal := [f"{a} {name} against {b}" for name, a, b in counts if a != b]:
+        if unequal := [f"{counted(a, name)} against {b}" for name, a, b in counts if a != b]:
             lines.append(f"size: {self.names[0]} has {', '.join(unequal)} of {self.names[1]}")
         for name, faults in zip(self.names, self.faults, strict=True):
             lines += [f"faults: only in {name} {printable(str(fault))}" for fault in faults]
@@ -117,7 +117,7 @@ class Difference:
             changes = [change for change in self.changes if change.sort == sort]
             lines += [f"{word}: {change.in_words(self.names)}" for change in changes[:LISTED]]
             if len(changes) > LISTED:
-                lines.append(f"{word}: {len(changes) - LISTED} more changes")
+                lines.append(f"{word}: {counted(len(changes) - LISTED, 'more changes')}")
         for name, links in zip(self.names, self.links, strict=True):
             some = [
                 f"{printable(action)} from the dstate of step {s} to that of step {x}"

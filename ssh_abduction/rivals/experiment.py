@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.words import PlainData, attributes_of
+from ssh_abduction.data.words import PlainData, attributes_of, counted
 from ssh_abduction.rivals.consequences import Consequence
 from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.solver import Stop
@@ -159,7 +159,7 @@ class Experiment:
                 )
             whole = "this"
             if any(branch.plan.branches for branch in plan.branches):
-                whole = f"the whole plan takes {plan.longest} actions at most and"
+                whole = f"the whole plan takes {counted(plan.longest, 'actions')} at most and"
             text = f"{count} maps: after {_acts(plan.actions)} their predictions differ; "
             is_greedy = len(self.alike) != 2
             more = " (another plan may be shorter or leave fewer)" if is_greedy else ""

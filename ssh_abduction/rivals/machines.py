@@ -22,6 +22,7 @@ from ssh_abduction.data.groups import firsts, reached
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Star, star_to_json
 from ssh_abduction.data.trace import Trace, View
+from ssh_abduction.data.words import counted
 from ssh_abduction.solver import Watch, observation
 from ssh_abduction.theory.evidence.alike import are_alike
 from ssh_abduction.theory.fields import IN_TOLERANCE
@@ -68,7 +69,7 @@ def _star_text(star: Sequence[Any]) -> str:
     if all(isinstance(entry, bool) for entry in star):
         ways = compress(("ahead", "right", "back", "left"), star)
         return f"(open: {', '.join(ways) or 'nothing'})"
-    return f"({len(star)} gateways)"
+    return f"({counted(len(star), 'gateways')})"
 
 
 class Observations:

@@ -77,8 +77,9 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
     """Say in two sentences how long the log is, and how large the map is."""
     log, cost = run["log"], solution.cost
     seen = (
-        f"{log['scans']} scans along {log['metres']:g} m; "
-        f"{run['visits']} visits to distinctive places, {run['steps']} steps."
+        f"{counted(log['scans'], 'scans')} along {log['metres']:g} m; "
+        f"{counted(run['visits'], 'visits')} to distinctive places, "
+        f"{counted(run['steps'], 'steps')}."
     )
     if cost is None:
         return f"{seen} There is no map of them: {solution.status.value}."
@@ -87,13 +88,15 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
     elif solution.complete and solution.count == 1:
         proven = "one minimal map" if solution.weighed is None else "one map of least cost"
     else:
-        proven = f"{'' if solution.complete else 'at least '}{solution.count} minimal maps"
+        least = "" if solution.complete else "at least "
+        proven = f"{least}{counted(solution.count, 'minimal maps')}"
     if solution.weighed is not None:
         proven += f"; {solution.weighed.sentence}"
     elif joins := joins_in_words(solution.by_minimality, solution.count):
         proven += f"; {joins}"
-    paths = f", {cost.paths} paths" if paths_mean_something(solution) else ""
-    size = f"{cost.places} places{paths}, {cost.dstates} distinctive states"
+    paths = f", {counted(cost.paths, 'paths')}" if paths_mean_something(solution) else ""
+    dstates = counted(cost.dstates, "distinctive states")
+    size = f"{counted(cost.places, 'places')}{paths}, {dstates}"
     return f"{seen} {size}: {proven}."
 
 

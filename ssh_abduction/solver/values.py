@@ -225,12 +225,13 @@ class Progress:
     def sentence(self) -> str:
         """The progress on one line, in words."""
         best = (
-            f"best {self.cost.dstates} dstates, {self.cost.places} places, {self.cost.paths} paths"
+            "best "
+            + ", ".join(counted(getattr(self.cost, k), k) for k in ("dstates", "places", "paths"))
             if self.cost
             else "no map yet"
         )
         bound = ", ".join(f"{k} ≥ {v}" for k, v in self.bound.to_dict().items()) or "no bound yet"
         return (
-            f"clingo has {self.prefix} of {self.steps} steps; {best}; {bound}; "
+            f"clingo has {self.prefix} of {counted(self.steps, 'steps')}; {best}; {bound}; "
             f"{counted(self.maps, 'maps')} listed; {self.seconds:.1f} s"
         )
