@@ -329,9 +329,17 @@ def test_solve_reports_corrections_that_contradict_the_trace(
 ) -> None:
     building = str(folder / "building")
     assert main(["correct", building, "--same", "monday:1,tuesday:1"]) == 0
+    assert (
+        "same: monday:1, tuesday:1: the steps do not look alike (monday:1 shows b, tuesday:1 shows "
+        "c), so there will be no map unless one of them may be misread: solve with --set "
+        "misread=4; if they are not one, say --different monday:1,tuesday:1"
+    ) in capsys.readouterr().err
     assert main(["correct", building, "--same", "monday:2,tuesday:1"]) == 0
+    assert "do not look alike" not in capsys.readouterr().err
     assert main(solving(folder)) == 20
     told = capsys.readouterr().out
+    opposite = "say the opposite of this correction (ssh-abduction correct), or delete it"
+    assert told.splitlines()[-1].startswith(opposite)
     assert (
         "same: monday:1, tuesday:1: it contradicts the trace (monday:1 shows b, tuesday:1 shows c)"
         in told
@@ -346,6 +354,27 @@ def test_solve_reports_corrections_that_contradict_the_trace(
     assert main(solving(folder)) == 20
     said = "it contradicts the trace, or another correction that is named here"
     assert capsys.readouterr().out.count(said) == 2
+
+
+@pytest.mark.parametrize(("views", "helps"), [("abcdX", True), ("abcaX", False)])
+def test_misreading_is_advised_where_it_makes_a_correction_possible(
+    views: str, helps: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A travel along a path cannot lead back to a place, whatever is seen there."""
+    actions = ["travel", "around"] * 2 if helps else ["travel"] * 4
+    trace = Trace.from_steps(views, actions, name="monday")
+    trace.save(tmp_path / "monday.jsonl")
+    maps = str(tmp_path / "maps.json")
+    solving = ["solve", str(tmp_path / "monday.jsonl"), "-o", maps]
+    assert main(solving) == 0
+    assert main(["correct", maps, "--same", "monday:0,monday:4"]) == 0
+    assert main(solving) == 20
+    assert ("misread: solve with --set misread=4" in capsys.readouterr().out) == helps
+    assert main([*solving, "--set", "misread=4"]) == (0 if helps else 20)
+    if helps:  # The map allows misread views, so the next correction needs no other settings.
+        capsys.readouterr()
+        assert main(["correct", maps, "--same", "monday:1,monday:2"]) == 0
+        assert "as misread (misread=4)" in capsys.readouterr().err
 
 
 def test_solve_names_a_contradicting_correction_without_an_explanation(

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from ssh_abduction.cli.obeyed_corrections import clash_alone, misreading, seen_at
 from ssh_abduction.cli.options import add_map, add_maps, at_comma, trace_beside
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.saved_map import SavedMap, sentences_of
-from ssh_abduction.data.corrections import ASSERTIONS
+from ssh_abduction.data.corrections import ASSERTIONS, Corrections, Said
 from ssh_abduction.data.errors import MapError, brief, named, printable
 from ssh_abduction.data.words import counted
+from ssh_abduction.theory.theory import Theory
 
 HELPS = {
     "same": "steps I and J, such as monday:12,tuesday:3, are one dstate",
@@ -79,7 +82,10 @@ def run(options: argparse.Namespace) -> int:
         print("\n".join(map(printable, sentences_of(said))) or "nothing was said")
         return 0
     file = saved.save(said)
-    if saved.star == "none" and {"open", "closed"} & {kind for kind, _ in options.said}:
+    warn(_unlike(saved, said, [pair for pair in said.pairs if pair not in before.pairs]))
+    if saved.theory.get("star") == "none" and {"open", "closed"} & {
+        kind for kind, _ in options.said
+    }:
         without = "this map was made without stars, so a gateway that is open or closed changes no"
         warn([f"{without} map; to use stars, set star=auto when you map or solve again"])
     sentences = counted(sum(1 for _ in sentences_of(said)), "corrections")
@@ -93,6 +99,25 @@ def _how_to_obey(maps: Path) -> str:
         return f"solve again with -o {shlex.quote(str(maps))}"
     folder = shlex.quote(str(maps.parent))
     return f"to obey: ssh-abduction solve --theory {folder} {folder} -o {shlex.quote(str(maps))}"
+
+
+def _unlike(saved: SavedMap, corrections: Corrections, new: Sequence[Said]) -> Iterator[str]:
+    """Yield a warning for each two steps that are newly said to be one, but do not look alike."""
+    if saved.trace is None or not (new and saved.theory):
+        return
+    trace, theory = corrections.corrected(saved.trace), Theory.from_dict(saved.theory)
+    for said in new:
+        if not clash_alone(said, trace, theory.without_faults()):
+            continue
+        opposite = "different" if said.kind == "same" else "elsewhere"
+        back = f"if they are not one, say --{opposite} {shlex.quote(','.join(said.steps))}"
+        follows = f"so each map will treat one of them as misread (misread={theory.misread:g})"
+        if clash_alone(said, trace, theory):
+            lenient = misreading(theory)
+            follows = "so there will be no map"
+            if lenient is not None and not clash_alone(said, trace, lenient):
+                follows += " unless one of them may be misread: solve with --set misread=4"
+        yield f"{said}: the steps do not look alike{seen_at(said, trace)}, {follows}; {back}"
 
 
 def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 import warnings
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from ssh_abduction.cli.saved_map import sentences_of
 from ssh_abduction.data.corrections import ASSERTIONS, Corrections, Passage, Said
 from ssh_abduction.data.corrections_file import FILE, beside, load_corrections, save_corrections
 from ssh_abduction.data.drives import drives_of, fingerprints_of, step_of, together
-from ssh_abduction.data.errors import MapError, named, printable
+from ssh_abduction.data.errors import MapError, TheoryError, named, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
@@ -127,8 +129,9 @@ class Obeying:
         source = named(said.source or "corrections")
         if explanation is None:
             sure = [
-                f"{source}: {pair}: it contradicts the trace{self._seen(pair)}"
-                for pair in filter(self._clashes, said.pairs)
+                f"{source}: {pair}: it contradicts the trace{seen_at(pair, self.trace)}"
+                for pair in said.pairs
+                if clash_alone(pair, self.trace, self.without)
             ]
             if sure or solution.status is not Status.UNSATISFIABLE:
                 return sure
@@ -148,37 +151,64 @@ class Obeying:
         wrong = [one for one in sentences if one in kept.pairs or one in kept.gateways]
         others = ", or another correction that is named here" if len(wrong) > 1 else ""
         return [
-            f"{source}: {sentence}: it contradicts the trace{self._seen(sentence)}{others}"
+            f"{source}: {sentence}: it contradicts the trace{seen_at(sentence, self.trace)}{others}"
             for sentence in wrong
         ]
 
-    def _clashes(self, said: Said) -> bool:
-        """Whether two steps that are said to be one dstate or place cannot be so by themselves."""
-        if not said.kind.startswith("same"):
-            return False
-        drives = drives_of(self.trace)
-        steps = sorted(step_of(drives, step) for step in said.steps)
-        alone = [self.trace[t : t + 1].without_displacements() for t in steps]
-        nothing: dict[str, Any] = dict.fromkeys(ASSERTIONS, ())
-        theory = self.without.replace(displacement="none", **{**nothing, said.kind: ((0, 1),)})
-        with warnings.catch_warnings():  # of drives that are equal, or have nothing in common
-            warnings.simplefilter("ignore")
-            return explain(together(alone, ["first", "second"]), theory) is not None
+    def how_to_mend(self, blamed: Sequence[str], explanation: Explanation | None) -> Iterator[str]:
+        """Yield a line that says how to mend the corrections of `blamed`, if there are any."""
+        if not blamed:
+            return
+        said = self.corrections.known_in(drives_of(self.trace))
+        lenient = misreading(self.without)
+        if lenient is None:
+            helps = False
+        elif explanation is None:
+            pairs = [p for p in said.pairs if clash_alone(p, self.trace, self.without)]
+            helps = bool(pairs) and not any(clash_alone(p, self.trace, lenient) for p in pairs)
+        else:
+            stretch = range(explanation.first, explanation.last + 1)
+            helps = not self._has_no_map(said, stretch, lenient)
+        them = "this correction" if len(blamed) == 1 else "one of these corrections"
+        also = ", or let views and stars be misread: solve with --set misread=4" if helps else ""
+        yield f"say the opposite of {them} (ssh-abduction correct), or delete it{also}"
 
-    def _has_no_map(self, said: Corrections, stretch: range) -> bool:
-        trace, theory = obeyed(said, self.as_seen, self.without)
+    def _has_no_map(self, said: Corrections, stretch: range, without: Theory | None = None) -> bool:
+        trace, theory = obeyed(said, self.as_seen, without or self.without)
         part = theory.of_steps(stretch.start, len(stretch))
         # In these steps, every view may be unknown.
         part = part.replace(unknown_views=None in trace.views)
         return explain(trace[stretch.start : stretch.stop], part) is not None
 
-    def _seen(self, said: Said | Passage) -> str:
-        """Say what the robot saw at two steps that are said to be one dstate, if this differs."""
-        if isinstance(said, Passage) or said.kind != "same":
-            return ""
-        drives = drives_of(self.trace)
-        views = [self.trace.steps[step_of(drives, step)].view for step in said.steps]
-        if views[0] == views[1]:
-            return ""
-        seen = ("no view" if view is None else view for view in views)
+
+def misreading(theory: Theory) -> Theory | None:
+    """Return the theory with misread views and stars; None if it has or refuses them."""
+    with contextlib.suppress(TheoryError):
+        return None if theory.misread else theory.replace(misread=4)
+    return None
+
+
+def clash_alone(said: Said, trace: Trace, theory: Theory) -> bool:
+    """Whether two steps that are said to be one dstate or place cannot be so by themselves."""
+    if not said.kind.startswith("same"):
+        return False
+    drives = drives_of(trace)
+    steps = sorted(step_of(drives, step) for step in said.steps)
+    alone = [trace[t : t + 1].without_displacements() for t in steps]
+    nothing: dict[str, Any] = dict.fromkeys(ASSERTIONS, ())
+    theory = theory.replace(displacement="none", weigh="auto", **{**nothing, said.kind: ((0, 1),)})
+    with warnings.catch_warnings():  # of drives that are equal, or have nothing in common
+        warnings.simplefilter("ignore")
+        return explain(together(alone, ["first", "second"]), theory) is not None
+
+
+def seen_at(said: Said | Passage, trace: Trace) -> str:
+    """Say what the robot saw at two steps that are said to be one dstate, if this differs."""
+    if isinstance(said, Passage) or not said.kind.startswith("same"):
+        return ""
+    drives = drives_of(trace)
+    first, second = (trace.steps[step_of(drives, step)] for step in said.steps)
+    if said.kind == "same" and first.view != second.view:
+        seen = ("no view" if step.view is None else step.view for step in (first, second))
         return f" ({', '.join(f'{s} shows {v}' for s, v in zip(said.steps, seen, strict=True))})"
+    return " (their stars differ)" if first.star != second.star else ""

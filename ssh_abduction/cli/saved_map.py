@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from ssh_abduction.cli.options import maps_path, read_maps, trace_beside, trace_of_maps
 from ssh_abduction.data.corrections import Corrections, Naming, number_at
@@ -40,7 +41,7 @@ class SavedMap:
     drives: tuple[Drive, ...]
     file: Path  # the file of maps
     corrections: Corrections  # what a person said about it
-    star: str | None  # how its theory uses stars; None if the file does not say
+    theory: Mapping[str, Any]  # the theory of the map, as data; empty if the file does not say
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], number: int | str = 1) -> SavedMap:
@@ -58,7 +59,6 @@ class SavedMap:
                 f"{named(file)}: drives: expected the drives that were mapped, each with its "
                 "fingerprint, got none; solve again, with -o"
             )
-        theory = data.get("theory") if isinstance(data, dict) else None
         ssh_map = listing.maps[listing.number(str(number))]
         if (corrections := beside(file)) is not None:
             said = load_corrections(corrections)
@@ -66,18 +66,25 @@ class SavedMap:
         else:  # keep the names that the map has
             said = Corrections.of_names(ssh_map, listing.drives)
         drives = {**said.drives, **{name: str(mark) for name, mark in known.items()}}
-        star = theory.get("star") if isinstance(theory, dict) else None
-        found = cls(ssh_map, listing.drives, file, replace(said, drives=drives), star)
+        theory = data.get("theory") if isinstance(data, dict) else None
+        theory = theory if isinstance(theory, dict) else {}
+        found = cls(ssh_map, listing.drives, file, replace(said, drives=drives), theory)
         return found.named(found.corrections)
 
     def named(self, said: Corrections) -> SavedMap:
         """Return the same map with these corrections, and with their names."""
         return replace(self, map=said.named(self.map, self.drives), corrections=said)
 
+    @cached_property
+    def trace(self) -> Trace | None:
+        """The trace of the map; None if it is not beside the map, nor in its file."""
+        own = trace_beside(str(self.file))
+        return Trace.load(own) if own else trace_of_maps(str(self.file))
+
     @property
     def in_quarters(self) -> bool:
         """Whether stars have four directions."""
-        return self.star == "frame"
+        return self.theory.get("star") == "frame"
 
     def save(self, corrections: Corrections) -> Path:
         """Write the corrections beside the map, after a check. Returns their file.
@@ -85,10 +92,8 @@ class SavedMap:
         Raises MapError if a gateway contradicts the trace, or a drive or a step is unknown.
         """
         corrections.known_in(self.drives)
-        own = trace_beside(str(self.file))
-        trace = Trace.load(own) if own else trace_of_maps(str(self.file))
-        if trace is not None:
-            corrections.corrected(trace)
+        if self.trace is not None:
+            corrections.corrected(self.trace)
         file = self.file.parent / FILE
         save_corrections(corrections, file)
         return file

@@ -261,7 +261,8 @@ class _Text:
     def end(self, solution: Solution, explanation: Explanation | None) -> Callable[[], str]:
         """Make the whole output as text, and return a function that returns it."""
         lines = _lines(self._search, solution, explanation, self._search.backbone)
-        text = _text(chain(lines, self._obeying.blamed(solution, explanation)))
+        blamed = self._obeying.blamed(solution, explanation)
+        text = _text(chain(lines, blamed, self._obeying.how_to_mend(blamed, explanation)))
         return lambda: text
 
     def last_words(self, solution: Solution) -> str:
