@@ -7,13 +7,14 @@ import random
 from dataclasses import replace
 from itertools import groupby, product
 from pathlib import Path
+from typing import Any
 
 import pytest
 from worlds import rectangle, written
 
 from ssh_abduction import SSHMap, Theory, Trace, check, route, solve
 from ssh_abduction.cli import main
-from ssh_abduction.data import MapError
+from ssh_abduction.data import Action, MapError
 from ssh_abduction.data.map_parts import Fault, Name
 from ssh_abduction.data.maps import DState, Fit, MapPath, Pose
 from ssh_abduction.robot_logs.log_maps import BARE
@@ -163,6 +164,26 @@ def test_route_passes_no_gateway_that_was_last_seen_closed(
         assert route(opened, start, goal, by=by).actions == actions
         with pytest.raises(MapError, match="passes a gateway that was last seen closed"):
             route(replace(ssh_map, faults=(shut,)), start, goal, by=by)
+
+
+@pytest.mark.parametrize(
+    ("actions", "arguments", "said"),
+    [
+        # One way only: the paths of the map also lead back.
+        (["travel"] * 3, {}, "take --by places: the places of the map imply a way"),
+        # Nothing leads back through a lift that was used once.
+        (["travel", Action("lift", "lift"), "travel"], {}, "that known links .* no stairs"),
+        (["travel", Action("lift", "lift"), "travel"], {"by": "places"}, "implied .* no stairs"),
+        (["travel"] * 3, {"by": "places", "avoid": ["p1"]}, "avoid less"),
+    ],
+)
+def test_route_advises_only_what_leads_there(
+    actions: list[Any], arguments: dict[str, Any], said: str
+) -> None:
+    ssh_map = solve(Trace.from_steps("abcd", actions)).maps[0]
+    with pytest.raises(MapError, match=said) as error:
+        route(ssh_map, **{"start": 3, "goal": "p0", **arguments})
+    assert ("--by places" in str(error.value)) == ("--by places" in said)
 
 
 def test_route_counts_rivals_that_agree() -> None:

@@ -33,7 +33,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal, NoReturn
 
@@ -156,7 +157,8 @@ class Route:
         if self.metres is not None and self.moves:
             parts.append(f"{self.metres:.1f} m")
         if untried := sum(not move.known for move in self.moves):
-            parts.append(f"{untried} of them never tried, but implied by the places of the map")
+            some = "" if untried == len(self.moves) else f"{untried} of them "
+            parts.append(f"{some}never tried, but implied by the places of the map")
         elif self.maps > 1:
             parts.append(f"{len(self.agree)} of {self.maps} maps expect the same views")
         if not self.moves:
@@ -233,7 +235,11 @@ def route(
         aside = graph.nodes_in(off_the_way(ssh_map, start_place, goal_place))
     way = graph.shortest(here - closed, there - closed, closed | aside)
     if way is None:
-        _raise_no_route(graph, here, there, closed, goal_named)
+        by_places = False
+        if by != "places" and ssh_map.places:
+            with suppress(MapError):
+                by_places = bool(route(listing, start, goal, by="places", avoid=avoid, map=map))
+        _raise_no_route(graph, here, there, closed, goal_named, by_places)
     moves = tuple(_move(graph, a, b) for a, b in pairwise(way))
     begin, end = (graph.course(node)[0] for node in (way[0], way[-1]))
     first = way[0]
@@ -299,24 +305,36 @@ def _raise_no_route(
     there: AbstractSet[Node],
     closed: AbstractSet[Node],
     named: str,
+    by_places: bool,
 ) -> NoReturn:
-    """Raise MapError with the reason why there is no route, and what to do about it."""
+    """Raise MapError with the reason why there is no route, and what to do about it.
+
+    `by_places` says whether there is a route by places.
+    """
+    implied = "take --by places: the places of the map imply a way that the robot has not driven"
     if closed and graph.shortest(here, there, set()) is not None:
-        raise MapError(
-            f"avoid: expected a way around what is avoided, got none to {named}; avoid less"
-        )
-    mend = "drive on (ssh-abduction next says what to try)"
+        mend = implied if by_places else "avoid less"
+        raise MapError(f"avoid: expected a way around what is avoided, got none to {named}; {mend}")
+    opened = MoveGraph(replace(graph.map, faults=()), graph.by) if graph.closed else graph
+    mend = "the robot has not driven from here to there; drive on"
     if not any(here & {*piece} and there & {*piece} for piece in graph.map.pieces):
         mend = "it is in another piece of the map; add a drive that leads there (solve --onto)"
-    elif graph.closed:
+    elif _floors(graph, here).isdisjoint(_floors(graph, there)):
+        mend = "the robot used no lift and no stairs that lead to its floor; drive on"
+    elif by_places:
+        mend = f"{implied}, or drive on"
+    elif opened.shortest(here, there, closed) is not None:
         mend = "no route passes a gateway that was last seen closed; drive on if it is open again"
-    elif graph.by != "places" and graph.map.places:
-        mend = "take --by places, which may lead where the robot has not driven, or drive on"
+    moves = "known and implied moves" if graph.by == "places" else "known links"
     reached = counted(graph.dstates_from(here), "dstates")
     raise MapError(
-        f"to: expected a goal that known links lead to (they lead to {reached}), got {named}; "
-        f"{mend}"
+        f"to: expected a goal that {moves} lead to (they lead to {reached}), got {named}; {mend}"
     )
+
+
+def _floors(graph: MoveGraph, nodes: AbstractSet[Node]) -> set[int | None]:
+    """Find the floors of those nodes that are dstates. A map without floors has the floor None."""
+    return {graph.map.dstates[node].floor for node in nodes if isinstance(node, int)}
 
 
 def _agreeing(
