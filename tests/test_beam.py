@@ -52,6 +52,15 @@ def test_beam_finds_the_true_map_of_aces3(stars: bool) -> None:
     assert any(truth.is_true(ssh_map, known) for ssh_map in maps_of(known.trace, theory, 16))
 
 
+@pytest.mark.parametrize("misread", [0.0, 1.5])
+def test_beam_joins_steps_of_unknown_view_with_known_ones(misread: float) -> None:
+    known = truth.random_walk(4, 40, 16302, DRIFTING)
+    trace = known.trace.with_views([v if t % 4 else None for t, v in enumerate(known.trace.views)])
+    (found, *_) = maps_of(trace, Theory(misread=misread), 4)
+    assert truth.is_true(found, known)
+    assert solve(trace, Theory(misread=misread), time_limit=1.5).maps[0].labels == found.labels
+
+
 def test_beam_finds_the_true_causal_map() -> None:
     (known,) = truth.mazes(3, 40, [700], DRIFTING)
     assert truth.is_true(maps_of(known.trace, Theory.causal(), 4)[0], known)

@@ -183,7 +183,7 @@ def test_sights_compare_gateways_by_bearing(
     stars = [Star(tuple(Gateway(b, 0.75) for b in seen)) for seen in ((0.0, 5.0, 90.0), bearings)]
     trace = together([Trace((Step("a", star=star.gateways),)) for star in stars])
     settled = settle(trace, Theory(changed=changed, star="gateways", boundary="none")).theory
-    sights = Sights(trace, settled, Log(trace, settled), misreads=False)
+    sights = Sights(trace, settled, misreads=False)
     assert sights.are_alike(*sights.shown) == is_one
 
 
@@ -242,8 +242,7 @@ def test_causal_drives_that_cannot_share_a_dstate_stay_apart_for_sure() -> None:
         rivals = [rival_of(ssh_map, 0.0) for ssh_map in joined(problem)]
         assert [groups_of_drives(r.dstates, drives_of(problem.trace)) for r in rivals[-1:]] == [2]
         assert may_join_more(problem, rivals[-1:]) == may_join
-        log = Log(problem.trace, problem.theory)
-        sights = Sights(problem.trace, problem.theory, log, misreads=False)
+        sights = Sights(problem.trace, problem.theory, misreads=False)
         assert sights.are_alike(sights.shown[0], sights.shown[4]) == may_join
 
 
@@ -324,7 +323,7 @@ def test_ties_relate_maps_whichever_of_them_stands() -> None:
     trace = replace(along("abc", "cba"), closures=(Closure(1, 4, between, exact),))
     problem = settle(trace, Theory(star="none", boundary="none"))
     log = Log(problem.trace, problem.theory, problem.pairs)
-    sights = Sights(problem.trace, problem.theory, log, misreads=False)
+    sights = Sights(problem.trace, problem.theory, misreads=False)
     poses = np.array([0.0, 0.0, 5.0, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0]), np.identity(9) * 0.01
     one, other = (
         Part.of_steps({first + t: t for t in range(3)}, range(3), poses, 0.0, log, sights)

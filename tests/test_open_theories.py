@@ -27,6 +27,7 @@ from ssh_abduction.data import TheoryError
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.solver import Search, Status, choosing, prefixes
+from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.frameless import FramelessEngine
@@ -280,6 +281,15 @@ FAST = {
     ),
     "frameless": (Theory(star="none", weigh="count"), FramelessEngine),
 }
+
+
+def test_frameless_engine_without_a_map_left_yields_none() -> None:
+    trace = Trace.from_steps("aba", ["around", "around"])
+    engine = FramelessEngine(Task.of(settle(trace, Theory(star="none", same=((0, 2),)))))
+    engine.grow(len(trace))
+    assert [*engine.improving_maps()]
+    assert engine.forbid([Equality(0, 2)])
+    assert [*engine.improving_maps()] == []
 
 
 @pytest.mark.parametrize("name", FAST)

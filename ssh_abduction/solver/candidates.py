@@ -64,7 +64,7 @@ class Candidates:
     def __init__(
         self, task: Task, known: Known, judging: Judging, report: Callable[[], None]
     ) -> None:
-        self._trace = task.trace  # some of its views may be unknown
+        self._given = task  # some views of its trace may be unknown
         self._task, self._known, self._judging = _with_all_views(task), known, judging
         self._report = report
         self._beams: dict[int, Beam] = {}  # by their widths
@@ -96,7 +96,7 @@ class Candidates:
         from ssh_abduction.solver.guesses.beam import Beam  # loads numpy
 
         if width not in self._beams:
-            self._beams[width] = Beam(self._task.problem, self._task.log, width)
+            self._beams[width] = Beam(self._given.problem, self._given.log, width)
         return self._beams[width]
 
     def maps_of(self, search: Beam | Joining) -> Iterator[SSHMap]:
@@ -111,13 +111,13 @@ class Candidates:
         """
         from ssh_abduction.solver.guesses.beam import Beam  # loads numpy
 
-        trace, theory = self._task.trace, self._task.theory
+        trace, theory = self._given.trace, self._given.theory
         mended = trace.without_displacements_at(wrong)
-        problem = self._task.problem.changed(mended, theory.replace(jumped=0.0))
+        problem = self._given.problem.changed(mended, theory.replace(jumped=0.0))
         jumps = faults_of(((t, "jumped") for t in wrong), {}, {}, trace, theory)
         most -= theory.prices[0] * sum(fault.cost for fault in jumps)
-        for ssh_map in Beam(problem, self._task.log, 1).maps(most):
-            whole = self._with_unknown_views(with_more_faults(ssh_map, jumps))
+        for ssh_map in Beam(problem, self._given.log, 1).maps(most):
+            whole = with_more_faults(ssh_map, jumps)
             if self._judging.accepts(whole):
                 return whole
         return None
@@ -158,8 +158,8 @@ class Candidates:
         """
         before = self._known.best
         for first in beam.partial():
-            done = self._task.trace.prefix(len(first.dstate_at))
-            self._go_on_to_end(sketch_beyond(first, done, self._task.theory, homing=False))
+            done = self._given.trace.prefix(len(first.dstate_at))
+            self._go_on_to_end(sketch_beyond(first, done, self._given.theory, homing=False))
             if self._known.best is not before:
                 return
 
@@ -213,7 +213,7 @@ class Candidates:
         trace, theory, log = self._task.trace, self._task.theory, self._task.log
         if (
             not self._task.speedups.greedy
-            or trace is not self._trace
+            or trace is not self._given.trace
             or not row("clique").holds_for(theory)
             or not self._judging.can_accept
         ):
@@ -231,8 +231,7 @@ class Candidates:
 
     def _attempts(self) -> list[Callable[[], None]]:
         """List functions that each make a map without a search. Those for small maps come first."""
-        trace, theory = self._task.trace, self._task.theory
-        known = self._known.partial if trace is self._trace else None
+        trace, theory, known = self._given.trace, self._given.theory, self._known.partial
         sketches = sketches_of(trace.steps[0], theory)
         if known is not None:
             sketches.insert(0, sketch_beyond(known, trace.prefix(len(known.dstate_at)), theory))
@@ -247,14 +246,14 @@ class Candidates:
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
         """Extend a map to the end of the trace and offer it, unless a step contradicts it."""
-        if (wrong := first_contradiction(sketch, self._task.trace)) is None:
+        if (wrong := first_contradiction(sketch, self._given.trace)) is None:
             self._offer_or_blame(sketch.map())
         else:
             self.contradicting[wrong] = None
 
     def _offer_separate(self) -> None:
         """Offer a map in which steps share a dstate only if the axioms force them to."""
-        trace, theory = self._trace, self._task.theory
+        trace, theory = self._given.trace, self._task.theory
         if (ssh_map := separate_map(trace, theory)) is not None:
             self._offer_or_blame(ssh_map)
             return
@@ -276,8 +275,8 @@ class Candidates:
             # The next travel may put these steps on a path.
             later = (
                 t
-                for t in range(last, len(self._trace) - 1)
-                if self._trace.actions[t].kind == "travel"
+                for t in range(last, len(self._given.trace) - 1)
+                if self._given.trace.actions[t].kind == "travel"
             )
             self.contradicting |= dict.fromkeys((next(later, last - 1) + 1, last))
 
@@ -317,9 +316,9 @@ class Candidates:
 
     def _with_unknown_views(self, ssh_map: SSHMap) -> SSHMap:
         """Give each dstate of a map its view in the original trace, see `_with_all_views`."""
-        if self._task.trace is self._trace:
+        if self._task.trace is self._given.trace:
             return ssh_map
-        views = answer_maps.views_of(dict(enumerate(ssh_map.dstate_at)), self._trace)
+        views = answer_maps.views_of(dict(enumerate(ssh_map.dstate_at)), self._given.trace)
         dstates = tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
         return replace(ssh_map, dstates=dstates)
 

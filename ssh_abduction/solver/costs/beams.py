@@ -70,11 +70,9 @@ class Beams:
 
         Joining the maps of drives, which broad beams find, counts as a broad beam.
         If displacements may be wrong, this is False: after a wrong one the pose is unknown, so the
-        beam often drops the map of least cost. It is False if views are unknown, too: a beam joins
-        no step of unknown view with a step of known view, unless axioms force it to.
+        beam often drops the map of least cost.
         """
-        theory = self._parts.task.theory
-        is_sound = math.isfinite(self.broken) and not (theory.jumped or theory.unknown_views)
+        is_sound = math.isfinite(self.broken) and not self._parts.task.theory.jumped
         return is_sound and self._best[0] <= nats + EQUAL
 
     def search(self, clashes: Callable[[], bool]) -> bool:

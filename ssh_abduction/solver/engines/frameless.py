@@ -72,7 +72,10 @@ class FramelessEngine:
             self._named.grow(size)
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
-        *_, fewest = self._named.improving()
+        improving = [*self._named.improving()]
+        if not improving:  # the maps excluded so far leave none
+            return
+        fewest = improving[-1]
         if len(self._task.theory.priorities) == 1:
             yield from self._fitting.maps(fewest, "ignore")
             return

@@ -41,7 +41,6 @@ from ssh_abduction.solver.guesses.completing import valid_map
 from ssh_abduction.solver.guesses.extending import Extending, Extension
 from ssh_abduction.solver.guesses.pieces import headings_by_turn
 from ssh_abduction.solver.guesses.reckoning import Hypothesis
-from ssh_abduction.solver.guesses.sights import nats_of_misread, right_view
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
@@ -219,7 +218,7 @@ class Beam:
         price += found.changes + self._problem.overlap.of_steps(found.labels, found.places)
         price += sum(self._fault[kind][t] for t, kind in found.faults)
         if "misread" in self._fault:
-            price += sum(map(nats_of_misread, found.seen))
+            price += sum(map(self._sights.misread, found.seen))
         return price
 
     def _checked(self, beam: list[Hypothesis], end: int, joins: bool = True) -> list[Hypothesis]:
@@ -264,7 +263,7 @@ class Beam:
         steps = list(trace.steps)
         first = first_index_of(self._sights.seen)
         for t, label in enumerate(found.labels):
-            right = self._trace.steps[first[right_view(found.seen[label])]]
+            right = self._trace.steps[first[self._sights.right(found.seen[label])]]
             steps[t] = replace(steps[t], view=right.view)
             if self._bare.star in ("pattern", "frame"):
                 steps[t] = replace(steps[t], star=right.star)

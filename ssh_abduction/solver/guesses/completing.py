@@ -31,6 +31,7 @@ from ssh_abduction.data.gateways import Facing
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp.facts.answer_maps import views_of
 from ssh_abduction.solver.steps.faults import with_changes
 from ssh_abduction.theory.theory import Theory
 
@@ -59,7 +60,7 @@ def completed(
     for here, action, there in zip(labels, trace.actions, labels[1:], strict=False):
         if not action.starts and links.setdefault((here, action.name), there) != there:
             return None
-    views = {label: step.view for label, step in zip(labels, trace.steps, strict=False)}
+    views = views_of(dict(enumerate(labels)), trace)
     listed = tuple((s, action, x) for (s, action), x in links.items())
     if theory.level == "causal":
         dstates = tuple(DState(s, views[s]) for s in range(len(views)))

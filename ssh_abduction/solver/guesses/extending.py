@@ -15,7 +15,7 @@ from ssh_abduction.data.drives import frames_of
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.guesses.pieces import Pieces, fitted
 from ssh_abduction.solver.guesses.reckoning import Hypothesis, HypothesisPoses, first_pose
-from ssh_abduction.solver.guesses.sights import DEAREST, Sights, nats_of_misread
+from ssh_abduction.solver.guesses.sights import DEAREST, Sights
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
 
@@ -57,7 +57,7 @@ class Extending:
         self._lands = "one_landing" in theory.hard
         self.prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
         self.reckoning, self._frames = HypothesisPoses(trace), frames_of(trace)
-        self.sights = Sights(trace, self.bare, log, misreads=theory.misread > 0)
+        self.sights = Sights(trace, self.bare, misreads=theory.misread > 0)
         self.fault = {
             kind: [self.prices[0] * theory.fault_tenths(kind, step) / 10 for step in trace.steps]
             for kind in ("misread", "slipped", "jumped")
@@ -214,10 +214,10 @@ class Extending:
     def _misread(self, found: Hypothesis, dstate: int, t: int) -> float:
         """Return by how many nats the cost of misread views grows if step t is at a dstate."""
         seen, number, doubt = found.seen[dstate], self.sights.seen[t], self._doubt(t)
-        if math.isinf(doubt):
-            return 0.0 if number in seen else math.inf
+        if number in seen and math.isinf(doubt):
+            return 0.0
         after = {**seen, number: seen.get(number, 0.0) + doubt}
-        return nats_of_misread(after) - nats_of_misread(seen)
+        return self.sights.misread(after) - self.sights.misread(seen)
 
     def extended(self, option: Extension, t: int) -> Hypothesis:
         """Make the hypothesis that an option leads to, with its pose at step t."""

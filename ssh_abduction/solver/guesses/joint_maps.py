@@ -99,7 +99,7 @@ class Joining:
         self.broken = 0.0
         self._problem, self._log = problem, log
         self._bare = problem.theory.replace(displacement="none", weigh="count")
-        self.sights = Sights(problem.trace, self._bare, log, misreads=False)
+        self.sights = Sights(problem.trace, self._bare, misreads=False)
         # The ways to lay one map on another.
         self._ways: _Anchors = {}
         # The ways that fit, each with its cost in nats.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import combinations, pairwise, product
 from typing import TypeAlias
 
@@ -17,7 +17,7 @@ from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver.guesses.reckoning import Hypothesis
 from ssh_abduction.solver.steps.frames import may_face, members, rotation_bits
-from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
 
 # What a step shows of its place.
@@ -34,7 +34,7 @@ class Sights:
 
     Attributes:
         seen: What each step shows of its dstate, as a number: its observation, or only its view if
-            gateways may change between drives.
+            gateways may change between drives. An unknown view agrees with every view.
         shown: What each step shows of its place, whichever way it faces: its star, or None without
             stars. A star of four openings is turned to a normal form.
         drive: The number of the drive of each step.
@@ -42,14 +42,18 @@ class Sights:
             extension.
     """
 
-    def __init__(self, trace: Trace, theory: Theory, log: Log, *, misreads: bool) -> None:
+    def __init__(self, trace: Trace, theory: Theory, *, misreads: bool) -> None:
         """Read the views and stars of all steps.
 
         The theory's field `changed` is the price of a changed gateway, in dstates. With `misreads`,
         stars may be wrong. Then any step may be at any place.
         """
         starts = starts_of(trace)
-        self.seen = numbered(trace.views) if theory.changed else log.seen
+        shows = [
+            (step.view, None) if theory.changed else observation(step, theory)
+            for step in trace.steps
+        ]
+        self.seen, self._shows = numbered(shows), [*dict.fromkeys(shows)]
         # In a causal theory, a place is a dstate, so star=alike compares the stars of places, too.
         is_alike = theory.star == "alike" and theory.level == "causal"
         star = "gateways" if is_alike else theory.star
@@ -63,6 +67,28 @@ class Sights:
         """Return the nats for changed gateways if step t is at a place; inf if it cannot be."""
         before, now = found.drives[place], self.drive[t]
         return self._between(found.sights[place], self.shown[t], is_one_drive=before == now)
+
+    def misread(self, seen: Mapping[int, float]) -> float:
+        """Return the cost in nats of the misread views at a dstate; inf if they are not allowed.
+
+        `seen` has what steps there saw, as in the attribute `seen`, and the cost in nats of taking
+        that as misread. What would cost most to take as misread is right (`right`).
+        """
+        return self._wrong(seen, self.right(seen)) if len(seen) > 1 else 0.0
+
+    def right(self, seen: Mapping[int, float]) -> int:
+        """Return what steps at a dstate saw rightly, if the misread views cost the least nats."""
+        known = [number for number in seen if self._shows[number][0] is not None]
+        return min(known or seen, key=partial(self._wrong, seen))
+
+    def _wrong(self, seen: Mapping[int, float], right: int) -> float:
+        """Return the cost in nats of the views at a dstate that differ from the right one."""
+        view, star = self._shows[right]
+        return sum(
+            nats
+            for number, nats in seen.items()
+            if number != right and self._shows[number] not in ((view, star), (None, star))
+        )
 
     def merged(self, first: Mapping[int, Sight], second: Mapping[int, Sight]) -> float:
         """Return by how many nats changed gateways cost more if two places are one.
@@ -120,19 +146,6 @@ class Sights:
         if not isinstance(sight, tuple) or not isinstance(own, tuple):
             return math.inf
         return self._price * _fewest_changes(sight, own)
-
-
-def nats_of_misread(seen: dict[int, float]) -> float:
-    """Return the cost in nats of the misread views at a dstate.
-
-    The view that would cost most to call misread is taken as right, and the others as misread.
-    """
-    return sum(seen.values()) - max(seen.values())
-
-
-def right_view(seen: dict[int, float]) -> int:
-    """Return the observation that costs most to treat as misread. It is taken as right."""
-    return max(seen, key=lambda number: seen[number])
 
 
 def _shown(step: Step, star: str) -> Sight:

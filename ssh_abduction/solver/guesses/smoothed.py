@@ -28,7 +28,7 @@ def smoothed_map(problem: Problem, log: Log, begin: SSHMap | None = None) -> SSH
     """
     trace, theory = problem.trace, problem.theory
     bare = theory.replace(displacement="none", weigh="count")
-    sights = Sights(trace, bare, log, misreads=False)
+    sights = Sights(trace, bare, misreads=False)
     if begin is None:
         labels, places = [*range(len(trace))], numbered(visits_by_turns(trace, theory))
     else:

@@ -142,17 +142,20 @@ def with_compass(ssh_map: SSHMap) -> SSHMap:
 def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) -> SSHMap:
     """Turn a map of a mended trace into a map of the trace itself.
 
-    Each dstate gets the view that most of its steps have, weighted by the cost of a wrong view.
+    Each dstate gets the view that most of its steps have, weighted by the cost of a wrong view. It
+    is None if all these views are unknown.
     The steps at which the map differs from the trace become its faults.
     """
-    votes: dict[int, Counter[View]] = {}
+    votes: dict[int, Counter[View]] = {s.id: Counter() for s in ssh_map.dstates}
     for label, step in zip(ssh_map.dstate_at, trace.steps, strict=True):
-        assert step.view is not None
-        votes.setdefault(label, Counter())[step.view] += theory.fault_tenths("misread", step) or 1
-    shows = {label: max(counts, key=lambda view: counts[view]) for label, counts in votes.items()}
+        if step.view is not None:
+            votes[label][step.view] += theory.fault_tenths("misread", step) or 1
+    shows = {
+        label: max(counts, key=counts.__getitem__, default=None) for label, counts in votes.items()
+    }
     faults: list[tuple[int, str]] = []
     for t, (step, other) in enumerate(zip(trace.steps, mended.steps, strict=True)):
-        if step.view != shows[ssh_map.dstate_at[t]]:
+        if step.view not in (None, shows[ssh_map.dstate_at[t]]):
             faults.append((t, "misread"))
         if theory.star in ("pattern", "frame") and step.openings != other.openings:
             faults.append((t, "misseen"))
