@@ -219,6 +219,60 @@ def test_check_names_each_false_claim(
 
 
 @pytest.mark.parametrize(
+    ("lie", "said"),
+    [
+        ({}, None),
+        ({"bound": {"cost": 4.0}}, "bound.cost: expected 4.5 dstates, the cost of map 1, as the"),
+        ({"bound": {"cost": 4.6}}, "bound.cost: expected at most 4.5 dstates, as map 1 costs no m"),
+        ({"bound": {"dstates": 3}}, "bound: expected a cost in dstates, got"),
+        ({"cost": {"dstates": 3, "places": 0, "paths": 0}}, "faults, as map 1 has these, got 3 d"),
+    ],
+)
+def test_check_bound_checks_the_costs_of_maps_with_faults(
+    lie: dict[str, Any],
+    said: str | None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = str(tmp_path / "trace.jsonl")
+    Trace.from_steps("abcabcabXabc", ["travel"] * 11).save(path)
+    data = answer(path, capsys, "--theory", "causal", "--set", "misread=1.5")
+    code, out = check(path, data | lie, tmp_path, capsys)
+    assert code == (20 if said else 0), out
+    assert (said or "the other claims of the file agree with its maps") in out
+    assert "that no better map exists is not checked: a map may treat steps as wrong" in out
+
+
+@pytest.mark.parametrize(
+    ("views", "words", "why"),
+    [
+        (["a", None, "c", "a"], "", "a step whose view is unknown may be any dstate"),
+        (["a", "b", "c", "a"], "--onto {maps}", "solve --onto writes no proof"),
+        (["a", "b", "c", "a"], "--set without=functional_view", "axioms that are left out"),
+    ],
+)
+def test_check_bound_says_what_it_cannot_check(
+    views: list[str | None],
+    words: str,
+    why: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    first, path, maps = (str(tmp_path / name) for name in ("a.jsonl", "b.jsonl", "c.json"))
+    Trace.from_steps("ab", ["right"], name="monday").save(first)
+    Trace.from_steps(views, ["right"] * 3, name="tuesday").save(path)
+    main(["solve", first, "-o", maps])
+    assert main(["solve", path, *words.format(maps=maps).split(), "-o", maps]) == 0
+    for lie, code in (({}, 0), ({"steps": 99}, 20)):
+        data = json.loads(Path(maps).read_text())
+        data |= lie
+        Path(maps).write_text(json.dumps(data))
+        capsys.readouterr()
+        assert main(["check", "--bound", maps]) == code
+        assert why in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
     ("part", "value"), [("chi2", 0.0), ("dof", 0), ("p", 1.0), ("scale", 0.5), ("bend", -1.0)]
 )
 def test_check_names_a_false_fit(

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from ssh_abduction.data.errors import brief, is_whole
+from ssh_abduction.data.errors import brief, is_finite, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.words import counted
 from ssh_abduction.theory.fields import COUNTS
@@ -148,12 +148,10 @@ class _Claims:
         """
         if "cost" in self.answer:
             cost = self.answer["cost"]
-            expected = (
-                {k: v for k, v in self._least(cost).items() if v or k != "excuses"}
-                if self.maps
-                else None
+            expected = _shown(self._least(cost)) if self.maps else None
+            whole = isinstance(cost, Mapping) and all(
+                is_whole(value) for name, value in cost.items() if name != "faults"
             )
-            whole = isinstance(cost, Mapping) and all(is_whole(value) for value in cost.values())
             if cost != expected or (expected is not None and not whole):
                 because = "as map 1 has these" if self.maps else "as there is no map"
                 yield f"cost: expected {_text(expected)}, {because}, got {_text(cost)}"
@@ -162,7 +160,7 @@ class _Claims:
         if self.theory.weigh == "cost":
             # Maps of one cost in nats may have different counts (checker/cost_claims.py).
             if "within" in self.answer:
-                yield from self._costs_of_each(self._shown())
+                yield from self._costs_of_each()
             return
         if "within" in self.answer:
             yield from self._costs_within(self.answer["within"])
@@ -176,7 +174,7 @@ class _Claims:
                     f"{best} in map 1 and {here} in map {i + 1}"
                 )
 
-    def _preferred(self, i: int) -> list[int]:
+    def _preferred(self, i: int) -> list[float]:
         """List the counts of map i that the theory minimises, the most important first.
 
         Empty if there is no map i.
@@ -215,8 +213,8 @@ class _Claims:
                     f"maps: expected equal numbers of {preferred} in maps {i} and {i + 1}, which "
                     f"are of one level, got {best} and {here}"
                 )
-        shown = self._shown()
-        yield from self._costs_of_each(shown)
+        yield from self._costs_of_each()
+        shown = [_shown(counts) for counts in self.counts]
         begins = [
             i for i in range(len(shown)) if i == 0 or self._preferred(i) != self._preferred(i - 1)
         ]
@@ -231,13 +229,10 @@ class _Claims:
                 f"{brief(self.answer['levels'])}"
             )
 
-    def _shown(self) -> list[dict[str, int]]:
-        """Return the counts of each map as an answer writes them: no excuses if there are none."""
-        return [{k: v for k, v in counts.items() if v or k != "excuses"} for counts in self.counts]
-
-    def _costs_of_each(self, shown: Sequence[Mapping[str, int]]) -> Iterator[str]:
+    def _costs_of_each(self) -> Iterator[str]:
         """Check that each map has the cost that is claimed for it."""
         listed = self.answer.get("maps")
+        shown = map(_shown, self.counts)
         for i, (said, counts) in enumerate(
             zip(listed if isinstance(listed, Sequence) else (), shown, strict=False)
         ):
@@ -247,7 +242,7 @@ class _Claims:
                     f"{_text(said['cost'])}"
                 )
 
-    def _least(self, cost: Any) -> dict[str, int]:
+    def _least(self, cost: Any) -> dict[str, float]:
         """Return the counts that `cost` should have, as a dict from name to number.
 
         These are the counts of the first map. If axioms are left out, clingo may count more than
@@ -269,6 +264,9 @@ class _Claims:
         No map may be below a bound. The certificate must prove the bound on dstates. If the status
         is optimal, the bound must equal the cost.
         """
+        if self.theory.has_faults:
+            yield from self._bound_with_faults()
+            return
         bound = self.answer.get("bound", {})
         if not isinstance(bound, Mapping) or not all(
             name in COUNTS and is_whole(value) and value >= 0 for name, value in bound.items()
@@ -311,14 +309,56 @@ class _Claims:
                     f"optimal, got {got}"
                 )
 
+    def _bound_with_faults(self) -> Iterator[str]:
+        """Check the claimed lower bound on the cost of dstates and faults together, in dstates."""
+        bound = self.answer.get("bound", {})
+        cost = bound.get("cost", 0) if isinstance(bound, Mapping) else None
+        if not (is_finite(cost) and cost >= 0 and set(bound) <= {"cost"}):
+            yield f"bound: expected a cost in dstates, got {brief(bound)}"
+            return
+        costs = [counts["tenths"] / 10 for counts in self.counts]
+        below = [i for i, least in enumerate(costs) if least < cost]
+        if below and not self.theory.without:
+            i = below[0]
+            yield (
+                f"bound.cost: expected at most {costs[i]:g} dstates, as map {i + 1} costs no more, "
+                f"got {cost:g}"
+            )
+        elif (
+            self.is_optimal
+            and self.theory.weigh != "cost"
+            and not self.theory.without
+            and "bound" in self.answer
+            and cost < costs[0]
+        ):
+            yield (
+                f"bound.cost: expected {costs[0]:g} dstates, the cost of map 1, as the status is "
+                f"optimal, got {cost:g}"
+            )
 
-def _counts(ssh_map: SSHMap) -> dict[str, int]:
-    """Count the dstates, places, paths and excuses of a map."""
+
+def _counts(ssh_map: SSHMap) -> dict[str, float]:
+    """Count the dstates, places, paths and excuses of a map, and what its faults cost in dstates.
+
+    "tenths" is the cost of dstates and faults together, in tenths of a dstate.
+    """
+    dstates, faults = len(ssh_map.dstates), sum(round(10 * one.cost) for one in ssh_map.faults)
     return {
-        "dstates": len(ssh_map.dstates),
+        "dstates": dstates,
         "places": len(ssh_map.places),
         "paths": len(ssh_map.paths),
         "excuses": len(ssh_map.excused),
+        "faults": faults / 10,
+        "tenths": 10 * dstates + faults,
+    }
+
+
+def _shown(counts: Mapping[str, float]) -> dict[str, float]:
+    """Return counts as an answer writes them: without excuses and faults if there are none."""
+    return {
+        k: v
+        for k, v in counts.items()
+        if k in ("dstates", "places", "paths") or (v and k != "tenths")
     }
 
 

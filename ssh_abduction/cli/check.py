@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -143,40 +144,42 @@ def run(options: argparse.Namespace) -> int:
     if resolved.weigh == "cost" and isinstance(data, dict) and data.get("weighed"):
         holds &= _costs_hold(trace, data, maps, resolved, str(options.maps), said)
     if options.bound:
-        _refuse_bound(data, resolved, solved)
+        unproven = _why_no_proof(data, resolved, solved)
         broken, doubt = not holds, why if other else None
         if broken:
             doubt = "some maps break axioms" if any(violations) else "a claim about costs is false"
         elif solved is None:
             doubt = "the file names no theory"
-        holds &= _bound(trace, data, maps, doubt, made_by, broken, said)
+        holds &= _bound(trace, data, maps, doubt, made_by, broken, said, unproven)
     found = _Judgement(violations, resolved, [*map(printable, said)], holds)
     print(json_line(found.to_dict()) if options.json else "\n".join(found.lines()))
     return 0 if holds else EXIT_VIOLATED
 
 
-def _refuse_bound(data: Any, resolved: Theory, solved: Theory | None) -> None:
-    """Raise MapError if a clique proves no bound for these theories, or the file has none."""
+def _why_no_proof(data: Any, resolved: Theory, solved: Theory | None) -> str | None:
+    """Say why a clique of steps proves no bound for these theories; None if it may prove one.
+
+    Raises MapError if the file is no answer of `solve`, or lacks the clique that it should have.
+    """
+    if not isinstance(data, dict) or "status" not in data:
+        raise MapError(
+            "bound: expected what solve printed, got only maps; leave out --bound, or take a "
+            "file that solve -o wrote"
+        )
     if resolved.has_faults or (solved is not None and solved.has_faults):
-        raise MapError(
-            "bound: expected a theory without faults (misread, slipped, jumped, changed), as a "
-            "clique of steps proves nothing if steps may be treated as wrong; leave out --bound"
-        )
+        return "a map may treat steps as wrong, so steps that look different may be one dstate"
     if resolved.unknown_views:
-        raise MapError(
-            "bound: expected a trace whose views are all known, as a step whose view is unknown "
-            "may be any dstate; leave out --bound"
-        )
+        return "a step whose view is unknown may be any dstate"
     if RESTS_ON - set(resolved.axioms):
+        return "its proof rests on axioms that are left out: functional_view or deterministic"
+    if "onto" in data:
+        return "this holds for maps that keep the existing map, and solve --onto writes no proof"
+    if "certificate" not in data:
         raise MapError(
-            "bound: expected a theory with the axioms functional_view and deterministic, which "
-            "the proof rests on, got another one; leave out --bound"
+            "certificate: expected one in the file of maps, got none; leave out --bound, or solve "
+            "again"
         )
-    if not isinstance(data, dict) or "certificate" not in data:
-        raise MapError(
-            "certificate: expected one in the file of maps, got none; leave out --bound, "
-            "or take a file that solve --onto did not write"
-        )
+    return None
 
 
 def _axioms_of(theory: Theory) -> Theory:
@@ -229,21 +232,27 @@ def _bound(
     solved: Theory,
     broken: bool,
     said: list[str],
+    unproven: str | None,
 ) -> bool:
     """Check the lower bound and the other claims in a file of maps, and append to `said`.
 
-    `doubt` says why clingo's proofs may not hold for this trace and theory. Returns whether all
-    claims hold.
+    `doubt` says why clingo's proofs may not hold for this trace and theory, `unproven` why the file
+    has no proof of the bound. Returns whether all claims hold.
     """
-    bound = check_bound(trace, data["certificate"])
-    said += [f"bound: {fault}" for fault in bound.faults]
+    bound = None if unproven else check_bound(trace, data["certificate"])
+    said += [f"bound: {fault}" for fault in bound.faults] if bound else []
+    proven = bound.dstates + len(bound.refuted) if bound else sys.maxsize
     false = [
-        *false_claims(data, maps, len(trace), solved, bound.dstates + len(bound.refuted)),
+        *false_claims(data, maps, len(trace), solved, proven),
         *_false_of_maps(data, maps, trace),
     ]
     if not false and not broken and "theory" in data:
         false += _false_of_all(data, trace)
     said += false
+    if bound is None:
+        said += [] if false else ["the other claims of the file agree with its maps"]
+        said.append(f"that no better map exists is not checked: {unproven}")
+        return not false
     if bound.faults:
         return False
     fewest = min((len(m.dstates) for m in maps), default=None)
