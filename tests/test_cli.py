@@ -538,6 +538,8 @@ def test_machine_output_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
             ["cluster", "x", "-o", "y", "--plot", "z.foo"],
             "--plot: expected a name that ends in .png, .pdf or .svg",
         ),
+        (["solve", "x", "--time-limit", "10s"], "--time-limit: expected a number, got '10s'"),
+        (["map", "x", "-o", "y", "-n", "1.5"], "-n/--maps: expected a whole number, got '1.5'"),
     ],
 )
 def test_wrong_usage_names_the_wrong_option(
@@ -565,6 +567,7 @@ def test_error_messages_say_how_to_mend_the_input(
         (["check", str(none), ACES], "maps: expected one to check, got none"),
         (["check", str(tmp_path / "no.json")], "no.json: expected a readable file of maps"),
         (["next", ACES], "expected a file of maps, got a trace; name the maps first"),
+        (["solve", ACES, "-n", "-1"], "1 or more, got -1; None (--maps 0) lists all"),
         (["train", str(solved), ACES, "--map", "5", "-o", "x"], "--map: expected 1 to 4, got 5"),
         (
             ["reproduce", "notched-rectangle", "--jobs", "0"],

@@ -460,6 +460,11 @@ def test_log_is_mapped_in_its_own_process(hall: Path, tmp_path: Path) -> None:
     assert dict(answer.files)["run.json"]
 
 
+def test_error_of_a_log_names_it_once(tmp_path: Path) -> None:
+    answer = MapQuestion(None, {}, {}, 0.5, 1.0, 1, False).answer(0, f"{tmp_path}/")
+    assert answer.line.startswith(f"{tmp_path}: expected a folder of ROS 2")
+
+
 def test_killed_process_loses_only_its_log(hall: Path) -> None:
     question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1, False)
     lost = question.lost(workers.Lost(0, late=False), str(hall))

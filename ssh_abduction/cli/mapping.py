@@ -251,9 +251,11 @@ class MapQuestion(FileQuestion):
 
     def failed(self, number: int, path: str, error: Exception) -> FileAnswer:
         message = in_a_line(error)
+        if not message.startswith((named(path), named(Path(path)))):
+            message = f"{named(path)}: error: {message}"
         return FileAnswer(
             number,
-            message if message.startswith(named(path)) else f"{named(path)}: error: {message}",
+            message,
             EXIT_ERROR,
             tuple(getattr(error, "__notes__", ())),  # the warnings that may say why
         )

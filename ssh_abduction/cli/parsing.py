@@ -24,6 +24,7 @@ WITHDRAWN = dict.fromkeys(
     ),
 )
 OTHER_VERBS = {"localize": "localise"}
+NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
 DRAWN = ("dot", "graphml", "svg")  # options of `show` in version 0.1.0, now `export --to`
 
 
@@ -59,7 +60,7 @@ class Setting:
         try:
             return self.type(text)
         except ValueError:
-            expected = {int: "a whole number", float: "a number"}.get(self.type, "another value")  # type: ignore[call-overload]
+            expected = NUMBERS.get(self.type, "another value")
             raise argparse.ArgumentTypeError(
                 f"expected {expected}, got {text!r}; write one"
             ) from None
@@ -196,6 +197,15 @@ class Parser(argparse.ArgumentParser):
         except argparse.ArgumentError as error:
             hint = meant(value, map(str, action.choices or ()))
             raise argparse.ArgumentError(action, f"{error.message}{hint}") from None
+
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
+        try:
+            return super()._get_value(action, arg_string)
+        except argparse.ArgumentError as error:
+            if (expected := NUMBERS.get(action.type)) is None:
+                raise
+            text = f"expected {expected}, got {arg_string!r}; write one"
+            raise argparse.ArgumentError(action, text) from error
 
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """Parse the words of a command line. The parser of the verb reports unknown options.

@@ -90,7 +90,7 @@ def a_count_of_maps(value: object, error: Kind) -> int | None:
     """Return the largest number of maps to list: 1 or more, or None for all. Or raise `error`."""
     if value is None:
         return None
-    return a_whole_number("max_maps (--maps)", value, error, 1, mend="None lists all (--maps 0)")
+    return a_whole_number("max_maps (--maps)", value, error, 1, mend="None (--maps 0) lists all")
 
 
 def numbers(
