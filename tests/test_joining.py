@@ -377,14 +377,29 @@ def test_all_ways_to_join_drives_are_rivals() -> None:
     assert sorted(labels[9] for labels in found) == [0, 5]
 
 
-@pytest.mark.slow
-def test_search_joins_six_drives() -> None:
-    (known,) = of_mazes(4, 60, [315], NOISE, drives=6)
-    candidates = Search(known.trace)._parts.candidates
+@pytest.mark.parametrize(
+    ("hides", "steps", "drives"), [(4, 40, 2), pytest.param(0, 60, 6, marks=pytest.mark.slow)]
+)
+def test_search_joins_drives_even_if_some_views_are_unknown(
+    hides: int, steps: int, drives: int
+) -> None:
+    (known,) = of_mazes(4, steps, [315], NOISE, drives=drives)
+    views = [None if hides and t % hides == 1 else v for t, v in enumerate(known.trace.views)]
+    candidates = Search(known.trace.with_views(views))._parts.candidates
     joining = candidates.joining()
     assert joining is not None
     *_, ssh_map = candidates.maps_of(joining)
     assert truth.is_true(ssh_map, known)
+
+
+def test_unknown_view_does_not_join_two_known_ones() -> None:
+    trace = Trace.from_steps(["a", None, "b"], ["travel", "travel"])
+    sights = Sights(trace, settle(trace, Theory(star="none")).theory, misreads=False)
+    a, unknown, b = (frozenset([number]) for number in sights.seen)
+    assert sights.may_be_one(a, unknown)
+    assert sights.may_be_one(a | unknown, a)
+    assert not sights.may_be_one(a | unknown, b | unknown)
+    assert sights.right({min(unknown): 3.0, min(b): 1.0, min(a): 2.0}) == min(a)
 
 
 @pytest.mark.parametrize(

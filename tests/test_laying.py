@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from unittest.mock import patch
@@ -20,10 +21,17 @@ from ssh_abduction.solver import Status
 from ssh_abduction.solver.drives import added_drives
 
 
+def without_views(trace: Trace) -> Trace:
+    return trace.with_views([v if t % 4 else None for t, v in enumerate(trace.views)])
+
+
 @pytest.mark.slow
-def test_onto_lays_drives_on_the_map_one_by_one() -> None:
-    """The method was developed on seed 0."""
+@pytest.mark.parametrize("hidden", [False, True])
+def test_onto_lays_drives_on_the_map_one_by_one(hidden: bool) -> None:
+    """The method was developed on seed 0. With `hidden`, every fourth view is unknown."""
     known = list(walks(6, 100, 4, seed=300))
+    if hidden:
+        known = [replace(walk, trace=without_views(walk.trace)) for walk in known]
     solution: Solution | None = None
     for number, walk in enumerate(known, 1):
         before = solution

@@ -101,7 +101,7 @@ class Candidates:
 
     def maps_of(self, search: Beam | Joining) -> Iterator[SSHMap]:
         """Yield the maps that a search finds and the checker accepts, in its order."""
-        yield from filter(self._judging.accepts, map(self._with_unknown_views, search.maps()))
+        yield from filter(self._judging.accepts, search.maps())
 
     def map_without(self, wrong: Collection[int], most: float = math.inf) -> SSHMap | None:
         """Find a map by a narrow beam if only the displacements to `wrong` steps are wrong.
@@ -133,7 +133,7 @@ class Candidates:
             return None
         from ssh_abduction.solver.guesses.joint_maps import Joining  # loads numpy
 
-        return Joining(self._task.problem, self._task.log)
+        return Joining(self._given.problem, self._given.log)
 
     def smoothed(self, begin: SSHMap | None = None) -> SSHMap | None:
         """Merge visits, or places of the map `begin`, at poses that fit all closures.
@@ -147,9 +147,8 @@ class Candidates:
             return None
         from ssh_abduction.solver.guesses.smoothed import smoothed_map  # loads numpy
 
-        found = smoothed_map(self._task.problem, self._task.log, begin)
-        whole = None if found is None else self._with_unknown_views(found)
-        return whole if whole is not None and self._judging.accepts(whole) else None
+        found = smoothed_map(self._given.problem, self._given.log, begin)
+        return found if found is not None and self._judging.accepts(found) else None
 
     def go_on(self, beam: Beam) -> None:
         """Extend the partial maps of a beam to the whole trace, the longest first.

@@ -212,8 +212,6 @@ def _sketched(digest: Digest, ssh_map: SSHMap, part: Trace, theory: Theory) -> I
     The search begins with these maps of the digest and the drive, if they break no axiom. So its
     best map has at most one dstate more for each new step, also at a limit.
     """
-    if theory.unknown_views:
-        return
     standing = replace(ssh_map, dstate_at=digest.labels)
     for homing in (True, False):
         sketch = sketch_beyond(standing, digest.trace, theory, homing)

@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 
 def can_lay(theory: Theory) -> bool:
     """Whether new drives can be laid on a map by a theory in which no field is "auto"."""
-    may_differ = theory.has_faults or theory.lifts or theory.unknown_views
-    return theory.weigh == "cost" and not may_differ
+    return theory.weigh == "cost" and not (theory.has_faults or theory.lifts)
 
 
 def laid(

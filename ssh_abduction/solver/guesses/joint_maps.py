@@ -229,7 +229,10 @@ class Joining:
         cost if they are one place; inf if they cannot be. Dstates coincide if they are nearer than
         `near` metres.
         """
-        alike = np.array([[bool(seen & other) for other in second.seen] for seen in first.seen])
+        may_be_one = self.sights.may_be_one
+        alike = np.array(
+            [[may_be_one(seen, other) for other in second.seen] for seen in first.seen]
+        )
         denied = denied_pairs(self._problem.theory, first, second)
         (at, facing), (there, turned) = first.poses, second.poses
         ways = [

@@ -49,12 +49,14 @@ class _State:
     Attributes:
         dstate: For each dstate, the first dstate that it is merged with.
         place: For each place, the first place that it is merged with.
+        seen: For each first dstate, what steps there show, as numbers (`Sights.seen`).
         sights: For each first place, what each drive saw of it.
         links: For each first dstate, the dstate that each of its actions leads to.
     """
 
     dstate: list[int]
     place: list[int]
+    seen: list[frozenset[int]]
     sights: list[Mapping[int, Sight]]
     links: list[dict[int, int]]
     mean: Array
@@ -63,7 +65,8 @@ class _State:
 
     def copy(self) -> _State:
         """Copy everything that a merge changes in place."""
-        return replace(self, sights=[*self.sights], links=[dict(links) for links in self.links])
+        links = [dict(links) for links in self.links]
+        return replace(self, seen=[*self.seen], sights=[*self.sights], links=links)
 
 
 class _ClashError(Exception):
@@ -90,6 +93,7 @@ class Overlay:
         self._apart = _State(
             [*range(len(both.places))],
             [*range(len(both.sights))],
+            [*both.seen],
             [*both.sights],
             links,
             both.mean,
@@ -176,7 +180,7 @@ class Overlay:
         return Part(
             {t: number[state.dstate[s]] for t, s in both.labels.items()},
             [place[state.place[both.places[s]]] for s in dstates],
-            [both.seen[s] for s in dstates],
+            [state.seen[s] for s in dstates],
             [both.stars[s] for s in dstates],
             {
                 (number[s], action): number[state.dstate[x]]
@@ -292,6 +296,7 @@ class Overlay:
                     pairs.append((state.links[s][action], there))
                 else:
                     state.links[s][action] = there
+            state.seen[s] |= state.seen[x]
             state.dstate = [s if i == x else i for i in state.dstate]
             p, q = sorted(state.place[self._both.places[i]] for i in (s, x))
             headings = self._both.heading[s], self._both.heading[x]
@@ -362,10 +367,8 @@ class Overlay:
 
     def _look_alike(self, s: int, x: int) -> bool:
         """Whether two dstates show the same, except for gateways that changed."""
-        both = self._both
-        return bool(both.seen[s] & both.seen[x]) and self._sights.are_alike(
-            both.stars[s], both.stars[x]
-        )
+        seen, stars, sights = self._state.seen, self._both.stars, self._sights
+        return sights.may_be_one(seen[s], seen[x]) and sights.are_alike(stars[s], stars[x])
 
     def _coinciding(self, place: int) -> list[tuple[float, tuple[int, int]]]:
         """List pairs of dstates at a place that show the same and may face the same way.

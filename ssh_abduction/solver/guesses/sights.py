@@ -54,6 +54,7 @@ class Sights:
             for step in trace.steps
         ]
         self.seen, self._shows = numbered(shows), [*dict.fromkeys(shows)]
+        self._has_unknown = None in trace.views
         # In a causal theory, a place is a dstate, so star=alike compares the stars of places, too.
         is_alike = theory.star == "alike" and theory.level == "causal"
         star = "gateways" if is_alike else theory.star
@@ -75,6 +76,12 @@ class Sights:
         that as misread. What would cost most to take as misread is right (`right`).
         """
         return self._wrong(seen, self.right(seen)) if len(seen) > 1 else 0.0
+
+    def may_be_one(self, first: frozenset[int], second: frozenset[int]) -> bool:
+        """Whether steps that saw this (`seen`) may be at one dstate, if no view is misread."""
+        if first == second or not self._has_unknown:
+            return first == second
+        return self.misread(dict.fromkeys(first | second, math.inf)) == 0.0
 
     def right(self, seen: Mapping[int, float]) -> int:
         """Return what steps at a dstate saw rightly, if the misread views cost the least nats."""

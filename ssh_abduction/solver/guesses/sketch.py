@@ -134,16 +134,12 @@ class Sketch:
         sketch._orders = [list(path.order) for path in ssh_map.paths]
         sketch._states, sketch._along, sketch._facing, sketch._slots = [], {}, {}, {}
         stars: dict[int, object] = {}
-        # The observation of a dstate is that of its first step.
+        # The star of a dstate is that of its first step.
         seen = dict(zip(reversed(ssh_map.dstate_at), reversed(trace.steps), strict=True))
         for s in ssh_map.dstates:
             place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
-            assert s.view is not None
-            sketch._states.append(
-                KnownDState(
-                    s.view, observation(seen[s.id], theory), place, heading, s.path, direction
-                )
-            )
+            shown = observation(replace(seen[s.id], view=s.view), theory)
+            sketch._states.append(KnownDState(s.view, shown, place, heading, s.path, direction))
             stars.setdefault(place, sketch._star(seen[s.id], heading))
             if s.path is not None:
                 sketch._along[place, s.path, direction] = s.id
