@@ -71,7 +71,7 @@ def mapping(
     for log in halves:
         logs.append(str(folder / f"{log.source}.log"))
         write_carmen(Path(logs[-1]), log.scans)
-    command = ["map", *logs, "--together", "-o", str(folder / "building"), "--time-limit", "5"]
+    command = ["map", *logs, "--together", "-o", str(folder / "building"), "--time-limit", "1"]
     with patch.object(log_maps, "import_log", kept):
         main([*command, "--set", "ladder=false"])
     return folder / "building", parts
@@ -251,7 +251,7 @@ def test_joint_run_of_the_same_logs_is_skipped(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     logs = [str(folder.parent / f"{name}.log") for name in ("monday", "tuesday")]
-    command = ["map", *logs, "--together", "-o", str(folder), "--time-limit", "5"]
+    command = ["map", *logs, "--together", "-o", str(folder), "--time-limit", "1"]
     assert main([*command, "--set", "ladder=false"]) == 0
     assert "2 logs: done already" in capsys.readouterr().out
     assert digest(logs) != digest(logs[::-1])
@@ -273,7 +273,7 @@ def test_map_together_obeys_corrections(
     assert main(["name", building, "monday:0", "kitchen"]) == 0
     assert main(["correct", building, "--different", pair]) == 0
     logs = [str(folder.parent / f"{name}.log") for name in ("monday", "tuesday")]
-    settings = ["--together", "-o", building, "--time-limit", "5", "--set", "ladder=false"]
+    settings = ["--together", "-o", building, "--time-limit", "1", "--set", "ladder=false"]
     capsys.readouterr()
     main(["map", *logs, *settings])
     told = capsys.readouterr()
@@ -290,7 +290,7 @@ def test_map_together_obeys_corrections(
     for log in logs:
         (tmp_path / Path(log).stem).mkdir()
         shutil.copy(Path(building) / "corrections.yaml", tmp_path / Path(log).stem)
-    assert main(["map", *logs, "-o", str(tmp_path), "--time-limit", "5"]) == 1
+    assert main(["map", *logs, "-o", str(tmp_path), "--time-limit", "1"]) == 1
     assert capsys.readouterr().out.count("expected no corrections, got") == 2
 
 
