@@ -153,7 +153,7 @@ def test_a_beam_finds_faults(kind: str, seed: int) -> None:
     assert check(trace, best, theory) == ()
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(data=st.data())
 def test_all_maps_of_a_beam_satisfy_the_axioms(data: st.DataObject) -> None:
     trace = data.draw(traces(closures=True).filter(lambda trace: trace.has_displacements))

@@ -124,7 +124,7 @@ def solved_as(trace: Trace, theory: Theory, costs: dict[Key, tuple[float, ...]])
         assert 10 * len(ssh_map.dstates) + sum(10 * f.cost for f in ssh_map.faults) == least[0]
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(st.data())
 def test_maps_with_changes_equal_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(drives_with_stars(), label="trace")

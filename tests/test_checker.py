@@ -657,7 +657,7 @@ def mutants(draw: st.DrawFn) -> tuple[Case, SSHMap]:
     return original, m
 
 
-@settings(max_examples=75)
+@settings(max_examples=35)
 @given(mutants(), THEORIES | st.none())
 def test_checker_never_raises_on_a_mutated_map(
     mutant: tuple[Case, SSHMap], theory: Theory | None

@@ -96,7 +96,7 @@ def test_malformed_closure_is_an_error(tmp_path: Path, closures: Any, said: str)
         Trace.load(path)
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(st.data())
 def test_misfit_with_closures_equals_plain_least_squares(data: st.DataObject) -> None:
     drawn = traces(max_steps=5, closures=True, metric=True).filter(lambda trace: trace.closures)

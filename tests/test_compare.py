@@ -69,7 +69,7 @@ products = st.lists(
 )
 
 
-@settings(max_examples=75)
+@settings(max_examples=30)
 @given(relations | products)
 def test_choices_equal_the_finest_division_by_brute_force(rows: list[list[bool]]) -> None:
     table = np.array(rows, dtype=bool)
@@ -196,7 +196,7 @@ def naive_differing(maps: Sequence[SSHMap]) -> dict[str, set[int]]:
     return {sort: differing for sort, differing in found.items() if differing}
 
 
-@settings(max_examples=12)
+@settings(max_examples=7)
 @given(st.data())
 def test_comparison_is_true_of_the_listed_maps(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")

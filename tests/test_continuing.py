@@ -24,7 +24,7 @@ from tests.strategies import traces
 CAUSAL = Theory.causal()
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(traces(max_steps=30), st.data())
 def test_continued_labels_are_a_consistent_map(trace: Trace, data: st.DataObject) -> None:
     """The given map may be wrong, and few steps may settle a link. Evidence is left out."""

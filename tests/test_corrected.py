@@ -47,7 +47,7 @@ def maps_of(trace: Trace, theory: Theory, speedups: Speedups) -> set[object]:
     return {key(ssh_map) for ssh_map in maps}
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(broken_traces(), st.sampled_from(["none", "strict"]), st.booleans())
 def test_maps_of_traces_with_slipped_actions_equal_the_brute_force(
     trace: Trace, boundary: str, framed: bool

@@ -140,7 +140,7 @@ def test_causal_maps_with_faults_equal_the_brute_force(
     assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_few_names_and_short_prefixes_do_not_change_answers(data: st.DataObject) -> None:
     trace = data.draw(small_traces(max_steps=7))

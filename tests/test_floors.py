@@ -46,7 +46,7 @@ def traces_with_lifts(draw: st.DrawFn) -> Trace:
     return replace(trace, steps=tuple(steps))
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(st.data())
 def test_maps_with_floors_equal_the_brute_force(data: st.DataObject) -> None:
     solver_agrees(data, data.draw(traces_with_lifts(), label="trace"))

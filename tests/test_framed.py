@@ -96,7 +96,7 @@ def framed_theories(draw: st.DrawFn) -> Theory:
     )
 
 
-@settings(max_examples=12)
+@settings(max_examples=7)
 @given(framed_traces(), framed_theories(), st.sets(st.sampled_from(SPEEDUPS)), st.data())
 def test_framed_maps_equal_those_of_the_plain_encoding(
     trace: Trace, theory: Theory, off: set[str], data: st.DataObject

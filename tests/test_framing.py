@@ -22,7 +22,7 @@ from ssh_abduction.theory.speedups import SPEEDUPS, row
 PATTERN = Theory(star="pattern")
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_framed_maps_satisfy_the_theory(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=10).filter(lambda t: t.has_stars), label="trace")
@@ -41,7 +41,7 @@ def test_framed_maps_satisfy_the_theory(data: st.DataObject) -> None:
     assert costs == sorted(costs, reverse=True)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.data())
 def test_framing_changes_no_answer(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6).filter(lambda t: t.has_stars), label="trace")

@@ -200,7 +200,7 @@ def test_sketches_of_worlds_satisfy_all_axioms(world: str) -> None:
         assert len(small.places) <= len(large.places)
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(traces())
 def test_sketch_exists_if_a_map_exists(trace: Trace) -> None:
     theory = settle(trace, Theory.topological().replace(star="gateways")).theory

@@ -70,7 +70,7 @@ def agree(trace: Trace, theory: Theory, ssh_map: SSHMap) -> tuple[Join, ...]:
     return joins
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(st.data())
 def test_named_joins_are_a_minimal_set_that_implies_all_others(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6))

@@ -32,7 +32,7 @@ def house() -> LogMap:
     """The map of most of a drive through a house of six rooms and a hall."""
     scans = every_second_beam(scans_of(record(World.named("doors"), every=1.0)))
     scans = scans[: len(scans) * 7 // 10]
-    return map_log(RobotLog(scans, source="house"), time_limit=4, with_ladder=False)
+    return map_log(RobotLog(scans, source="house"), time_limit=1, with_ladder=False)
 
 
 def along(*places: int) -> SSHMap:

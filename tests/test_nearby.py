@@ -37,7 +37,7 @@ from ssh_abduction.theory.settle import Problem
 CAUSAL = Theory.causal()
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(machines(), st.integers(0, 10_000), st.data())
 def test_search_near_a_guess_changes_no_answer(
     trace: Trace, cores: int, data: st.DataObject

@@ -182,7 +182,7 @@ def drawn(data: st.DataObject, most: int) -> tuple[Trace, Theory]:
     return trace, settle(trace, data.draw(theories(trace, fixed=fixed), label="theory")).theory
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(st.data())
 def test_online_sketches_are_consistent(data: st.DataObject) -> None:
     trace, theory = drawn(data, 14)

@@ -67,7 +67,7 @@ def with_toy(toy: Toy, theory: Theory) -> Theory:
         if toy.causal or name != "causal"
     ],
 )
-@settings(max_examples=2)
+@settings(max_examples=1)
 @given(data=st.data())
 def test_own_axiom_is_obeyed_offline_and_online(name: str, toy: Toy, data: st.DataObject) -> None:
     """Solve offline and online, against the brute force. The first prefixes are so short that
@@ -293,7 +293,7 @@ def test_frameless_engine_without_a_map_left_yields_none() -> None:
 
 
 @pytest.mark.parametrize("name", FAST)
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(data=st.data())
 def test_every_engine_forbids_maps_refused_by_evidence(name: str, data: st.DataObject) -> None:
     """An engine that settles dstates first obeys it, too. Its maps are those of the brute force."""

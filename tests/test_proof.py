@@ -28,7 +28,7 @@ from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.log import Log
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(machines(most_steps=30))
 def test_checker_accepts_the_certificates_of_solve(trace: Trace) -> None:
     for theory in (

@@ -41,7 +41,7 @@ def agree(trace: Trace, theory: Theory) -> None:
         assert getattr(solution.cost, name) == getattr(counts, name)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(st.data())
 def test_minimal_maps_equal_the_brute_force(data: st.DataObject) -> None:
     solver_agrees(data, data.draw(traces(closures=True), label="trace"))
@@ -82,7 +82,7 @@ def test_excuses_are_minimised_without_excusable_paths(
     agree(trace, Theory(boundary="defeasible", next_place=True, star="none", prefer=prefer))
 
 
-@settings(max_examples=13)
+@settings(max_examples=8)
 @given(st.data())
 def test_checker_rejects_maps_outside_the_brute_force(data: st.DataObject) -> None:
     """The maps of one theory under the axioms of another.

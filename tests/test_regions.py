@@ -197,7 +197,7 @@ def as_set(ssh_map: SSHMap) -> set[brute_regions.Found]:
     return {(frozenset(r.places), frozenset(r.bounds), r.door) for r in ssh_map.regions}
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     trace=st.builds(walk, st.integers(0, 10_000), st.integers(2, 16)),
     boundary=st.sampled_from(("strict", "defeasible", "none")),
@@ -213,7 +213,7 @@ def test_encoding_checker_and_brute_force_agree_on_streets(
         assert as_set(ssh_map) == brute_regions.regions(ssh_map, trace, axioms_for_regions(theory))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.lists(st.sampled_from(sorted(ROOMS)), min_size=2, max_size=7))
 def test_encoding_checker_and_brute_force_agree_on_rooms(rooms: list[str]) -> None:
     tour = "".join(room for i, room in enumerate(rooms) if i == 0 or room != rooms[i - 1])

@@ -43,7 +43,7 @@ def least_by_trying(moves: RepeatedMoves, together: np.ndarray) -> float:
     return min(sum(map(cost, parts)) for parts in divisions(len(moved)))
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(st.integers(1, 6), st.integers(0, 10**6))
 def test_shares_bound_all_clusterings_into_cliques_from_below(n: int, seed: int) -> None:
     draw = np.random.default_rng(seed)

@@ -109,7 +109,7 @@ def test_maps_by_prefixes_of_random_machines_equal_whole_traces(seed: int) -> No
     assert len(set(by_prefix.maps)) == by_prefix.count
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(
     traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory)))
 )

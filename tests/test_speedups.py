@@ -188,7 +188,7 @@ def test_lazy_search_lists_as_many_maps_as_requested(most: int) -> None:
     assert found.complete == (every.count <= most)
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(machines(most_steps=40))
 def test_greedy_merging_gives_a_map(trace: Trace) -> None:
     theory = Theory.causal()

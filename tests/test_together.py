@@ -70,7 +70,7 @@ def joint_traces(draw: st.DrawFn, closures: bool = False) -> Trace:
     return replace(trace, steps=tuple(steps))
 
 
-@settings(max_examples=12)
+@settings(max_examples=7)
 @given(st.data())
 def test_joint_maps_equal_the_brute_force(data: st.DataObject) -> None:
     solver_agrees(data, data.draw(joint_traces(), label="trace"))
@@ -87,7 +87,7 @@ def test_cheapest_joint_maps_equal_plain_least_squares(data: st.DataObject) -> N
     test_weighing.agree(trace, test_weighing.weighed(theory, prices))
 
 
-@settings(max_examples=8)
+@settings(max_examples=4)
 @given(st.data())
 def test_checker_rejects_joint_maps_outside_the_brute_force(
     data: st.DataObject,

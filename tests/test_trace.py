@@ -372,7 +372,7 @@ def test_prefix_ends_without_an_action() -> None:
     assert trace.prefix(3) == trace
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(
     st.binary(max_size=200)
     | st.binary(max_size=50).map(lambda line: f"{HEADER}\n".encode() + line)

@@ -39,7 +39,7 @@ def hidden(trace: Trace, steps: set[int]) -> Trace:
     return trace.with_views([None if t in kept else view for t, view in enumerate(trace.views)])
 
 
-@settings(max_examples=12)
+@settings(max_examples=7)
 @given(st.data())
 def test_maps_with_unknown_views_equal_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")
