@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from modules import parsed
 
 from ssh_abduction import cli
 from ssh_abduction.cli import parser
@@ -66,7 +67,7 @@ FOREIGN = re.compile(
 
 def texts(path: Path) -> Iterator[str]:
     """The texts of a module, apart from its docstrings."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parsed(path)
     told = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
         if (

@@ -171,9 +171,7 @@ def parts(folder: Path, ending: str, count: int = 3) -> None:
         (".mcap", None),
         (".bag", None),
         (".mcap", "rosbag2_bagfile_information: {version: 9, storage_identifier: ''}\n"),
-        (".mcap", "not: a bag\n"),
         (".db3", ""),
-        (".bag", ""),
     ],
 )
 def test_bag_parts_without_usable_metadata_are_read_as_one_drive(
@@ -322,9 +320,7 @@ HALF = TIMES[-1] / 2
 BROKEN: dict[str, Callable[[float], float]] = {
     "10 s back from midway": lambda t: t - 10 * (t > HALF),
     "10 s on from midway": lambda t: t + 10 * (t > HALF),
-    "2 s on from midway": lambda t: t + 2 * (t > HALF),
     "2 % fast": lambda t: 1.02 * t,
-    "2 % slow": lambda t: 0.98 * t,
     "all equal": lambda t: 0.0,
     "0 from midway": lambda t: t if t < HALF else -100.0,
     "0 up to midway": lambda t: t if t > HALF else -100.0,

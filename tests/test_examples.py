@@ -38,7 +38,6 @@ def run(name: str, *words: str) -> str:
     [
         ("aces3-route", Theory.topological(), (19, 10, 4), 4),
         ("notched-rectangle", Theory.topological(), (8, 4, 4), 1),
-        ("notched-rectangle", Theory.circumscriptive(), (8, 4, 4), 1),
         ("notched-rectangle", Theory.causal(), (4, 0, 0), 1),
         ("adventure", Theory.causal(), (6, 0, 0), 1),
     ],

@@ -375,7 +375,7 @@ def test_confidence_of_a_view_scales_the_cost_of_a_fault() -> None:
 
 def test_front_equals_the_brute_force() -> None:
     trace = Trace.from_steps("abababba", ["right", "travel"] * 3 + ["right"])
-    for kinds in ({"misread": 1.5}, {"slipped": 1.5}, {"misread": 1.5, "slipped": 1.5}):
+    for kinds in ({"slipped": 1.5}, {"misread": 1.5, "slipped": 1.5}):
         front = fault_front(trace, Theory.causal().replace(**kinds), most=3)
         assert [point.proven for point in front.points] == [True] * 4
         assert [point.dstates for point in front.points] == [

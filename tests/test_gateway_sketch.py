@@ -104,8 +104,10 @@ def ruled(text: str, theory: Theory) -> Theory:
     return theory.replace(rules=[Rules("own.lp", text)])
 
 
-@pytest.mark.parametrize("fault", [{}, {"misread": 1.5}, {"slipped": 3.0}])
-@pytest.mark.parametrize("name", KEPT)
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [*((name, {}) for name in KEPT), ("order", {"misread": 1.5}), ("brief", {"slipped": 3.0})],
+)
 def test_map_that_satisfies_own_rules_is_returned_at_the_limit(
     name: str, fault: dict[str, float]
 ) -> None:
@@ -164,8 +166,9 @@ def test_rules_about_atoms_without_facts_cannot_be_checked(body: str) -> None:
     )
 
 
-@pytest.mark.parametrize("kind", ["misread", "slipped"])
-@pytest.mark.parametrize("body", READ)
+@pytest.mark.parametrize(
+    ("kind", "body"), [(("misread", "slipped")[i % 2], body) for i, body in enumerate(READ)]
+)
 def test_own_rules_select_the_same_maps_with_faults_as_clingo(body: str, kind: str) -> None:
     plain = Theory.topological().replace(**{kind: 0.5})
     theory = ruled(f"#program step(t).\n:- {body}.", plain)
@@ -192,7 +195,7 @@ def sketched(trace: Trace, theory: Theory) -> list[SSHMap]:
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_sketches_of_worlds_satisfy_all_axioms(world: str) -> None:
-    for seed in range(2):
+    for seed in range(1):
         trace = drive(world, seed, 60)
         theory = settle(trace).theory
         small, large = sketched(trace, theory)

@@ -417,10 +417,8 @@ def test_general_stars_switch_off_speedups_for_right_angles() -> None:
 
 WORLDS: dict[str, tuple[nx.Graph, int, set[object]]] = {
     "corners of 60 degrees": (planar.triangle(), 13, set()),
-    "bends of 120 degrees": (planar.hexagon(), 19, {0}),
     "three gateways, and a hub": (planar.wheel(3), 30, {0}),
     "three gateways, and dead ends": (planar.junction(0, 120, 240), 16, set()),
-    "five gateways": (planar.junction(0, 72, 144, 216, 288), 30, set()),
     "five gateways at odd angles": (planar.junction(0, 50, 135, 180, 270), 22, set()),
     "six gateways": (planar.junction(0, 60, 120, 180, 240, 300), 30, set()),
 }
@@ -462,7 +460,7 @@ def test_bend_ends_two_paths() -> None:
         assert (solution.cost.dstates, solution.cost.places, solution.cost.paths) == counts
 
 
-@pytest.mark.parametrize(("noise", "unseen"), [(0, False), (8, False), (8, True)])
+@pytest.mark.parametrize(("noise", "unseen"), [(0, False), (8, True)])
 def test_streets_at_any_angles_have_true_maps(noise: float, unseen: bool) -> None:
     graph = planar.scattered(6, random.Random(3))
     tour = drive(graph, 0, next(iter(graph[0])), 24, random.Random(3), noise=noise, unseen=unseen)

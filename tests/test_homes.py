@@ -73,7 +73,7 @@ CASES = {
     ("case", "prefer"),
     [
         *((case, ("dstates", "paths", "places")) for case in CASES),
-        *((case, ("dstates", "places", "paths")) for case in [*CASES][1::2]),
+        *((case, ("dstates", "places", "paths")) for case in [*CASES][1::3]),
         *((case, ("dstates", "places")) for case in [*CASES][::3]),
     ],
 )

@@ -107,9 +107,8 @@ def test_joined_map_costs_at_most_as_much_as_the_true_one(known: truth.Known, st
     assert found <= nats(truth.partition(known.dstates), truth.partition(known.places)) + 1e-6
 
 
-@pytest.mark.parametrize("seed", [513, 514])
-def test_joined_map_names_the_gateways_that_changed(seed: int) -> None:
-    case = changes.case(4, 60, seed, 3, 8)
+def test_joined_map_names_the_gateways_that_changed() -> None:
+    case = changes.case(4, 60, 513, 3, 8)
     problem = settle(case.known.trace, Theory(changed=1.2, star="frame"))
     *_, best = joined(problem)
     assert truth.is_true(best, case.known)
@@ -413,7 +412,7 @@ def test_laying_costs_more_where_most_steps_look_alike(
     trace, theory = along(views, views[:6]), Theory(boundary="none")
     assert settle(trace, theory).overlap.price == pytest.approx(price)
     free, joint = (
-        solve(trace, theory.replace(same=pairs), time_limit=0.7)
+        solve(trace, theory.replace(same=pairs), time_limit=0.3)
         for pairs in ((), ((0, len(views)),))
     )
     assert len(free.maps[0].pieces) == pieces

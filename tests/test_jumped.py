@@ -118,7 +118,7 @@ def test_carried_robot_finds_its_circuit_again() -> None:
 
 def test_displacements_that_may_be_wrong_exclude_no_pair() -> None:
     """The best map joins steps that the wrong displacement takes far apart."""
-    solution = solve(circuit(7, (5,)), Theory(jumped=0.5), time_limit=20)
+    solution = solve(circuit(7, (5,)), Theory(jumped=0.5, weigh="count"))
     assert solution.maps[0].faults
     assert solution.effort.evidence["displacement"]["pairs"] == 0
 

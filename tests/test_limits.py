@@ -17,7 +17,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import aces
 import clingo
 import pytest
 from in_processes import answer_and_end, sleep, stay, vanish
@@ -450,7 +449,7 @@ def test_ctrl_c_while_clingo_deletes_a_program_is_raised_later(
     ask: Callable[[Solution], object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Python only prints what is raised where an object is deleted."""
-    solution = aces.solution(max_maps=1)
+    solution = solve(rectangle(8), max_maps=1)
     delete, left = clingo.Control.__del__, [KeyboardInterrupt]
 
     def interrupted(control: clingo.Control) -> None:

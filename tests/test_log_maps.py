@@ -330,7 +330,7 @@ def test_map_on_an_unreliable_track_has_no_probability(
     track = replace(imported_hall.track, is_reliable=False)
     imported = replace(imported_hall, track=track)
     monkeypatch.setattr(log_maps, "import_log", lambda *_: imported)
-    doubtful = map_log(read_log(hall), time_limit=5, max_maps=1, with_ladder=False).solution
+    doubtful = map_log(read_log(hall), time_limit=1, max_maps=1, with_ladder=False).solution
     reliable = Solution.load(runs / "hall" / "maps.json")
     for solution, is_reliable in ((doubtful, False), (reliable, True)):
         said = "no probability is given, as the track is unreliable" in solution.sureness

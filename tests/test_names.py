@@ -7,6 +7,8 @@ import ast
 from collections import Counter
 from pathlib import Path
 
+from modules import parsed
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -20,7 +22,7 @@ def names(kind: type[ast.ClassDef | ast.FunctionDef]) -> list[str]:
         node.name
         for folder in ("ssh_abduction", "perception", "simulator")
         for path in sorted((ROOT / folder).rglob("*.py"))
-        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        for node in parsed(path).body
         if isinstance(node, kind)
     ]
 
@@ -53,7 +55,7 @@ def test_names_of_tests_have_at_most_80_characters() -> None:
     found = [
         node.name
         for path in sorted((ROOT / "tests").glob("test_*.py"))
-        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        for node in parsed(path).body
         if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
     ]
     assert len(found) > 1000

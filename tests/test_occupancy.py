@@ -121,7 +121,7 @@ def test_image_path_is_relative_to_the_yaml_file(name: str, tmp_path: Path) -> N
         assert borders(walls, 0.5, (-1.0, 2.0, 0.0)) == sides((GREY < 89).tolist())
 
 
-@pytest.mark.parametrize("yaw", [0.0, 0.3, -1.5707963, 3.0])
+@pytest.mark.parametrize("yaw", [0.0, 3.0])
 @pytest.mark.parametrize("negate", [False, True])
 @pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
 @pytest.mark.parametrize("kind", ["L", "1", "LA", "P", "P with alpha", "RGB", "RGBA", "I;16"])

@@ -241,7 +241,7 @@ def test_draft_with_turns_that_lead_back_may_break_an_axiom() -> None:
 @pytest.mark.parametrize("stars", [False, True])
 def test_draft_follows_a_robot_through_a_maze(stars: bool) -> None:
     doubts: list[bool] = []
-    for seed in range(3):
+    for seed in range(2):
         trace = maze(3, 3, steps=60, seed=seed, loops=0.5, stars=True).trace
         trace = (
             trace if stars else Trace.from_steps([step.view or "" for step in trace], trace.actions)
@@ -416,7 +416,6 @@ def test_malformed_displacement_leaves_the_mapper_unchanged(
     ("theory", "stars", "steps"),
     [
         (Theory(joint=1), True, 12),
-        (Theory(), False, 12),
         (Theory.causal(), False, 12),
     ],
 )

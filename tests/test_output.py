@@ -373,7 +373,6 @@ SCRIPT = "-c import~sys;from~ssh_abduction.__main__~import~run;sys.exit(run())"
             ("-m ssh_abduction", module)
             for module in (
                 "ssh_abduction.cli",
-                "clingo",
                 "numpy.linalg",
                 "sklearn.base",
             )

