@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,15 +58,22 @@ def seeing(name: str, first: tuple[int, ...], last: tuple[int, ...]) -> Trace:
     return Trace.from_steps("abcd", ["travel", "around", "travel"], stars=stars, name=name)
 
 
-@pytest.fixture
-def folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with traces and their joint map, in which the b of Tuesday is that of Monday."""
+    folder = tmp_path_factory.mktemp("drives")
     for trace in (MONDAY, TUESDAY, ROUND):
-        trace.save(tmp_path / f"{trace.name}.jsonl")
-    (tmp_path / "building").mkdir()
-    assert main(solving(tmp_path)) == 0
+        trace.save(folder / f"{trace.name}.jsonl")
+    (folder / "building").mkdir()
+    assert main(solving(folder)) == 0
+    return folder
+
+
+@pytest.fixture
+def folder(solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """A copy of this folder that a test may change."""
     capsys.readouterr()
-    return tmp_path
+    return shutil.copytree(solved, tmp_path, dirs_exist_ok=True)
 
 
 def solving(folder: Path, *names: str) -> list[str]:

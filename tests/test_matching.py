@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -84,6 +85,7 @@ def test_wall_in_free_space_lowers_the_score() -> None:
     assert whole.score > parted.score + 0.05
 
 
+@cache
 def rounds() -> tuple[RobotLog, Track, tuple[Visit, ...], list[PackedPatch]]:
     """A robot drives twice to the end of a side corridor and back."""
     walls = [(-9, -1, 2, -1), (3, -1, 7, -1), (8.5, -1, 19, -1), (-9, 1, 4, 1), (6, 1, 19, 1)]

@@ -58,7 +58,7 @@ def circuits() -> Trace:
 
 @pytest.fixture(scope="module")
 def tours() -> Trace:
-    return simulate(HALL, tours=2, seed=1000)
+    return simulate(HALL, tours=1, seed=1000)
 
 
 # Laser
