@@ -9,6 +9,7 @@ import networkx as nx
 import planar
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 from test_gateways import traces
 
 from benchmarks.instances import maze
@@ -204,11 +205,19 @@ def test_sketches_of_worlds_satisfy_all_axioms(world: str) -> None:
 
 
 @settings(max_examples=15)
-@given(traces())
-def test_sketch_exists_if_a_map_exists(trace: Trace) -> None:
-    theory = settle(trace, Theory.topological().replace(star="gateways")).theory
+@given(traces(), st.booleans())
+def test_sketch_exists_if_a_map_exists(trace: Trace, all_on_paths: bool) -> None:
+    theory = settle(trace, Theory(star="gateways", all_on_paths=all_on_paths)).theory
     exists = any(check(trace, ssh_map, theory) == () for ssh_map in sketched(trace, theory))
     assert exists == bool(solve(trace, theory, max_maps=1, time_limit=100).maps)
+
+
+def test_sketch_puts_dstates_that_face_opposite_ways_on_one_path() -> None:
+    stars = [(0, 1, 0, 1), (1, 0, 1, 0)] * 2
+    trace = Trace.from_steps("abab", ["right"] * 3, stars=stars)
+    theory = settle(trace, Theory(star="gateways", all_on_paths=True)).theory
+    found = sketched(trace, theory)
+    assert [check(trace, ssh_map, theory) for ssh_map in found] == [(), ()]
 
 
 @pytest.mark.parametrize(("first", "places"), [([0], 2), ([0, 180], 3)])

@@ -238,7 +238,8 @@ class Candidates:
             partial(self._go_on_to_end, sketch) for sketch in sketches
         ]
         if has_no_frames(theory):
-            kinds.append(self._offer_separate)
+            # The paths of this map often cross where there is no place.
+            kinds.insert(0 if theory.planar else len(kinds), self._offer_separate)
         if theory.misread or theory.slipped or theory.jumped:
             kinds.append(self._offer_mended)
         return [self.merge, *kinds]

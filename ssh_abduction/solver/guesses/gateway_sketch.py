@@ -35,7 +35,7 @@ from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.rotations import leads
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solver.guesses.sketch import Contradiction, KnownDState, Sketch
+from ssh_abduction.solver.guesses.sketch import Contradiction, Sketch
 from ssh_abduction.theory.theory import Theory
 
 # A dstate, and a star that is seen there.
@@ -187,10 +187,9 @@ class GatewaySketch(Sketch):
         return next((x for x in known if self._may_be_at(x, step) and self._may_show(x)), None)
 
     def _course_through(self, here: int) -> tuple[int, int] | None:
-        s = self._states[here]
-        if not self._homing and self._may_begin_path(s):
+        if not self._homing and self._may_begin_path(here):
             return None
-        sights, turns = self._sights(self._shown[s.place])
+        sights, turns = self._sights(self._shown_with(here))
         read = frames_that_fit(sights, turns, self._axioms, as_shown=False) or []
         own = [
             turned for sight, turned in zip(sights, read, strict=False) if sight.dstate.id == here
@@ -201,11 +200,20 @@ class GatewaySketch(Sketch):
                 return path, -(direction or 1)
         return None
 
-    def _may_begin_path(self, s: KnownDState) -> bool:
+    def _shown_with(self, here: int) -> _PlaceSights:
+        """Return the sights of the place of a dstate, which may be that of the present step."""
+        known = self._shown[self._states[here].place]
+        is_shown = any(x == here for x, _ in known.sights)
+        return known if is_shown else self._grown(self._states[here].place, here, len(self.labels))
+
+    def _may_begin_path(self, here: int) -> bool:
         """Whether a new path may leave a place in the heading of a dstate."""
+        s = self._states[here]
         self._orders.append([s.place])
         s.path, s.direction = len(self._orders) - 1, 1
-        fitted = frames_that_fit(*self._sights(self._shown[s.place]), self._axioms, as_shown=False)
+        fitted = frames_that_fit(
+            *self._sights(self._shown_with(here)), self._axioms, as_shown=False
+        )
         s.path = None
         self._orders.pop()
         return fitted is not None
