@@ -105,7 +105,7 @@ def test_route_by_places_stays_in_one_piece() -> None:
         near, far = (f"p{ssh_map.place_of(t)}" for t in (1, 2))
         assert len(route(ssh_map, 0, near, by="places").moves) == 1
         for by in ("actions", "places"):
-            with pytest.raises(MapError, match=r"to 2 dstates.*; it is in another piece"):
+            with pytest.raises(MapError, match=r"reach 2 dstates.*; it is in another piece"):
                 route(ssh_map, 0, far, by=by)
 
 
@@ -172,7 +172,11 @@ def test_route_passes_no_gateway_that_was_last_seen_closed(
         # One way only: the paths of the map also lead back.
         (["travel"] * 3, {}, "take --by places: the places of the map imply a way"),
         # Nothing leads back through a lift that was used once.
-        (["travel", Action("lift", "lift"), "travel"], {}, "that known links .* no stairs"),
+        (
+            ["travel", Action("lift", "lift"), "travel"],
+            {},
+            "from dstate 3 .*they reach 1 dstate.* no stairs",
+        ),
         (["travel", Action("lift", "lift"), "travel"], {"by": "places"}, "implied .* no stairs"),
         (["travel"] * 3, {"by": "places", "avoid": ["p1"]}, "avoid less"),
     ],
@@ -184,6 +188,12 @@ def test_route_advises_only_what_leads_there(
     with pytest.raises(MapError, match=said) as error:
         route(ssh_map, **{"start": 3, "goal": "p0", **arguments})
     assert ("--by places" in str(error.value)) == ("--by places" in said)
+
+
+@pytest.mark.parametrize(("goal", "where"), [(3, "the goal"), ("p3", "at place 3")])
+def test_route_to_its_own_start_says_so(goal: int | str, where: str) -> None:
+    found = route(solve(Trace.from_steps("abcd", ["travel"] * 3)), None, goal)
+    assert found.sentence == f"the start, dstate 3, is {where}: there is nothing to do"
 
 
 def test_route_counts_rivals_that_agree() -> None:

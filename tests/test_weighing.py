@@ -394,7 +394,7 @@ def test_stopped_search_is_not_sure(route: truth.Known) -> None:
     assert solution.confidence is not None
     assert solution.confidence < 0.5
     assert "nats less may exist" in solution.weighed.sentence
-    assert f"among the {len(solution.weighed.rivals)} maps found)" in solution.weighed.sentence
+    assert f"among the {len(solution.weighed.rivals)} maps found" in solution.weighed.sentence
     alone = replace(solution.weighed, rivals=solution.weighed.rivals[:1])
     assert "no other map was found, so it is unknown which joins are doubtful" in alone.sentence
 
@@ -514,8 +514,9 @@ def test_sentence_names_the_most_probable_missed_join() -> None:
     assert weighed.sentence.endswith("; steps 1 and 3 may be at one place, too (0.27)")
     apart = Rival(10.5, (0, 1, 2, 3), (0, 1, 2, 3))
     doubtful = replace(weighed, rivals=(*rivals, apart))
-    assert doubtful.sentence.endswith("; the most doubtful join is of steps 0 and 2 (0.69)")
-    assert replace(doubtful, broken=30.0).sentence.endswith("(0.69 if the axioms hold)")
+    most = "; the most doubtful join, of steps 0 and 2, has probability 0.69"
+    assert doubtful.sentence.endswith(most)
+    assert replace(doubtful, broken=30.0).sentence.endswith(f"{most} if the axioms hold")
     assert replace(weighed, rivals=(best,)).missed is None
     turned = replace(weighed, rivals=(best, Rival(11.0, (0, 1, 2, 3), (0, 1, 0, 2))))
     assert turned.sentence.endswith(

@@ -37,7 +37,10 @@ def add_parser(verbs: Verbs) -> None:
         "after this time goes on for up to 64 times as long",
         type=float,
     )
-    said = "whether to compute how much each kind of evidence helps (default: true)"
+    said = (
+        "whether to compute how much each kind of evidence helps; this takes time after the "
+        "search, which --time-limit does not limit (default: true)"
+    )
     parser.add_setting("ladder", said, default=True)
     parser.add_setting(
         "again", "whether to map also logs that are already mapped (default: false)", default=False

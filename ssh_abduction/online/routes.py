@@ -162,10 +162,9 @@ class Route:
         elif self.maps > 1:
             parts.append(f"{len(self.agree)} of {self.maps} maps expect the same views")
         if not self.moves:
-            if self.goal == f"dstate {self.start}":
-                return f"dstate {self.start} is {self.goal}: there is nothing to do"
-            within = "in" if self.goal.startswith("region") else "at"
-            return f"dstate {self.start} is {within} {self.goal}"
+            where = f"in {self.goal}" if self.goal.startswith("region") else f"at {self.goal}"
+            where = "the goal" if self.goal == f"dstate {self.start}" else where
+            return f"the start, dstate {self.start}, is {where}: there is nothing to do"
         return f"from dstate {self.start} to {self.goal}: {', '.join(parts)}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -216,7 +215,7 @@ def route(
     number = listing.number(str(map))
     ssh_map = listing.maps[number]
     graph = MoveGraph(ssh_map, by, listing.drives)
-    here, _ = graph.nodes(ssh_map.dstate_at[-1] if start is None else start, "from")
+    here, start_named = graph.nodes(ssh_map.dstate_at[-1] if start is None else start, "from")
     there, goal_named = graph.nodes(goal, "to")
     if not goal_named.startswith("dstate"):
         there = graph.nodes_in({graph.course(node)[0] for node in there})
@@ -239,7 +238,7 @@ def route(
         if by != "places" and ssh_map.places:
             with suppress(MapError):
                 by_places = bool(route(listing, start, goal, by="places", avoid=avoid, map=map))
-        _raise_no_route(graph, here, there, closed, goal_named, by_places)
+        _raise_no_route(graph, here, there, closed, (start_named, goal_named), by_places)
     moves = tuple(_move(graph, a, b) for a, b in pairwise(way))
     begin, end = (graph.course(node)[0] for node in (way[0], way[-1]))
     first = way[0]
@@ -304,17 +303,19 @@ def _raise_no_route(
     here: AbstractSet[Node],
     there: AbstractSet[Node],
     closed: AbstractSet[Node],
-    named: str,
+    names: tuple[str, str],
     by_places: bool,
 ) -> NoReturn:
     """Raise MapError with the reason why there is no route, and what to do about it.
 
-    `by_places` says whether there is a route by places.
+    `names` are words for the start and the goal. `by_places` says whether there is a route by
+    places.
     """
+    begin, end = names
     implied = "take --by places: the places of the map imply a way that the robot has not driven"
     if closed and graph.shortest(here, there, set()) is not None:
         mend = implied if by_places else "avoid less"
-        raise MapError(f"avoid: expected a way around what is avoided, got none to {named}; {mend}")
+        raise MapError(f"avoid: expected a way around what is avoided, got none to {end}; {mend}")
     opened = MoveGraph(replace(graph.map, faults=()), graph.by) if graph.closed else graph
     mend = "the robot has not driven from here to there; drive on"
     if not any(here & {*piece} and there & {*piece} for piece in graph.map.pieces):
@@ -328,7 +329,8 @@ def _raise_no_route(
     moves = "known and implied moves" if graph.by == "places" else "known links"
     reached = counted(graph.dstates_from(here), "dstates")
     raise MapError(
-        f"to: expected a goal that {moves} lead to (they lead to {reached}), got {named}; {mend}"
+        f"to: expected a goal that {moves} lead to from {begin} (they reach {reached}), got "
+        f"{end}; {mend}"
     )
 
 

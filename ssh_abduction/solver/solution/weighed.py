@@ -294,7 +294,8 @@ class Weighed:
             if len(self.rivals) == 1:
                 return f"{text}; no other map was found, so it is unknown which joins are doubtful"
             given = f" among the {len(self.rivals)} maps found"
-        return f"{text}; the most doubtful join is of steps {first} and {second} ({sure}{given})"
+        join = f"the most doubtful join, of steps {first} and {second}"
+        return f"{text}; {join}, has probability {sure}{given}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the costs as plain data."""
