@@ -355,7 +355,7 @@ def test_export_command_writes_the_output_of_python(
     assert main(["export", file, "--to", "tmap2", "--set", "name=hall"]) == 0
     printed = capsys.readouterr()
     assert checked_tmap2(printed.out)["pointset"] == "hall"
-    assert "positions are of a layout" in printed.err
+    assert "positions are those of a drawing" in printed.err
     assert main(["export", file, "--to", "nav2", "--map", "3"]) == 1
     assert "1 to 1" in capsys.readouterr().err
 

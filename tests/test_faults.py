@@ -488,6 +488,9 @@ def test_solve_prints_the_front(
     assert "if a fault costs more than 0 and less than 9 dstates" in said
     assert main(["solve", "trace.jsonl", "--front", "1", "--json"]) == 0
     assert [point["dstates"] for point in json.loads(capsys.readouterr().out)["front"]] == [13, 4]
+    RECTANGLE[:9].save("right.jsonl")
+    assert main(["solve", "right.jsonl", "--front", "1"]) == 0
+    assert capsys.readouterr().out.endswith("\nno fault saves a dstate\n")
     assert main(["solve", "trace.jsonl", "--front", "2", "--theory", "topological"]) == 1
     assert "expected a causal theory" in capsys.readouterr().err
     assert main([*command, "--set", "within=1"]) == 1

@@ -64,6 +64,8 @@ def _as_text(front: Front, most: int) -> str:
             f"if a fault costs more than {front.prices[0]:g} and less than {front.prices[1]:g} "
             "dstates, the map at the knee costs least of these"
         )
+    elif not front.stopped and len({point.dstates for point in front.points}) == 1:
+        lines.append("no fault saves a dstate")
     elif not front.stopped:
         lines.append("no knee: each further fault saves about as many dstates")
     if front.stopped:

@@ -144,7 +144,7 @@ def export_doubts(
     found = []
     if not roads.metric:
         found.append(
-            "the map has no poses: its positions are of a layout, and no metres; "
+            "the map has no poses, so its positions are those of a drawing, not metres; "
             "solve a trace with displacements, and without a short time limit"
         )
     if len(ssh_map.pieces) > 1:
