@@ -204,7 +204,14 @@ def test_ctrl_c_during_output_leaves_it_complete(
 
 def test_check_accepts_the_maps_of_solve(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(solved), ACES]) == 0
-    assert capsys.readouterr().out == "4 of 4 maps satisfy the 27 axioms\n"
+    assert capsys.readouterr() == ("4 of 4 maps satisfy the 27 axioms\n", "")
+
+
+def test_check_warns_of_another_trace(
+    solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", str(solved), saved(rectangle(8), tmp_path)]) == 1
+    assert "was made of other steps than those of" in capsys.readouterr().err
 
 
 def test_check_names_the_broken_axiom(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:

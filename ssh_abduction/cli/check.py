@@ -22,9 +22,11 @@ from ssh_abduction.cli.options import (
     theory_of,
     written_theory,
 )
+from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import MapError, brief, is_finite, printable
+from ssh_abduction.data.drives import fingerprints_of
+from ssh_abduction.data.errors import MapError, brief, is_finite, named, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
@@ -118,6 +120,9 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     trace = solved_trace(options)
     data = read_json(options.maps)
+    if not _may_be_of(data, trace):
+        steps = f"those of {named(trace.source or 'the trace')}"
+        warn([f"{named(options.maps)} was made of other steps than {steps}"])
     solved = written_theory(data)
     asked = theory_of(options, solved)
     trace, theory = as_corrected(trace, asked, options.maps)
@@ -154,6 +159,14 @@ def run(options: argparse.Namespace) -> int:
     found = _Judgement(violations, resolved, [*map(printable, said)], holds)
     print(json_line(found.to_dict()) if options.json else "\n".join(found.lines()))
     return 0 if holds else EXIT_VIOLATED
+
+
+def _may_be_of(data: Any, trace: Trace) -> bool:
+    """Whether a file of maps may be of this trace: their drives have the same fingerprints."""
+    drives = data.get("drives") if isinstance(data, dict) else None
+    drives = drives if isinstance(drives, list) else []
+    known = {str(drive.get("fingerprint")) for drive in drives if isinstance(drive, dict)}
+    return not known or "None" in known or known == set(fingerprints_of(trace).values())
 
 
 def _why_no_proof(data: Any, resolved: Theory, solved: Theory | None) -> str | None:
