@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -184,7 +185,11 @@ def test_map_of_a_drive_has_perfect_place_precision(runs: Path) -> None:
     assert (judged.places.precision, judged.places.recall) == (1.0, 1.0)
     run = json.loads((folder / "run.json").read_text())
     assert set(run["seconds"]) >= {"track", "places", "trace", "views", "maps"}
-    assert "<script" not in (folder / "report.html").read_text()
+    report = (folder / "report.html").read_text()
+    assert "<script" not in report
+    assert not re.search(r"[ >]-0°", report)
+    assert "path_order=total; star=none; " in report
+    assert "prefer=dstates,places,paths; " in report
 
 
 def test_stored_recogniser_recognises_another_drive(

@@ -177,7 +177,7 @@ def _faults(solution: Solution) -> str:
 def _settings(run: Mapping[str, Any]) -> str:
     """Make the table of the settings: what is a place, the width of the robot, the theory."""
     told = ((n, value) for n, value in run["theory"].items() if value not in (None, False, [], 0))
-    theory = ", ".join(f"{name} {value}" for name, value in told)
+    theory = "; ".join(f"{name}={_setting(value)}" for name, value in told)
     why = "where the free space forks, or the robot turned, began or ended"
     rows = [
         ("places", "junctions, turning points, ends", why),
@@ -185,6 +185,13 @@ def _settings(run: Mapping[str, Any]) -> str:
         ("theory", theory, "which axioms hold, and what is minimised"),
     ]
     return _table(("", "", ""), rows)
+
+
+def _setting(value: Any) -> str:
+    """Write the value of a field of a theory as after --set."""
+    if isinstance(value, list):
+        return ",".join(map(_setting, value))
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _time(run: Mapping[str, Any]) -> str:
@@ -225,9 +232,9 @@ def _visits(imported: Imported, solution: Solution) -> str:
         star = " ".join(
             "?"
             if entry is None
-            else f"{entry:g}"
+            else f"{entry:zg}"
             if isinstance(entry, int | float)
-            else f"{entry.bearing:g}°{'' if entry.open else '?'}"
+            else f"{entry.bearing:zg}°{'' if entry.open else '?'}"
             for entry in step.star or ()
         )
         seen = (step.extra["visit"], step.extra["scan"], "?" if step.view is None else step.view)
