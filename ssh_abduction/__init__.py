@@ -1,18 +1,19 @@
 """Find every minimal topological map that explains what a robot saw and did.
 
 Each exported name is loaded when it is first used. So the command line starts at once, and Ctrl-C
-works from its start. When this module is loaded, it imports only `sys`, which is part of Python
-itself, and not even `__future__`. At that time, Python may still search the current folder first,
-and a file there could replace a module of Python. `__main__` moves that folder to the end of the
-search path.
+works from its start. When this module is loaded, it imports `sys`, which is part of Python itself,
+and `lazy`, but not even `__future__`. At that time, Python may still search the current folder
+first, and a file there could replace a module of Python. `__main__` moves that folder to the end of
+the search path.
 """
 
 import sys
 
+from ssh_abduction.runtime.lazy import lazy_names
+
 TYPE_CHECKING = False  # as in typing, which takes longer to load than this whole module
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from typing import Any
 
     from ssh_abduction.checker import check as check
@@ -61,58 +62,6 @@ _MOVED_MODULES = {
     "ssh_abduction.learner": "ssh_abduction.learning",
     "ssh_abduction.rivals.explain": "ssh_abduction.explain",
 }
-
-
-def lazy_names(package: str) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
-    """Make the `__getattr__` and `__dir__` of a package that loads each name when it is first used.
-
-    The package exports the names that its source imports by `as`, below `if TYPE_CHECKING`. They
-    are its `__all__`.
-
-    Returns:
-        The function `__getattr__`, which loads and returns the value of a name, and the function
-        `__dir__`, which lists all names.
-    """
-    where: dict[str, tuple[str, str]] = {}  # the module of each name, and its name there
-
-    def exported() -> "list[str]":
-        if not where:
-            where.update(_exports_of(package))
-        return sorted(where)
-
-    def load(name: str) -> "Any":
-        from importlib import import_module
-
-        if name == "__all__":
-            return exported()
-        if name not in exported():
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module, there = where[name]
-        loaded = import_module(module)
-        value = (
-            getattr(loaded, there) if hasattr(loaded, there) else import_module(f"{module}.{there}")
-        )
-        setattr(sys.modules[package], name, value)
-        return value
-
-    def names() -> "list[str]":
-        return sorted({*vars(sys.modules[package]), *exported()})
-
-    return load, names
-
-
-def _exports_of(package: str) -> "dict[str, tuple[str, str]]":
-    """Read the names that a package imports by `as`, each with its module and its name there."""
-    import ast
-
-    spec: Any = sys.modules[package].__spec__
-    return {
-        alias.asname: (node.module, alias.name)
-        for node in ast.walk(ast.parse(spec.loader.get_source(package)))
-        if isinstance(node, ast.ImportFrom) and node.module is not None
-        for alias in node.names
-        if alias.asname is not None
-    }
 
 
 class _MovedModules:

@@ -4,7 +4,7 @@ A star is what a robot sees of the ways out of a place. Each name is loaded when
 so that a program loads only what it needs.
 """
 
-from ssh_abduction import lazy_names
+from ssh_abduction.runtime.lazy import lazy_names
 
 TYPE_CHECKING = False
 

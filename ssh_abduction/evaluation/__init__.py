@@ -1,6 +1,6 @@
 """Compare maps with the truth, measure how evidence helps, and repeat the paper's experiments."""
 
-from ssh_abduction import lazy_names
+from ssh_abduction.runtime.lazy import lazy_names
 
 TYPE_CHECKING = False
 

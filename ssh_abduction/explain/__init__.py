@@ -1,6 +1,6 @@
 """Explain why steps are one dstate, where a place lies, and why a trace has no map."""
 
-from ssh_abduction import lazy_names
+from ssh_abduction.runtime.lazy import lazy_names
 
 TYPE_CHECKING = False
 

@@ -1,6 +1,6 @@
 """Bootstrap learning (Kuipers & Beeson 2002): images, views, map, labels, recogniser."""
 
-from ssh_abduction import lazy_names
+from ssh_abduction.runtime.lazy import lazy_names
 
 TYPE_CHECKING = False
 

@@ -1,6 +1,6 @@
 """Map while the robot drives, explore, localise in a known map, and plan routes."""
 
-from ssh_abduction import lazy_names
+from ssh_abduction.runtime.lazy import lazy_names
 
 TYPE_CHECKING = False
 

@@ -3,7 +3,7 @@
 Each function is loaded when it is first used, as some need networkx, scipy, matplotlib or pandas.
 """
 
-from ssh_abduction import lazy_names
+from ssh_abduction.runtime.lazy import lazy_names
 
 TYPE_CHECKING = False
 

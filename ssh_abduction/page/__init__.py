@@ -1,6 +1,6 @@
 """Show the maps of a trace on a page in the browser, with a server that answers its questions."""
 
-from ssh_abduction import lazy_names
+from ssh_abduction.runtime.lazy import lazy_names
 
 TYPE_CHECKING = False
 

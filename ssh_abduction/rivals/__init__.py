@@ -1,6 +1,6 @@
 """Compare rivals (minimal maps of one trace), and find an experiment that distinguishes them."""
 
-from ssh_abduction import lazy_names
+from ssh_abduction.runtime.lazy import lazy_names
 
 TYPE_CHECKING = False
 

@@ -1,6 +1,6 @@
 """Map a building from a robot's log, and write a report."""
 
-from ssh_abduction import lazy_names
+from ssh_abduction.runtime.lazy import lazy_names
 
 TYPE_CHECKING = False
 

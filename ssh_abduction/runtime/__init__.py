@@ -1,4 +1,4 @@
-"""Support for running programs: start and exit, time limits, the log, threads, deprecated names.
+"""Support for running programs: start and exit, lazy names, limits, the log, threads, old names.
 
-This module imports nothing, because `__main__` loads `program` before any other module.
+This module imports nothing, because `lazy` and `program` are loaded before any other module.
 """

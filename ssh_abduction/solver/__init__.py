@@ -5,7 +5,7 @@ Other packages import only the names that this module lists.
 Each name is loaded when it is first used, so that importing `Solution` does not load clingo.
 """
 
-from ssh_abduction import lazy_names
+from ssh_abduction.runtime.lazy import lazy_names
 
 TYPE_CHECKING = False
 
