@@ -235,9 +235,10 @@ def _deal(
     cards = shuffled[np.argsort(of[shuffled], kind="stable")]
     cards = cards[counts[of[cards]] > 1]
     if len(cards) < folds:
+        mend = f"take fewer (learning-curve --set folds={len(cards)})"
         raise PerceptionError(
             f"folds: expected at most {len(cards)}, the number of images of places that were seen "
-            f"more than once, got {folds}; take fewer"
+            f"more than once, got {folds}; {mend if len(cards) > 1 else 'record a longer drive'}"
         )
     fold = np.full(len(labels), -1, np.intp)
     fold[cards] = np.arange(len(cards)) % folds
