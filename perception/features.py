@@ -67,6 +67,7 @@ def telling_features(
         labels: (n,) dstate of each image. Images of other dstates are ignored.
         a: Label of one dstate.
         b: Label of the other dstate.
+        random_state: Seed of the permutations of features.
 
     Returns:
         The share of each feature by three methods, and the share of images that are recognised.

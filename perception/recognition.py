@@ -176,6 +176,7 @@ def learning_curve(
         y: (n,) label of each image.
         sizes: Numbers of images to learn from, each from 1 to n.
         folds: Number of folds, at least 2.
+        random_state: Seed of the division into folds.
         estimator: A scikit-learn classifier; None means `recogniser()`, for ranges in metres.
 
     Returns:

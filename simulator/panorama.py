@@ -215,6 +215,7 @@ class Camera:
         """Take a panorama.
 
         Args:
+            world: The world whose walls the camera sees.
             pose: Pose of the robot: x and y in metres, heading in radians.
             rng: Source of noise.
             hour: Hour of the day, from 0 to 24.

@@ -233,9 +233,11 @@ def record_plan(
     """Drive rounds through a building, and return the scans with odometry and truth.
 
     Args:
+        plan: The floor plan, with walls, doors and rooms.
         tours: Number of times that the same round is driven.
         seed: Seed of the round and of the noise.
         metres: Length of the round after which the robot goes home.
+        body: Size and errors of the robot; None for `Body()`.
         odometer: Noise of the odometry in the log.
         every: Metres between scans. In turns there is a scan every ten degrees.
 

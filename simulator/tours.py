@@ -51,6 +51,7 @@ def simulate(
     of hill-climbing.
 
     Args:
+        world: The world, with walls and a route.
         tours: Number of tours.
         seed: Seed of all noise.
         laser: The scanner; None for `Laser()`.

@@ -97,6 +97,7 @@ def _closings(
 
 
 def is_reliable(found: Match) -> bool:
+    """Whether a match of two local maps may become a closure."""
     return found.score >= SCORE and found.mutual >= MUTUAL
 
 

@@ -236,11 +236,11 @@ class _Chain:
         return self.sightings[-1].milestone
 
     def middle(self, recent: int = 0) -> Array:
-        """The median of the middles: (2,) metres; of the last `recent` ones only, if not 0."""
+        """The median of the middles, (2,) in metres: of all, or of the last `recent` ones."""
         return _middle(self.sightings[-recent:])
 
     def radius(self, recent: int = 0) -> float:
-        """The median of the radii in metres; of the last `recent` ones only, if not 0."""
+        """The median of the radii in metres: of all, or of the last `recent` ones."""
         radii = [sighting.junction.radius for sighting in self.sightings[-recent:]]
         return float(np.median(radii))
 

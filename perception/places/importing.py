@@ -138,6 +138,7 @@ def import_live(
     Args:
         items: The scans with odometry, in order, for example those of `stream_log` or `live_log`.
         width: Width of the robot in metres.
+        name: Name of the trace; None for a trace without a name.
         tell: A function that gets each note on suspicious scans and odometry, at once.
         show: A function that gets each visit when it is final, before `partings` moves, joins and
             adds visits.

@@ -238,7 +238,7 @@ def _of_one_source(track: RecordedTrack, called: str, notes: list[str]) -> Recor
 
 @dataclass(frozen=True)
 class _ScanPoses:
-    """Poses of the robot and its lasers."""
+    """The poses that a bag has: of the robot over time, and of its lasers on the robot."""
 
     odometry: TimedPoses  # poses by the odometer
     # The transform from the parent of the odometry's frame to this frame, then that from the

@@ -428,4 +428,5 @@ def without_codes(reach: float) -> float:
 
 
 def same_pose(a: Pose, b: Pose) -> bool:
+    """Whether two poses differ by no more than a log's rounding."""
     return all(abs(v) <= ROUNDED for v in displacement_between(a, b))

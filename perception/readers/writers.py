@@ -67,6 +67,7 @@ def write_carmen(
     laser. Ranges beyond the reach are written as the reach, ranges that are no measurement as 0.
 
     Args:
+        scans: The scans, in the order of the log.
         path: The file; it is gzipped if its name ends in .gz.
         parameters: Numbers by name, such as the noise of the odometry. They are written in PARAM
             lines at the beginning.
@@ -94,6 +95,7 @@ def write_bag(
     poses are known, from map to odom) and /tf_static (from base_link to laser).
 
     Args:
+        scans: The scans, in the order of the log.
         path: File or folder to write. A name that ends in .bag makes a file of ROS 1, one in .mcap
             a file of MCAP, and any other a folder of ROS 2.
         covariances: (n, 3, 3) covariance of the pose by odometry (x, y, heading) at each scan. None

@@ -79,6 +79,8 @@ def joins_by_minimality(
     star in both directions.
 
     Args:
+        trace: The trace that was mapped.
+        ssh_map: A minimal map of the trace.
         theory: The theory, with each "auto" replaced; Theory.topological() if None.
 
     Raises:

@@ -63,7 +63,7 @@ def add_reading(parser: Parser) -> None:
     group = parser.add_argument_group("reading logs")
     said = "format of the log (default: guessed from its content)"
     parser.add("--format", said, to=group, choices=FORMATS)
-    said = f"width of the robot in metres, which cannot pass narrower gaps (default: {WIDTH:g})"
+    said = f"width of the robot in metres; it cannot pass narrower gaps (default: {WIDTH:g})"
     parser.add("--width METRES", said, to=group, type=metres)
     parser.add_setting(
         "fov DEGREES",

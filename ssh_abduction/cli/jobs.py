@@ -66,6 +66,7 @@ class FileQuestion(Protocol):
 
         Args:
             number: The index of the file, which the answer repeats.
+            path: The path of the file.
             content: The result of `load`; None to read the file here.
             given_up: Returns whether the answer is not needed any more.
         """

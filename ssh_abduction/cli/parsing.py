@@ -317,6 +317,7 @@ class Verbs(argparse._SubParsersAction):  # type: ignore[type-arg]
         """Add a verb and return its parser.
 
         Args:
+            name: The name of the verb.
             run: Does what the options ask for, and returns the exit code.
             said: The text for the list of verbs.
             description: The text at the top of the help of this verb.

@@ -46,7 +46,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     said = "number of folds of the cross-validation (default: 10)"
     curve.add_setting("folds N", said, 10, type=int)
-    curve.add("--seed", "random seed of the folds (default: 0)", type=seed, default=0)
+    said = "random seed of the division into training and test images (default: 0)"
+    curve.add("--seed", said, type=seed, default=0)
     curve.add("--plot PNG", "draw the learning curve into this file", type=picture_file)
     curve.add("--json", "print JSON")
     apart = verbs.add(

@@ -68,7 +68,7 @@ def progress_bar() -> Any:
 
 @contextlib.contextmanager
 def _handled(log: logging.Logger, handler: logging.Handler, level: int) -> Iterator[None]:
-    """While the block runs, send a handler all records of a log of this level or higher."""
+    """While the block runs, pass the records of a log to a handler, from this level upwards."""
     before = log.level
     log.addHandler(handler)
     log.setLevel(level)

@@ -55,6 +55,8 @@ def a_number(
     """Return a value as a float if it is a finite number within bounds, or raise `error`.
 
     Args:
+        name: The name of the argument in messages.
+        value: The value to check.
         error: The class of the error to raise.
         low: The least number allowed.
         high: The greatest number allowed.

@@ -145,6 +145,7 @@ class Corrections:
         A second name of a place is for the second step there, as a step has one name.
 
         Args:
+            ssh_map: The map whose places, paths and regions have names.
             drives: The drives of its trace.
 
         Raises:
@@ -172,6 +173,7 @@ class Corrections:
         """Name the place, path or region of a step. An earlier name for this step is replaced.
 
         Args:
+            name: The new name.
             kind: "place", "path" or "region".
             step: The step, such as "monday:12".
 
@@ -347,6 +349,7 @@ class Corrections:
         If two names are of one place of this map, the map has both, and shows the first one.
 
         Args:
+            ssh_map: The map that gets the names.
             drives: The drives of its trace.
         """
         checked_map(ssh_map)

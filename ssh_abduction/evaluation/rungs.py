@@ -144,6 +144,7 @@ def ladder(
     """Solve a trace with one theory after the other, each with one more kind of evidence.
 
     Args:
+        trace: The trace. Its truth, if it has one, is used to evaluate the maps.
         theory: The theory to start from; Theory.topological() by default. The ladder replaces what
             it says about stars, displacements and planarity.
         time_limit: Seconds for each rung; None for no limit.

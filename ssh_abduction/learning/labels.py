@@ -51,6 +51,7 @@ def labels_of(
     false, or if `proven` is false.
 
     Args:
+        maps: The minimal maps of one trace.
         choose: Index of the map to take, from 0; None takes the labels on which all maps agree.
         complete: Whether `maps` are all minimal maps.
         proven: Whether `maps` are proven minimal.

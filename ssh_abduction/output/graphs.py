@@ -48,6 +48,7 @@ def to_networkx(
     places have the ids of their regions as the attribute regions.
 
     Args:
+        ssh_map: The map.
         level: The kind of graph: "causal", "topological" or "places".
         turns: How actions turn, as in `to_svg`. It decides the positions of "places" if the map has
             no poses.

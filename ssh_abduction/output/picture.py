@@ -46,6 +46,7 @@ def to_svg(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> str:
     """Draw a map as SVG text: to scale if it has poses, else with straight paths.
 
     Args:
+        ssh_map: The map.
         turns: How actions turn, for a map without poses: the trace that was mapped; or a dict from
             the name of an action to "right", "left", "around" or degrees clockwise. Actions that
             are themselves named right, left or around need no entry.

@@ -24,6 +24,7 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
     """Draw a map with matplotlib, with x to the right and y up; in metres if it has poses.
 
     Args:
+        ssh_map: The map.
         ax: The matplotlib axes to draw into; None for new ones.
         turns: How actions turn, as in `to_svg`.
 

@@ -79,6 +79,7 @@ def shortest_flow(
     flow is solved again, as Dantzig, Fulkerson & Johnson (1954) did for the travelling salesman.
 
     Args:
+        moves: The moves that the robot can make between stances.
         start: The number of the stance where the robot is.
         due: Indices of the moves that the walk has to make.
         unseen: Numbers of the stances that the walk has to visit.

@@ -155,7 +155,7 @@ def _about_faults(maps: Sequence[SSHMap]) -> dict[bytes, AnsweredQuestion]:
 
 
 def _key(column: Bools) -> bytes:
-    """Compute a key of answers. Equal columns and opposite columns have the same key."""
+    """Return a key for the answer of each map. The opposite answers have the same key."""
     return np.packbits(column ^ column[0]).tobytes()
 
 

@@ -58,6 +58,7 @@ def next_tour(
 
     Args:
         ssh_map: A minimal map of the trace.
+        trace: The trace that was mapped.
         theory: The theory of the map; Theory.topological() if None.
         actions: Actions that the robot can do, in addition to those of the trace.
         can: A function from what the robot sees to the names of the actions that it can do there.

@@ -47,6 +47,7 @@ class Overlap:
         """Find the drives that closures connect.
 
         Args:
+            trace: The trace of all drives.
             theory: The theory, which sets the price.
         """
         starts = starts_of(trace)

@@ -235,6 +235,7 @@ class Theory:
         Args:
             kind: misread (the view is wrong), misseen (the star), slipped (the action done there),
                 jumped (the displacement that led there), or changed (one gateway).
+            step: The step that has the fault.
         """
         one_of("kind", kind, FAULTS, TheoryError)
         _checked_step(step)
@@ -318,6 +319,7 @@ class Theory:
         """Check that a step has what the axioms need. `star` must not be auto.
 
         Args:
+            step: The step to check.
             where: The name of the step in messages.
 
         Raises:

@@ -202,6 +202,7 @@ def draw_telling(
     column.
 
     Args:
+        path: The file to write.
         ranges: Ranges in metres, of shape (n, d), over the half circle ahead, the first at the
             right.
         labels: The dstate of each scan, of shape (n,).

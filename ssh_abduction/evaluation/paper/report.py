@@ -57,6 +57,7 @@ def reproduce(
     """Run an experiment for all seeds, and write everything into a folder.
 
     Args:
+        name: The experiment: "notched-rectangle" or "taylor-hall".
         seeds: The seeds of all noise.
         folder: The folder to write into. It is made if it does not exist.
         jobs: The number of processes that work at once; -1 for one per processor.

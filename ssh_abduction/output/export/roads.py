@@ -112,6 +112,7 @@ class Roads:
         """Make the stops and roads of a map.
 
         Args:
+            ssh_map: The map.
             level: What a stop is. With "dstates", each link is a road. With "places", the robot's
                 travels between two places, in either direction, make a road in each direction.
             turns: How actions turn, as in `to_svg`.

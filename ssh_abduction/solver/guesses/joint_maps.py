@@ -292,7 +292,7 @@ class Joining:
         return next((part for part in joined if part and self._map(part)), None)
 
     def _otherwise(self, part: Part) -> Iterator[Part]:
-        """Yield the cheapest other ways to join the drives of a part, without closures."""
+        """Yield parts with the same drives, joined in the next cheapest ways without closures."""
         ways = [
             (nats, pair, way)
             for pair, found in self._laid.items()

@@ -96,7 +96,7 @@ class Log:
 
     @property
     def has_pairs(self) -> bool:
-        """Whether the evidence about pairs of steps is found already."""
+        """Whether the pairs of steps that evidence decides have already been computed."""
         return self._pairs is not None
 
     def replay(

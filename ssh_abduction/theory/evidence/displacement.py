@@ -105,6 +105,8 @@ class Displacement(Evidence):
         the theory allows no wrong displacement.
 
         Args:
+            trace: The trace that was mapped.
+            returns: Returns that contradict the displacements.
             wrong: The steps whose displacements the map treats as wrong.
         """
         if not self.may_be_wrong:
