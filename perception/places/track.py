@@ -139,7 +139,7 @@ def points_moved(pose: Pose | Array, points: Array) -> Array:
 
 
 def odometer_covariance(onward: Pose) -> Array:
-    """Compute the covariance, (3, 3), of a motion in metres and radians by a typical odometer."""
+    """Compute the covariance, (3, 3), of a motion in metres and radians, for a typical odometer."""
     way = math.hypot(onward[0], onward[1])
     along, across = OFFSET + WAY * way, OFFSET + WAY * way / 2
     heading = ANGLE + TURNING * abs(onward[2]) + DRIFT * way

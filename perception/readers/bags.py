@@ -12,8 +12,8 @@ MultiEchoLaserScan), the odometer's poses (nav_msgs/Odometry), and the transform
 - If there are transforms from `map` to `odom`, the robot was localised, and the scans have
   corrected poses.
 
-Times come from the headers of the messages. If these times contradict themselves or each other, the
-times of recording are used (`poses`).
+Times come from the headers of the messages. If these times are out of order, or do not fit those of
+other messages, the times of recording are used (`poses.py`).
 """
 
 from __future__ import annotations

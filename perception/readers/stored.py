@@ -80,7 +80,7 @@ class ScanTable(Sequence[Scan]):
         self._rows.extend(self._row(scan))
 
     def _row(self, scan: Scan) -> tuple[float, ...]:
-        """Keep the ranges of a scan, and make its row."""
+        """Store the ranges of a scan in a chunk. Return its other numbers, as a row for `_rows`."""
         size, chunk, begin = len(scan.ranges), -1, 0
         if scan.ranges is not _unknown(size):
             if not self._chunks or self._used + size > len(self._chunks[-1]):

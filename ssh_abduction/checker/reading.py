@@ -254,7 +254,7 @@ class Order:
         return []
 
     def allows(self, ring: Sequence[int]) -> bool:
-        """Tell whether the axioms let these places follow each other in a ring."""
+        """Whether the axioms allow that each of these places comes before the next, all round."""
         return not self._asymmetric or (not self._transitive and len(ring) > 2)
 
     def after(self, p: int, direction: int) -> Iterable[int]:

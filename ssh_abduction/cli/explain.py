@@ -74,11 +74,11 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add(
         "steps",
-        "two steps, to learn why they are one dstate or two: their numbers, from 0, or "
-        "DRIVE:STEP in a joint trace. A place and a path, such as p7 path2, to learn on which side "
-        "of the path the place lies. A place alone, to learn this of all paths, and in which "
-        "regions it is. Places and paths are those of the first minimal map or, with a file of "
-        "maps, of its first map; there, names work, too. Nothing, to learn why there is no map",
+        "what to explain. Two steps (numbers from 0, or DRIVE:STEP in a joint trace): why they are "
+        "one dstate or two. A place and a path, such as p7 path2: on which side of the path the "
+        "place lies. A place alone: its side of each path, and its regions. Nothing: why the trace "
+        "has no map. Numbers of places and paths are those of the first minimal map, or of the "
+        "first map in a file of maps. In a file, places and paths may also be given by name",
         nargs="*",
         default=(),
         metavar="step",

@@ -33,8 +33,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "--time-limit S",
         "seconds for the search (default: a twentieth of the time that the robot drove, less the "
-        "time for the import, but at least 30). Without this option, a search that has no map "
-        "after this time goes on for up to 64 times as long",
+        "time for the import, and less a quarter of the rest for the ladder; at least 30). Without "
+        "this option, a search that has no map after this time goes on for up to 64 times as long",
         type=float,
     )
     said = (

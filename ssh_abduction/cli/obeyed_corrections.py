@@ -182,7 +182,7 @@ class Obeying:
 
 
 def misreading(theory: Theory) -> Theory | None:
-    """Return the theory with misread views and stars; None if it has or refuses them."""
+    """Return the theory with misread views and stars; None if it allows or cannot allow them."""
     with contextlib.suppress(TheoryError):
         return None if theory.misread else theory.replace(misread=4)
     return None

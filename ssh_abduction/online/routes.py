@@ -391,7 +391,7 @@ class Leg:
         return self.in_words(named_by_number)
 
     def in_words(self, called: Callable[[str, int], str]) -> str:
-        """Say what to do. `called` puts a kind and a number into words, as `SSHMap.called`."""
+        """Say what to do. `called` puts a kind and a number into words, as `SSHMap.called` does."""
         if self.region is not None and self.door is not None:
             return (
                 f"{self.move} {called('region', self.region)} through {called('place', self.door)}"

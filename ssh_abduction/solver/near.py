@@ -67,5 +67,5 @@ class NearMinimal:
 
 
 def counted_first(theory: Theory) -> Count | None:
-    """Return the first count but excuses that a theory minimises (see `Cost`), if there is one."""
+    """Return the first count that a theory minimises, apart from excuses; None if there is none."""
     return next((name for name in theory.priorities if name != "excuses"), None)

@@ -283,9 +283,9 @@ class Theory:
     def demands(self) -> frozenset[str]:
         """The names of all that a speed-up must respect.
 
-        These are the names of hard axioms, and "NAME, excusable" for each other axiom; "asserted
-        same" if steps are asserted to be one dstate; "the rules of FILE" for the user's rules; and
-        "the field NAME" for each changed field that no axiom covers.
+        A hard axiom has its own name, and each other axiom "NAME, excusable". Steps that are said
+        to be one dstate give "asserted same", and the user's rules "the rules of FILE". A changed
+        field that no axiom covers gives "the field NAME".
         """
         excusable = {f"{name}, excusable" for name in set(self.axioms) - self.hard}
         asserted = {"asserted same"} if self.same else set()

@@ -361,7 +361,7 @@ def _are_steps(values: Sequence[Any], steps: int) -> bool:
 
 
 def _split(together: Iterable[Pair], parts: Mapping[int, Sequence[int]]) -> Iterator[Pair]:
-    """Replace each pair of old classes by all pairs of their parts, the smaller part first."""
+    """Replace each pair of old classes by all pairs of their parts, the lower number first."""
     for i, j in together:
         for a in parts[i]:
             for b in parts[j]:
