@@ -34,7 +34,7 @@ TINY = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class RecordedDrive:
-    """A completed drive."""
+    """A completed drive of a simulated robot: its scans, its odometry and its true poses."""
 
     name: str  # name of the drive
     # (n, beams) metres; infinite if the laser saw nothing within its reach.

@@ -113,7 +113,7 @@ def add_parser(verbs: Verbs) -> None:
         "also check the other claims of the file: the proof that no map has fewer dstates, the "
         "fits of maps, and what all maps share",
     )
-    parser.add("--json", "print JSON")
+    parser.add("--json", "print the answer as JSON")
     add_theory(parser, default="the theory of the maps, or topological")
 
 

@@ -49,7 +49,7 @@ def add_parser(verbs: Verbs) -> None:
         nargs=2,
         metavar=("I", "J"),
     )
-    parser.add("--json", "print JSON")
+    parser.add("--json", "print the answer as JSON")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -57,7 +57,7 @@ def add_parser(verbs: Verbs) -> None:
         "judge by the robot's true trajectory in this file, in TUM format: lines of timestamp "
         "tx ty tz qx qy qz qw",
     )
-    parser.add("--json", "print JSON")
+    parser.add("--json", "print the answer as JSON")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -87,7 +87,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add(
         "--plot PNG", "draw into this file how unsure the belief is at each step", type=picture_file
     )
-    parser.add("--json", "print JSON")
+    parser.add("--json", "print the answer as JSON")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -56,7 +56,7 @@ def add_parser(verbs: Verbs) -> None:
     add_maps(parser)
     add_trace(parser)
     add_limits(parser, "the best plan so far")
-    parser.add("--json", "print JSON")
+    parser.add("--json", "print the answer as JSON")
     add_theory(parser, default="the theory in the file of maps")
 
 

@@ -45,7 +45,7 @@ def add_parser(verbs: Verbs) -> None:
         default="actions",
     )
     add_map(parser)
-    parser.add("--json", "print JSON")
+    parser.add("--json", "print the answer as JSON")
 
 
 def run(options: argparse.Namespace) -> int:

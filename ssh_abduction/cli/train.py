@@ -49,7 +49,7 @@ def add_parser(verbs: Verbs) -> None:
     said = "random seed of the division into training and test images (default: 0)"
     curve.add("--seed", said, type=seed, default=0)
     curve.add("--plot PNG", "draw the learning curve into this file", type=picture_file)
-    curve.add("--json", "print JSON")
+    curve.add("--json", "print the learning curve as JSON")
     apart = verbs.add(
         "tell-apart",
         run_tell_apart,
