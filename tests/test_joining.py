@@ -40,7 +40,7 @@ from ssh_abduction.theory.settle import Problem, settle
 
 NOISE = truth.Noise(Odometry(**truth.NOISE))
 # Joining was developed on seeds below 100.
-MAZES = [*of_mazes(4, 60, range(310, 312), NOISE)]
+MAZES = [*of_mazes(4, 40, range(310, 312), NOISE)]
 
 
 def joined(problem: Problem) -> list[SSHMap]:
