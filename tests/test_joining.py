@@ -412,7 +412,7 @@ def test_laying_costs_more_where_most_steps_look_alike(
     trace, theory = along(views, views[:6]), Theory(boundary="none")
     assert settle(trace, theory).overlap.price == pytest.approx(price)
     free, joint = (
-        solve(trace, theory.replace(same=pairs), time_limit=0.3)
+        solve(trace, theory.replace(same=pairs), time_limit=0.5)
         for pairs in ((), ((0, len(views)),))
     )
     assert len(free.maps[0].pieces) == pieces
