@@ -272,6 +272,7 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
             f"logs have 2 % at most. It is {track.way[-1]:.0f} m long. The map may be "
             f"wrong.{'' if explained and not _has_few_beams(log) else f' Do this: {advice(log)}.'}"
         )
+    # If matching fails in much of the log, single contradictions say nothing more.
     elif contradictions := _contradictions(log, track):
         notes.append(
             f"The scans before and after scan {contradictions[0]} (line or message "

@@ -212,6 +212,7 @@ def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
     without_stars = kind == "misseen" and m.theory.star not in ("pattern", "frame")
     if not _is_allowed(m, kind) or without_stars:
         return f"The map disbelieves step {i} ({kind}), which the theory does not allow."
+    # There must be a step, and something at it that may be wrong.
     step = m.trace.steps[i] if 0 <= i < min(len(m.trace), len(m.map.dstate_at)) else None
     if (
         step is None

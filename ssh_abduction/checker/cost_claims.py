@@ -103,6 +103,8 @@ def false_costs(
         )
     if len(trace) > LONGEST:
         return
+    # The cost of map 1, and of the rivals that can be checked in time. If a map has no places, its
+    # dstates stand for them.
     places = [maps[0].dstates[label].place for label in maps[0].dstate_at]
     here = [p if p is not None else s for p, s in zip(places, maps[0].dstate_at, strict=True)]
     of_map: Faults = [(fault.kind, fault.step) for fault in maps[0].faults]

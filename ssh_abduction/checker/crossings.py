@@ -140,6 +140,7 @@ class Edges:
             for s, t in self.travels
         }
         ends = [choose(edge, key=repr) for edge in edges for choose in (min, max)]
+        # All clockwise orders of the gateways of a place that agree with its turns.
         orders = {
             p: clockwise_orders(
                 sorted({arm for arms in sequences[p] for arm in arms}, key=repr),

@@ -139,6 +139,7 @@ class Obeying:
                 f"{source}: {sentence}: perhaps it contradicts the trace"
                 for sentence in (*said.pairs, *said.gateways)
             ]
+        # Drop corrections one by one, as long as there is still no map. Those left clash.
         stretch = range(explanation.first, explanation.last + 1)
         kept = replace(said, pairs=(), gateways=())
         if self._has_no_map(kept, stretch):

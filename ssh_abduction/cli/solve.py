@@ -146,6 +146,7 @@ def run(options: argparse.Namespace) -> int:
         from ssh_abduction.cli import solve_onto
 
         return solve_onto.run(options)
+    # Many traces are solved each by itself, by `batch`.
     many = options.jobs is not None or options.scheduler is not None
     alone = many or (len(options.traces) > 1 and not options.together)
     if options.corrections is not None and (alone or options.front is not None):

@@ -26,6 +26,7 @@ def run(options: argparse.Namespace) -> int:
     existing = Solution.load(options.onto)
     trace = together([Trace.load(path) for path in options.traces])
     said = corrections_of(options)
+    # Steps of options such as --same are named by the drives of the old and the new traces.
     if existing.trace is not None:
         number_steps(options, together([existing.trace, trace]))
     solution = solve(

@@ -241,6 +241,7 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
         raise TraceError("traces: expected at least one trace, got none; give the traces to join")
     called = _names(parts, names)
     _check_alike(parts, called)
+    # Traces with different noise models get the covariance of each step, as a trace has one model.
     if len({model for trace in parts if (model := _odometry(trace))}) > 1:
         parts = tuple(map(_with_covariances, parts))
     drives = [trace.steps[d.first : d.stop] for trace in parts for d in drives_of(trace)]

@@ -131,7 +131,8 @@ def next_experiment(
     if can is not None:
         a_function("can", can, MapError, what="a function of what is seen")
     if watch is not None:
-        an_instance("watch", watch, Watch, MapError, mend="leave it out, and give limit and memory")
+        mend = "leave it out, and give time_limit and memory_limit"
+        an_instance("watch", watch, Watch, MapError, mend=mend)
     extra = [Action.of(action) for action in a_list("actions", actions, MapError)]
     if isinstance(maps, Solution):
         theory, complete, maps = theory or maps.theory, maps.complete, maps.maps

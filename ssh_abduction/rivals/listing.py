@@ -175,6 +175,7 @@ class Listing:
         """
         a_text("where", where, MapError)
         maps = tuple(ssh_map.renumbered() for ssh_map in maps_of(data, where))
+        # A file with a single map has no fields of an answer.
         answer: Mapping[str, Any] = data if isinstance(data, Mapping) and "maps" in data else {}
         _check_listed(maps, answer.get("maps", [data]), answer, where)
         theory = theory_in(answer["theory"], where) if "theory" in answer else None
@@ -191,6 +192,7 @@ class Listing:
         steps, backbone = len(maps[0].dstate_at) if maps else 0, None
         if maps and "backbone" in answer:
             backbone = Backbone.from_dict(answer["backbone"], steps, f"{where}: backbone")
+        # If larger maps follow the minimal ones of an optimal answer, all minimal ones are listed.
         is_optimal = status == Status.OPTIMAL.value
         listed = complete or (minimal < len(maps)) if is_optimal else complete
         read = FieldReader(where)

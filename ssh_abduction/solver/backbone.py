@@ -145,6 +145,7 @@ class _Reasoning:
                     found = self._differing_map(settled, replayed.labels)
                 if failed or refused:
                     break
+            # Evidence refuses the map: forbid it. Or it fails at a later step: give further steps.
             if refused:
                 of_prefix = all(
                     max(equality.first, equality.second) < engine.size for equality in refused

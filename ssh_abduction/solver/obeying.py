@@ -125,6 +125,7 @@ def _contradictions(
     said, found = corrections.known_in(drives), solution
     unit = 90 if solution.theory.star == "frame" else 1
     doubted = [(p, d) for p in said.gateways for d in drives]
+    # With stars, solve again without the corrections of gateways, to see what they prevent.
     if solution.theory.star != "none":
         seen = replace(trace, steps=tuple(step.as_seen() for step in trace.steps))
         doubted = [(p, d) for p, d in doubted if _may_keep_out(p, d, seen, ssh_map)]

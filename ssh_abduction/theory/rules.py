@@ -59,6 +59,7 @@ class Rules:
             )
         text = self.text.removeprefix("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
         object.__setattr__(self, "text", text)
+        # Clingo stops at characters outside of ASCII, and at NUL, without naming the line.
         stray = text.find("\0")
         if stray < 0:
             stray = _stray(text)

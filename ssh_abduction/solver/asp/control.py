@@ -267,6 +267,7 @@ class Asker:
         configuration.opt_mode, configuration.models = mode, models
         configuration.project = "no" if mode.partition(",")[0] == "opt" else "project"
         configuration.solve_limit = f"{conflicts},-1"
+        # Nothing can stop clasp while it prepares the program. So check first that time is left.
         self.watch.check(
             control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes
         )

@@ -472,6 +472,7 @@ class Forcing:
             low = self._price(classes.counts) + misfit
             if low >= most:
                 return joins, low, []
+            # Of each two classes that may join, keep the pair of visits with the highest bound.
             left = dict[tuple[int, int], tuple[int, int]]()
             for i, j in self._pairs:
                 a, b = int(joins[i]), int(joins[j])
@@ -480,6 +481,7 @@ class Forcing:
                     if known.get((i, j), 0.0) > known.get(best, 0.0):
                         left[min(a, b), max(a, b)] = (i, j)
             worth = {pair: known.get(pair, 0.0) for pair in left.values()}
+            # Compute bounds only if no known bound forces a join, as computing them takes long.
             if not any(price + misfit >= most for price in worth.values()):
                 for (a, b), pair in left.items():
                     look_at_clock()

@@ -177,6 +177,7 @@ def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> li
         tenths = [theory.fault_tenths("misread", step) if theory.misread else 0 for step in steps]
         fees = np.array([dstate * price / 10 or math.inf for price in tenths])
         fees[[step.view is None for step in steps]] = 0.0
+    # Dstates and places share the scatter of positions, so that nothing is paid twice.
     weights = np.array([1 - PLACES * has_places] * 2 + [1.0])
     scatter = track.scatter / weights
     apart, away = (
@@ -185,6 +186,7 @@ def _parts(problem: Problem, track: _LinearTrack, visit: NDArray[np.int_]) -> li
     own = track.piece, track.moves, apart
     parts = [_MovedPoints(track.poses, scatter, kinds, fees, dstate, *own)]
     if has_places:
+        # The point of a visit is the mean of its steps.
         together = np.column_stack([visit, track.piece])
         _, first, at, count = np.unique(
             together, axis=0, return_index=True, return_inverse=True, return_counts=True

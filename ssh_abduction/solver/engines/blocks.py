@@ -187,6 +187,7 @@ class Blocks:
         if proven is None or proven[0] < most or proven[1] < tenths:
             seen, actions = self.seen[begin:end], self.actions[begin : end - 1]
             price = {kind: found[begin:end] for kind, found in self.price.items()}
+            # Near guessed faults, an answer names the dstate even of a misread step.
             full = {
                 t + near - begin
                 for found in self.faults.values()

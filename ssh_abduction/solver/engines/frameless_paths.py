@@ -165,6 +165,7 @@ class PlacesAndPaths:
             homes = homes_of(known)
             if homes is not None:
                 _go_on_at_home(control, homes, (*PARTS, *EACH))
+        # This fails if some place cannot be fixed. Then the general search decides.
         best = None if homes is None else self._best_at_home(labels, control, fewest_paths(known))
         if best is None or homes is None:
             self._failed.add(key)

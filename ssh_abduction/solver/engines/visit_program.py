@@ -86,6 +86,7 @@ class VisitProgram:
         """
         control, known = self._asker.control, self.known
         if self.batch >= 0:
+            # Answers are now listed up to the new batch.
             control.release_external(visits_lp.listing_atom(self.batch))
         self.chart = chart
         self.batch += 1
@@ -108,6 +109,7 @@ class VisitProgram:
             if turn not in known.turns and chart.facing[turn[0]][0] in visits
         ]
         known.turns.update(turns)
+        # More of the trace may separate visits that fitted before.
         new, unfit = sorted(fits - known.fits), sorted(known.fits - fits)
         known.fits = fits
         joined = sorted(self._joined() - known.joined)

@@ -324,6 +324,7 @@ class Poses:
     def _jacobian(self, unknown: Array) -> Any:
         """Compute the derivative of the residuals with respect to the unknowns."""
         predicted, cos, sin = self._predicted(unknown)
+        # Unknowns are the positions of places (two each), the headings of dstates, scale and drift.
         scale = 1 + unknown[-2] * self._sigma[0] * self._scaled
         m, heading = len(self._moved), 2 * self._positions
         zero, turn = np.zeros(m), np.tile([0.0, 0.0, 1.0], (m, 1))
@@ -349,6 +350,7 @@ class Poses:
             np.einsum("nij,nj->ni", self._whitening, derivative).ravel()
             for _, derivative in columns
         ]
+        # Scale and drift have a prior each: a last row with a single 1.
         priors = np.arange(2)
         entries = (
             np.concatenate([*values, np.ones(2)]),

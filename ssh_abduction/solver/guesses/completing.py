@@ -69,6 +69,7 @@ def completed(
     bare = SSHMap(tuple(labels), dstates, listed, tuple(sorted(set(places))))
     if "travel_follows_path" not in theory.axioms:
         return bare.renumbered()
+    # Headings need paths. Then opposite headings may join paths, so paths are found again.
     courses = _courses(bare, trace, theory, ())
     facing_of = None if courses is None else _facing(_on(bare, courses), trace, theory, facing)
     courses = _courses(bare, trace, theory, facing_of.opposite) if facing_of else None
@@ -178,11 +179,13 @@ def _courses(
     founded = {s for pair in travels for s in pair}
     if theory.all_on_paths:
         founded = {s.id for s in ssh_map.dstates}
+    # A turn around puts both of its dstates on a path if one of them is on a path.
     grows = True
     while grows:
         more = {s for pair in around if founded & set(pair) for s in pair} - founded
         founded |= more
         grows = bool(more)
+    # Neighbours of a dstate on its path, with -1 if they face the other way.
     beside: dict[int, list[tuple[int, int]]] = defaultdict(list)
     for pairs, sign in ((travels, 1), (around, -1), (opposite, -1)):
         for s, x in pairs:
@@ -223,6 +226,7 @@ def _orders(
             path, direction = courses[here]
             first, second = (place[here], place[there])[::direction]
             before[path][second].add(first)
+    # The place at an end comes before, or after, all other places of the path.
     for here, towards in ends:
         if here in courses:
             path, direction = courses[here]

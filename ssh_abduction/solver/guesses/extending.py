@@ -232,6 +232,7 @@ class Extending:
             None if place is None else position[place],
             None if there is None else heading[there],
         )
+        # Lists are copied, because other hypotheses share those of the old one.
         if place is None:
             place = len(position)
             position, sights = [*position, n], [*sights, self.sights.shown[t]]
@@ -247,6 +248,7 @@ class Extending:
         number, links = self.sights.seen[t], moved.links
         if t and not moved.slips(t):
             links = {**links, (moved.labels[-1], self._log.actions[t - 1]): there}
+        # If views may be misread, each step adds its doubt. Otherwise, each view counts once.
         if number not in seen[there] or "misread" in self.fault:
             doubt = self._doubt(t) + seen[there].get(number, 0.0)
             seen = [*seen[:there], {**seen[there], number: doubt}, *seen[there + 1 :]]

@@ -123,6 +123,7 @@ class Joining:
             (first, second): self._anchors(first, second)
             for first, second in combinations(alone, 2)
         }
+        # The first join decides which others fit. So begin with each of the best pairs.
         starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
         joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
         best = min(joined, key=self._nats_of, default=alone)
@@ -131,6 +132,7 @@ class Joining:
             best = min(mended, key=self._nats_of)
         if len(best) < len(alone):
             yield from self._beside(alone)
+        # Rivals of the best map: two more pieces joined, and drives laid in other ways.
         dearer = []
         for two in combinations(best, 2):
             pair = two[::-1] if two[::-1] in self._laid else two

@@ -273,6 +273,7 @@ class Weighed:
         elif self.searched and not self.proven:
             least = math.floor(100 * self.bound / self.nats)
             text += f" (not proven: no map costs less than {least} % of this one)"
+        # Name one pair of steps: the one for which it is least sure whether they are one dstate.
         doubted = 1 - self.joins[0][2] if self.joins else 0.0
         if self.missed and self.missed[2] > max(doubted, DOUBTED):
             first, second, probability = self.missed

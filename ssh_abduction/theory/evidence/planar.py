@@ -294,6 +294,7 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
             clockwise[shown.places[x]].append(
                 [same.of(arm) for arm in arms_there if crossing or arm != (y, BACK)]
             )
+    # An edge from a gateway to itself has one end, which counts twice.
     ends = [end for edge in edges for end in tuple(edge) * (3 - len(edge))]
 
     @cache

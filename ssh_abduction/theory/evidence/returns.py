@@ -320,6 +320,7 @@ class Returns:
         """
         names = names or named_steps(drives_of(self.trace), len(self.trace))
         named = f"steps {names[first]} and {names[last]}"
+        # Places are compared by the first steps of their visits.
         i, j = self._begin_of_visit(first), self._begin_of_visit(last)
         if i in self.pairs.elsewhere.get(j, ()):
             they = (

@@ -81,6 +81,7 @@ def _map(
     heading of each step, if places have frames or gateways. `before` has triples of a path and two
     places on it, the earlier one first. The theory has the costs of faults.
     """
+    # Atoms name things by steps. A map numbers them from 0, in the order of these names.
     views = views_of(is_at, trace, faults)
     names = sorted(set(is_at.values()))
     dstate_of = {name: i for i, name in enumerate(names)}

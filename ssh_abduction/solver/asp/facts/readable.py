@@ -143,6 +143,7 @@ def _gateway_facts(trace: Trace, start: int, stop: int, *, changes: bool) -> Ite
         yield f"slots({x},{max(frame.slots, 1)})."
         yield from (f"closed({x},{k})." for k in range(frame.slots) if frame.is_closed(k))
         yield from (f"ends({x},{way})." for way in frames.ends(frame))
+    # Pairs of two known frames were given with earlier steps.
     for x, y in product(range(len(found.frames)), repeat=2):
         for shift in found.fits(x, y) if max(x, y) >= known else ():
             yield f"fits({x},{y},{shift})."
