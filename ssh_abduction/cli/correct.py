@@ -20,8 +20,10 @@ from ssh_abduction.theory.theory import Theory
 HELPS = {
     "same": "steps I and J, such as monday:12,tuesday:3, are one dstate",
     "different": "steps I and J are different dstates",
-    "elsewhere": "I and J, steps or places such as p4 or kitchen, are different places",
-    "same_place": "I and J, named as with --elsewhere, are one place",
+    "elsewhere": (
+        "steps I and J are at different places; I and J may also be places, such as p4 or kitchen"
+    ),
+    "same_place": "steps I and J are at one place; I and J may also be places, as with --elsewhere",
     "open": (
         "a gateway is open: a place and a direction on the drawn map, such as 'kitchen north', or "
         "a step and a direction from the robot, such as 'monday:12 left'"

@@ -109,7 +109,7 @@ def map_of_part(trace: Trace, theory: Theory, part: Part) -> SSHMap | None:
 def _on(
     ssh_map: SSHMap, courses: Mapping[int, _Course], headings: Mapping[int, int] | None = None
 ) -> SSHMap:
-    """Return a map with the given paths, directions and headings (slots); None for the others."""
+    """Return a map in which dstates have these paths, directions and headings; others have None."""
     dstates = []
     for s in ssh_map.dstates:
         path, direction = courses.get(s.id, (None, None))
