@@ -109,7 +109,7 @@ class ErrorFilter:
         return covariance
 
     def repeated_since(self, first: Any, last: Any) -> Array:
-        """The closing errors that one standard deviation of scale, or of drift, causes, (m, 3, 2)."""
+        """The closing errors of one standard deviation of scale, and of drift: (m, 3, 2)."""
         moved: Array = (
             self.repeated[last] - self.onward(first, last) @ self.repeated[first]
         ) * self.sigma
