@@ -21,7 +21,9 @@ from perception.errors import LogError
 from perception.places.closures import VisitMatch
 from perception.places.importing import Imported, import_log
 from perception.places.joining import join_logs
-from perception.places.unrelated import agreeing_matches
+from perception.places.local_map import CELL, Patch
+from perception.places.matching import Match, Scene
+from perception.places.unrelated import agreeing_matches, without_clashes
 from perception.readers.scans import RobotLog
 from perception.readers.writers import write_carmen
 from simulator.tours import record
@@ -186,6 +188,24 @@ def test_relations_of_three_drives_agree() -> None:
     # Without the third drive, nothing says which relation is right.
     assert agreeing_matches(drives, {(1, 2): wrong}) == {(1, 2): wrong}
     assert agreeing_matches(drives, {(1, 2): wrong + right}) == {(1, 2): []}
+
+
+def test_relation_that_puts_walls_into_free_space_does_not_count() -> None:
+    """Of three rooms in a row, the first two look alike, and the last one is wider."""
+    poses = np.array([(8.0 * k, 0.0, 0.0) for k in range(3)])
+    rooms = []
+    for half in (20, 20, 30):
+        rows, columns = np.indices((101, 101)) - 50
+        far = np.maximum(abs(rows), abs(columns))
+        corner = np.array([-50 * CELL, -50 * CELL])
+        rooms.append(Scene.of(Patch(far < half, far == half, far < 0, corner), np.zeros(2)))
+
+    def matched(first: int, last: int) -> VisitMatch:
+        return VisitMatch(first, last, Match(1.0, 0.0, np.zeros(2), 1.0, 0.1))
+
+    right, wrong = [matched(k, k) for k in range(3)], [matched(k + 1, k) for k in range(2)]
+    assert without_clashes([*wrong, *right], rooms, rooms, poses, poses) == right
+    assert without_clashes(wrong, rooms, rooms, poses, poses) == []
 
 
 def test_join_logs_keeps_a_single_log(

@@ -36,6 +36,8 @@ CLASH, CLEAR = 0.5, 0.3
 # A score is divided by the number of wall points that the other map observed, but at least by this
 # share of all wall points. So maps that hardly overlap do not match.
 OVERLAP = 0.3
+# Fewer wall points than this, where the other map observed anything, say nothing about a clash.
+FEW = 20
 # A match is refined only if its coarse score is at least HOPELESS, and if the standard deviation of
 # its shift is less than SPREAD metres. A larger deviation means that very different shifts match
 # equally well.
@@ -128,6 +130,21 @@ class Scene:
         """
         codes = self.codes.ravel()[self.cells(points)]
         return _SHARP[codes].sum(axis=1), (codes & 1).sum(axis=1)
+
+    def clash(self, other: Scene, turn: float, shift: Array) -> float | None:
+        """The share of the wall points of each scene that lie in free space of the other one.
+
+        The other one is rotated by `turn` radians, and its middle is shifted by `shift` metres.
+        None if less than a few wall points lie where the other scene observed anything.
+        """
+        codes = np.concatenate(
+            [
+                self.codes.ravel()[self.cells(points_turned(turn, other.walls).T + shift[:, None])],
+                other.codes.ravel()[other.cells(points_turned(-turn, self.walls - shift).T)],
+            ]
+        )
+        seen = codes[codes & 1 > 0]
+        return float((_far[seen] > CLEAR).mean()) if len(seen) >= FEW else None
 
     def mutual(self, other: Scene, turn: float, shift: Array) -> float:
         """The area that both scenes observed, as a share of the smaller one.

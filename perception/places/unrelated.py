@@ -3,7 +3,8 @@
 Each pair of visits is matched in all rotations, and each reliable match says how the frames relate.
 Before that, the poses of the visits of each drive are fitted to its own closures, as a drift bends
 the track. Places look alike, so a match counts only if at least VOTES visits of the second drive
-agree on one relation, and no other relation has more than half as many.
+agree on one relation, and no other relation has more than half as many. A relation that puts walls
+seen by one drive where the other one saw free space does not count.
 
 Relations of three drives form a loop. The two relations on which most visits agree say what the
 third one is. If no match of the third relation agrees with them, it is not believed.
@@ -17,6 +18,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, combinations
+from statistics import median
 
 import numpy as np
 
@@ -32,6 +34,10 @@ from ssh_abduction.data.groups import gathered
 NEAR, DRIFT, TWIST = 0.7, 0.05, math.radians(10)
 VOTES = 3
 TURNS = [k * TURN for k in range(round(math.tau / TURN))]
+# A relation puts visits of two drives near each other. It clashes if, for most pairs of visits at
+# most BESIDE metres apart, more than the share CLASHING of the wall points of the two visits lies
+# in free space of the other one.
+BESIDE, CLASHING = 6.0, 0.1
 # Of a drive with cuts, at most this many visits are matched, as the time grows with the square.
 MATCHED = 200
 
@@ -46,7 +52,12 @@ def closures_between(
     scenes = [scenes_of(visits) for visits in drives]
     counts = [0, *accumulate(len(visits) for visits in drives)]
     pairs = [*combinations(range(len(drives)), 2)]
-    found = {(a, b): _reliable_matches(scenes[a], scenes[b]) for a, b in pairs}
+    found = {
+        (a, b): without_clashes(
+            _reliable_matches(scenes[a], scenes[b]), scenes[a], scenes[b], poses[a], poses[b]
+        )
+        for a, b in pairs
+    }
     for (a, b), agreed in agreeing_matches(poses, found).items():
         for closing in _best_of_each_visit(agreed):
             yield replace(closing, first=closing.first + counts[a], last=closing.last + counts[b])
@@ -135,6 +146,56 @@ def agreeing_matches(
             frames[a, b] = _relations(agreed[a, b], poses[a], poses[b])
             frames[b, a] = frames[a, b].inverse()
     return agreed
+
+
+def without_clashes(
+    found: Sequence[VisitMatch],
+    ours: Sequence[Scene],
+    theirs: Sequence[Scene],
+    first: Array,
+    last: Array,
+) -> list[VisitMatch]:
+    """Drop the matches of relations that put walls of one drive into free space of the other.
+
+    `first` and `last` have the poses of the visits of each drive, (n, 3).
+    """
+    relations, visits = _relations(found, first, last), [one.last for one in found]
+    sets = [relations.agreeing(k) for k in range(len(found))]
+    votes = [len({visits[k] for k in np.flatnonzero(mask)}) for mask in sets]
+    judged, kept = np.zeros(len(found), bool), np.ones(len(found), bool)
+    for k in sorted(range(len(found)), key=lambda k: -votes[k]):
+        if votes[k] > 1 and not judged[k]:
+            agreed = [found[i] for i in np.flatnonzero(sets[k]).tolist()]
+            relation = _relations(agreed, first, last)
+            shares = _clashes(relation, ours, theirs, first, last)
+            if shares and median(shares) > CLASHING:
+                kept[sets[k] & ~judged] = False
+            judged |= sets[k]
+    return [one for one, keep in zip(found, kept, strict=True) if keep]
+
+
+def _clashes(
+    relation: _FrameMatches,
+    ours: Sequence[Scene],
+    theirs: Sequence[Scene],
+    first: Array,
+    last: Array,
+) -> list[float]:
+    """Return the share of wall points in free space for each pair of visits that are near.
+
+    Each visit of the later drive is placed by the match of the relation that is nearest to it.
+    """
+    shares = []
+    for scene, (x, y, turned) in zip(theirs, last, strict=True):
+        onward = np.array([x, y]) - relation.there
+        k = int(np.argmin(np.hypot(*onward.T)))
+        turn = relation.turns[k]
+        at = relation.here[k] + points_turned(turn, onward[k : k + 1])[0]
+        for other, (*middle, bent) in zip(ours, first, strict=True):
+            if math.dist(at, middle) < BESIDE:
+                shift = points_turned(-bent, (at - middle)[None])[0]
+                shares.append(other.clash(scene, turn + turned - bent, shift))
+    return [share for share in shares if share is not None]
 
 
 def _votes(matches: Sequence[VisitMatch]) -> int:
