@@ -5,19 +5,20 @@ A star is all openings seen at a step. This evidence needs neither places nor ri
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, ClassVar
 
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.evidence.protocol import Evidence
+from ssh_abduction.theory.evidence.protocol import Evidence, remembered
 from ssh_abduction.theory.pairs import Pairs
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
-_Seen = tuple[str | None, Star]  # a view (None if a dstate may have several views), and a star
+# A view (None if a dstate may have several views), and a star.
+_Seen = tuple[str | int | None, Star]
 
 
 @dataclass(frozen=True)
@@ -27,29 +28,32 @@ class Alike(Evidence):
     Attributes:
         has_one_view: Whether a dstate has only one view. Then steps with different views are
             different dstates anyway, so they give no pairs.
+        known: The pairs of the last few traces, for reuse.
     """
 
     name: ClassVar[str] = "alike"
     axiom: ClassVar[str] = "one_star"
     has_one_view: bool
+    known: dict[tuple[_Seen, ...], Pairs] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
     def of(cls, theory: Theory) -> Alike:
         return cls("functional_view" in theory.hard and not theory.unknown_views)
 
     def pairs(self, trace: Trace) -> Pairs:
-        return _pairs(
-            tuple(
-                (step.view if self.has_one_view else None, step.gateways or Star(()))
-                for step in trace.steps
-            )
+        seen: tuple[_Seen, ...] = tuple(
+            (step.view if self.has_one_view else None, step.gateways or Star(()))
+            for step in trace.steps
         )
+        return remembered(self.known, seen, _pairs)
+
+    def remembering(self, known: Alike) -> Alike:
+        return replace(self, known=known.known)
 
 
-@lru_cache(maxsize=8)
 def _pairs(seen: tuple[_Seen, ...]) -> Pairs:
     """Return the pairs of steps with the same view, but with stars that are not alike."""
-    steps: dict[str | None, dict[Star, list[int]]] = {}
+    steps: dict[str | int | None, dict[Star, list[int]]] = {}
     apart: dict[int, frozenset[int]] = {}
     for t, (view, star) in enumerate(seen):
         others = steps.setdefault(view, {})

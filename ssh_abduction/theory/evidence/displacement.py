@@ -30,15 +30,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.evidence.protocol import Equality, Evidence
+from ssh_abduction.theory.evidence.protocol import KEPT, Equality, Evidence
 from ssh_abduction.theory.evidence.returns import Returns
 from ssh_abduction.theory.pairs import Pairs
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
-
-
-KEPT = 8  # how many traces are remembered, with their returns
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ have a dstate or a place in common, or if other stretches connect them in this w
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 from typing import ClassVar
 
@@ -17,19 +16,29 @@ from ssh_abduction.data.floors import stretches_of
 from ssh_abduction.data.groups import gathered, way
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.evidence.protocol import Equality, Evidence
+from ssh_abduction.theory.evidence.protocol import Equality, Evidence, remembered
 from ssh_abduction.theory.pairs import Pairs
+
+_Ridden = tuple[tuple[int, ...], tuple[int, ...]]  # the stretch of each step, and lifted steps
 
 
 @dataclass(frozen=True)
 class Floors(Evidence):
-    """Evidence from actions that lead to other floors."""
+    """Evidence from actions that lead to other floors.
+
+    Attributes:
+        known: The pairs of the last few traces, for reuse.
+    """
 
     name: ClassVar[str] = "floors"
     axiom: ClassVar[str] = "other_floor"
+    known: dict[_Ridden, Pairs] = field(default_factory=dict, compare=False, repr=False)
 
     def pairs(self, trace: Trace) -> Pairs:
-        return _pairs(stretches_of(trace), _lifted(trace))
+        return remembered(self.known, (stretches_of(trace), _lifted(trace)), _pairs)
+
+    def remembering(self, known: Floors) -> Floors:
+        return replace(self, known=known.known)
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         stretches = stretches_of(trace)
@@ -51,9 +60,9 @@ def _lifted(trace: Trace) -> tuple[int, ...]:
     return tuple(t for t, action in enumerate(trace.actions, 1) if action.changes_floor)
 
 
-@lru_cache(maxsize=8)
-def _pairs(stretches: tuple[int, ...], lifted: tuple[int, ...]) -> Pairs:
+def _pairs(ridden: _Ridden) -> Pairs:
     """Pair each step of the stretch before a lift with each step of the stretch after it."""
+    stretches, lifted = ridden
     steps = gathered((stretch, t) for t, stretch in enumerate(stretches))
     return Pairs.of(
         elsewhere=[

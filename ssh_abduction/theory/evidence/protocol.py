@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -11,6 +12,9 @@ from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
+
+Key = TypeVar("Key")
+KEPT = 8  # how many traces are remembered, with what evidence says of them
 
 
 @dataclass(frozen=True)
@@ -72,3 +76,12 @@ class Evidence(Protocol):
         `since` steps are known to have no such set, so only later steps need to be checked.
         """
         return None
+
+
+def remembered(known: dict[Key, Pairs], key: Key, find: Callable[[Key], Pairs]) -> Pairs:
+    """Return what `find` gives for a key. `known` has the results for the last KEPT keys."""
+    if (found := known.get(key)) is None:
+        found = known[key] = find(key)
+        for old in list(known)[:-KEPT]:
+            known.pop(old, None)  # another thread may have removed it
+    return found
