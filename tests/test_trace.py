@@ -308,8 +308,11 @@ def test_empty_trace_file_is_refused(tmp_path: Path) -> None:
         Trace.load(tmp_path / "t")
 
 
-def test_binary_trace_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "t").write_bytes(bytes(range(256)) * 100)
+@pytest.mark.parametrize(
+    "content", [bytes(range(256)), f"{HEADER}\n".encode() + b'{"view": "\xe9"}']
+)
+def test_binary_trace_file_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "t").write_bytes(content)
     with pytest.raises(TraceError, match="is this a binary file"):
         Trace.load(tmp_path / "t")
 
