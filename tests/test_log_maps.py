@@ -390,6 +390,20 @@ def test_search_without_a_limit_continues_until_it_has_a_map(
         )
 
 
+@pytest.mark.parametrize(("limit", "rung"), [(3.0, 1.0), (80.0, 5.0), (1000.0, 10.0)])
+def test_ladder_takes_a_quarter_of_the_limit(
+    limit: float, rung: float, runs: Path, hall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There are four rungs, each with at least one second and at most ten."""
+    found, asked = Solution.load(runs / "hall" / "maps.json"), list[float]()
+    monkeypatch.setattr(LogMapping, "solve", lambda *args, **given: found)
+    monkeypatch.setattr(
+        log_maps, "ladder", lambda *args, **given: asked.append(given["time_limit"]) or []
+    )
+    map_log(read_log(hall), time_limit=limit)
+    assert asked == [rung]
+
+
 def test_report_says_why_there_is_no_map_or_proof() -> None:
     solution = solve(Trace.from_steps([0, 1], ["travel"]))
     assert how_it_ended(solution, 5.0) is None

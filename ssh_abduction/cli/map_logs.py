@@ -38,8 +38,8 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
     )
     said = (
-        "whether to compute how much each kind of evidence helps; this takes time after the "
-        "search, which --time-limit does not limit (default: true)"
+        "whether to compute how much each kind of evidence helps; this takes up to a quarter of "
+        "--time-limit after the search, or a few seconds if that is more (default: true)"
     )
     parser.add_setting("ladder", said, default=True)
     parser.add_setting(

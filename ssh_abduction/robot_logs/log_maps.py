@@ -303,8 +303,9 @@ def map_log(
         name: The name of the trace, or the names of the drives. None for no name, or for "drive 1",
             "drive 2" and so on.
         time_limit: Seconds for the search for minimal maps. None takes a twentieth of the time that
-            the robot drove, minus the time of the import, but at least 30 s. The ladder gets a
-            quarter of this time. If no map is found, the search may take up to 64 times as long.
+            the robot drove, minus the time of the import, but at least 30 s. If no map is found
+            then, the search may take up to 64 times as long. The ladder gets a quarter of this
+            time, but at least a second for each kind of evidence.
         max_maps: List at most this many minimal maps; None lists all.
         with_ladder: Whether to solve the trace with fewer kinds of evidence, too, to show what each
             kind contributes.
@@ -368,7 +369,8 @@ def map_log(
     # 4. Ladder: what each kind of evidence is worth.
     if with_ladder and not mapping.interrupted:
         begin, stars = time.process_time(), chosen.star != "none"
-        share = (left - seconds["maps"]) / len(list(rungs(trace, chosen, stars)))
+        rest = left - seconds["maps"] if time_limit is None else LADDER * time_limit
+        share = rest / len(list(rungs(trace, chosen, stars)))
         most = min(max(share, LEAST_RUNG), RUNG)
         climbed += ladder(
             trace,
