@@ -150,6 +150,7 @@ class _Detector:
                 continued[min(near)[1]][0].sightings.append(sighting)
             else:
                 self._open.append(_Chain(next(self._numbers), [sighting]))
+        # A chain ends when its junction is out of sight, or when it is too long to wait for.
         for chain in list(self._open):
             if milestone - chain.last >= GAP:
                 self._end(chain)

@@ -177,6 +177,7 @@ def watched(scans: Iterable[Scan], tell: Teller, source: str = "") -> Iterator[S
     last, begin, standing = first[-1:], 0, jumps.StandstillCheck()
     laser = log_checks.StuckLaser()
     for number, scan in enumerate(map(units.converted, chain(first, coming))):
+        # Checks look at a stretch of scans several times as it grows. Then a new one begins.
         if len(stretch) == LOOKS[-1]:
             stretch, begin, standing = last, number - 1, jumps.StandstillCheck()
         stretch.append(without_ranges(scan))

@@ -146,6 +146,7 @@ def passable(patch: Patch, room: float) -> Bools:
     is_reached = np.zeros(count + 1, np.bool_)
     is_reached[parts[trail]] = True
     reached = is_reached[parts]
+    # Small holes within the reached space are furniture, unless they touch the border.
     holes, count = ndimage.label(~reached)
     sizes = np.bincount(holes.ravel(), minlength=count + 1) * CELL**2
     small = sizes < FURNITURE

@@ -101,6 +101,7 @@ def headings_by(
         first, ahead = next((course, off) for course, off in courses.values() if course in part)
         found = _synchronised(graph.subgraph(part), first, robust)
         angles |= {course: angle - ahead for course, angle in found.items()}
+    # If all turns are quarters, robust headings are, too.
     quarter = math.pi / 2
     if robust and all(abs(math.remainder(turn.angle, quarter)) < EXACT for turn in turns):
         angles = {course: round(angle / quarter) * quarter for course, angle in angles.items()}

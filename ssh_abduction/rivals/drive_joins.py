@@ -164,6 +164,7 @@ def _pair(
                 DriveJoin(i, j, math.fsum(w for w, at in weighed if at[i] == at[j]))
                 for i, j in product(here, there)
             )
+            # Of the steps at both places, take the pair that is most often at one place.
             join = max(joins, key=lambda join: join.share)
             if join.share == 0:
                 excluded += 1

@@ -127,6 +127,7 @@ def _program(
         np.array([number[n] for n in ends])
         for ends in ([x.source for x in moves], [x.target for x in moves])
     )
+    # Balance: a stance is entered as often as it is left, but for the start and the last one.
     signs = np.r_[np.ones(m), -np.ones(m), -np.ones(size)]
     at = np.r_[targets, sources, :size], np.r_[:m, :m, m : m + size]
     balance = coo_array((signs, at), (size, m + size)).tocsr()

@@ -138,6 +138,7 @@ def _sides(
         for m, listed in zip(maps, courses_of, strict=True)
     ]
     states = [[m.dstates[label] for label in m.dstate_at] for m in maps]
+    # Places and courses that coincide in all maps are asked about once, by their first steps.
     places: dict[tuple[int | None, ...], int] = {}
     courses: dict[tuple[tuple[int, int] | None, ...], int] = {}
     for t in steps:

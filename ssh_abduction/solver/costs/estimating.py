@@ -58,6 +58,7 @@ def rivals_of(
     rival = rival_of(best, misfit.nats_of(best))
     kept_labels = rival.dstates[:kept_steps], rival.places[:kept_steps]
     kept = nats_of(replace(Cost.of(best), dstates=0, places=0), theory)
+    # Drives that no closure ties to others may lie otherwise.
     drives = drives_of(problem.trace)
     free = [drive for i, drive in enumerate(drives) if not problem.overlap.is_tied(i)]
 

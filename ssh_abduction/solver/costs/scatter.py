@@ -336,6 +336,7 @@ def _best_numbers(shares: Array, pays: Array, near: Array, far: Array) -> tuple[
         slope = np.identity(size) - far[kept].sum(0) - np.tensordot(c[kept], near[kept], 2)
         size_of_slope = max(1.0, float(np.linalg.norm(slope)))
         price = _positive(price - 2 * unit / math.sqrt(1 + step) / size_of_slope * slope)
+        # Average the numbers of the second half, as subgradient steps go back and forth.
         if step >= SUBGRADIENTS:
             sums, times = sums + kept[:, None] * c, times + kept
     kept = times > SUBGRADIENTS / 2

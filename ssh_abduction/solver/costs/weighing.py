@@ -380,6 +380,7 @@ class Weighing:
             return None
         rivals: dict[Course, Rival] = {}
         most = self.candidates[0].nats + CHANCE * CERTAIN
+        # Maps that lay drives otherwise are rivals, too, if they cost little more.
         layings = sorted(self._of_laying.values(), key=lambda candidate: candidate.nats)[:RIVALS]
         for candidate in (*self.candidates, *(c for c in layings if c.nats < most)):
             rival = rival_of(candidate.map, candidate.nats)

@@ -157,6 +157,7 @@ class Blocks:
         Returns the end of the wider block and the cost of these faults in tenths; None if there are
         no such faults, or no proof that this cost is the least.
         """
+        # Take the faults before `end`, and each that follows the last one within `most` steps.
         first = behind = bisect_left(places, begin)
         while behind < len(places) and places[behind] < max(
             end, places[behind - 1] + most + 1 if behind > first else 0

@@ -226,6 +226,7 @@ class FaultyEngine:
         labels: list[int] = []
         for t in range(self.size):
             here = answer.where.get(t)
+            # At least one end of this action was not given, so clingo has not checked its link.
             if t and (t - 1 not in answer.where or here is None):
                 there = machine.goes.get((labels[-1], self._actions[t - 1]))
                 known = there is not None and (

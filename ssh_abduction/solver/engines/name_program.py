@@ -201,6 +201,7 @@ class NameProgram:
             known.nodes.add(t)
             view = self.chart.seen[t]
             given.append((t, view, known.choices[t], known.last.get(view)))
+            # Pairs that evidence excludes are given if the names of both steps are open.
             if len(known.choices[t]) > 1:
                 known.last[view] = t
                 if self.chart.excluded:

@@ -163,6 +163,7 @@ class Poses:
         if not len(self._moved):
             return unknown
         off = self._residuals(unknown)
+        # Levenberg-Marquardt: damp a step more until it lowers the sum of squares.
         damping = LEAST_DAMPING
         for _ in range(ROUNDS):
             jacobian = self._jacobian(unknown)

@@ -212,6 +212,7 @@ class Joining:
             *self._by_dstates(first, second, changes, near),
             *self._by_places(first, second, changes == 0, near),
         ]
+        # Closures between the two maps say by themselves how to lay them.
         ties = sum(
             (c.first in first.labels and c.last in second.labels)
             or (c.first in second.labels and c.last in first.labels)

@@ -176,6 +176,7 @@ class Overlay:
         place = {p: i for i, p in enumerate(places)}
         position = both.position[places]
         poses = [*np.stack([position, position + 1], 1).ravel(), *both.heading[dstates]]
+        # The state of the new part: x and y of each place, then the heading of each dstate.
         n = 2 * len(places)
         return Part(
             {t: number[state.dstate[s]] for t, s in both.labels.items()},
@@ -292,6 +293,7 @@ class Overlay:
             if not self._look_alike(s, x) or self._dstates_apart.includes(state.dstate, s, x):
                 raise _ClashError
             for action, there in state.links[x].items():
+                # Both ends of equal links become one dstate, too.
                 if action in state.links[s]:
                     pairs.append((state.links[s][action], there))
                 else:

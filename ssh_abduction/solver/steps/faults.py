@@ -153,6 +153,7 @@ def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) ->
     shows = {
         label: max(counts, key=counts.__getitem__, default=None) for label, counts in votes.items()
     }
+    # What the mended trace changed, and views that lost the vote, are faults.
     faults: list[tuple[int, str]] = []
     for t, (step, other) in enumerate(zip(trace.steps, mended.steps, strict=True)):
         if step.view not in (None, shows[ssh_map.dstate_at[t]]):
