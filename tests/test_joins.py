@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from strategies import theories, traces
 
 from ssh_abduction import Solution, Theory, Trace, compare, solve
-from ssh_abduction.checker.joins import Join, joins_by_minimality, joins_in_words
 from ssh_abduction.cli import main
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.data import MapError, SSHMap
@@ -25,6 +24,7 @@ from ssh_abduction.page.content import content_of
 from ssh_abduction.rivals import Listing
 from ssh_abduction.robot_logs import log_report
 from ssh_abduction.solver.solution.weighed import Rival, Weighed
+from ssh_abduction.theory.joins import Join, joins_by_minimality, joins_in_words
 from ssh_abduction.theory.settle import settle
 
 Pair = tuple[int, int]

@@ -18,7 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ssh_abduction.checker.joins import joins_in_words
 from ssh_abduction.cli import EXIT_ERROR, unwritten
 from ssh_abduction.cli.cluster_jobs import answers_of
 from ssh_abduction.cli.guard import Guard
@@ -43,6 +42,7 @@ from ssh_abduction.data.errors import AbductionError, MapError, brief, named
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, check_limit, workers
+from ssh_abduction.theory.joins import joins_in_words
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

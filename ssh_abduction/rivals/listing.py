@@ -16,7 +16,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
-from ssh_abduction.checker.joins import Join, joins_in_words
 from ssh_abduction.data.checks import a_flag, a_path, a_text, a_whole_number, an_instance, one_of
 from ssh_abduction.data.corrections_file import named_beside
 from ssh_abduction.data.drives import Drive, pieces_in_words, with_named_faults
@@ -37,6 +36,7 @@ from ssh_abduction.solver import (
     theory_in,
     warnings_in,
 )
+from ssh_abduction.theory.joins import Join, joins_in_words
 from ssh_abduction.theory.theory import Theory
 
 # How to mend maps that show different views at a step.

@@ -14,7 +14,6 @@ from typing import Any
 
 from perception.places.importing import Imported
 from perception.readers.scans import RobotLog
-from ssh_abduction.checker.joins import joins_in_words
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.files import filled
@@ -26,6 +25,7 @@ from ssh_abduction.rivals.drive_joins import joins_of_drives
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.robot_logs.log_picture import SURE, doubtful_joins, figure, paths_mean_something
 from ssh_abduction.solver import Solution, Status
+from ssh_abduction.theory.joins import joins_in_words
 
 TEMPLATE = Path(__file__).parent / "report.html"
 

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ssh_abduction.checker.joins import Join
 from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.json_fields import FieldReader
@@ -21,6 +20,7 @@ from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.steps.certificate import Basis, Certificate
 from ssh_abduction.solver.values import Bound, Cost, Effort, Grounding, Level, Seconds
 from ssh_abduction.theory.fields import COUNTS
+from ssh_abduction.theory.joins import Join
 from ssh_abduction.theory.theory import Theory
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.checker.claims import contradictions
-from ssh_abduction.checker.joins import Join, joins_by_minimality, joins_in_words
 from ssh_abduction.data.checks import a_whole_number, one_of
 from ssh_abduction.data.drives import Drive, drives_of, with_named_faults
 from ssh_abduction.data.errors import MapError, SolverError, brief, named
@@ -49,6 +48,7 @@ from ssh_abduction.solver.solution.writing import (
 from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.solver.steps.noise import LEAST, Noise
 from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status, cost_as_counted
+from ssh_abduction.theory.joins import Join, joins_by_minimality, joins_in_words
 from ssh_abduction.theory.theory import Theory
 
 
@@ -183,7 +183,7 @@ class Solution(MapSequence):
     def by_minimality(self) -> tuple[Join, ...]:
         """The joins of the first map that rest on minimality alone.
 
-        A join is two steps at one place or one dstate (`ssh_abduction.checker.joins`). Joins that
+        A join is two steps at one place or one dstate (`ssh_abduction.theory.joins`). Joins that
         follow from those listed are left out. Empty if maps are compared by cost, as then
         `probability` says how sure a join is, unless the search was stopped before.
         """
