@@ -135,7 +135,7 @@ class Scene:
         """The share of the wall points of each scene that lie in free space of the other one.
 
         The other one is rotated by `turn` radians, and its middle is shifted by `shift` metres.
-        None if less than a few wall points lie where the other scene observed anything.
+        None if fewer than FEW wall points lie where the other scene observed anything.
         """
         codes = np.concatenate(
             [
