@@ -260,7 +260,7 @@ class _Text:
         return why_no_map(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> Callable[[], str]:
-        """Make the whole output as text, and return a function that returns it."""
+        """Make the output now, as text. Return a function that gives this text."""
         lines = _lines(self._search, solution, explanation, self._search.backbone)
         blamed = self._obeying.blamed(solution, explanation)
         text = _text(chain(lines, blamed, self._obeying.how_to_mend(blamed, explanation)))

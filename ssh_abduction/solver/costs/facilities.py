@@ -70,7 +70,7 @@ class Facilities:
         return shares * self.price / saved
 
     def first_shares(self) -> tuple[Array, Array]:
-        """Compute approximate shares, (n,), without a search of all space.
+        """Compute approximate shares, (n,), from those facilities that a short search finds.
 
         Also return what each point pays for each of its coordinates in the cheapest clustering, (n,
         d). This clustering may use fractions of clusters.

@@ -163,7 +163,7 @@ def poses_turned(
     centre: int,
     angle: float,
 ) -> tuple[Array, Array]:
-    """Turn some poses of a Gaussian about one position, counterclockwise by radians.
+    """Turn some poses of a Gaussian distribution about one position.
 
     Args:
         mean: The means.
@@ -171,7 +171,7 @@ def poses_turned(
         x: The indices of the x of the positions to turn. That of y comes next.
         headings: The indices of the headings to turn.
         centre: The index of the x of the position to turn about.
-        angle: The angle.
+        angle: The angle in radians, counterclockwise.
     """
     cos, sin = math.cos(angle), math.sin(angle)
     mean, covariance = mean.copy(), covariance.copy()

@@ -322,10 +322,10 @@ class Kept:
 
 
 def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: str) -> Shared:
-    """Read what a file says about one sort. Raises MapError.
+    """Read what all maps share of their dstates, places, paths or courses. Raises MapError.
 
-    `of_step` has the number of the dstate of each step, if the file has one number for each dstate;
-    None if it has one number for each step.
+    `data` is the part of a file about one of these. It has one number for each step or, if
+    `of_step` is given, for each dstate. `of_step` has the number of the dstate of each step.
     """
     expected = steps if of_step is None else len(set(of_step))
     always = data.get("always") if isinstance(data, Mapping) else None
