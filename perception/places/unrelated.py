@@ -159,10 +159,9 @@ def without_clashes(
 
     `first` and `last` have the poses of the visits of each drive, (n, 3).
     """
-    relations, visits = _relations(found, first, last), [one.last for one in found]
-    sets = [relations.agreeing(k) for k in range(len(found))]
-    votes = [len({visits[k] for k in np.flatnonzero(mask)}) for mask in sets]
+    sets, votes = _support(found, _relations(found, first, last))
     judged, kept = np.zeros(len(found), bool), np.ones(len(found), bool)
+    # Matches that agree are judged together, those on which most visits agree first.
     for k in sorted(range(len(found)), key=lambda k: -votes[k]):
         if votes[k] > 1 and not judged[k]:
             agreed = [found[i] for i in np.flatnonzero(sets[k]).tolist()]
@@ -181,16 +180,10 @@ def _clashes(
     first: Array,
     last: Array,
 ) -> list[float]:
-    """Return the share of wall points in free space for each pair of visits that are near.
-
-    Each visit of the later drive is placed by the match of the relation that is nearest to it.
-    """
+    """Return the share of wall points in free space for each pair of visits that are near."""
     shares = []
     for scene, (x, y, turned) in zip(theirs, last, strict=True):
-        onward = np.array([x, y]) - relation.there
-        k = int(np.argmin(np.hypot(*onward.T)))
-        turn = relation.turns[k]
-        at = relation.here[k] + points_turned(turn, onward[k : k + 1])[0]
+        at, turn, _ = relation.placed(np.array([x, y]))
         for other, (*middle, bent) in zip(ours, first, strict=True):
             if math.dist(at, middle) < BESIDE:
                 shift = points_turned(-bent, (at - middle)[None])[0]
@@ -226,6 +219,18 @@ class _FrameMatches:
         """Return what the matches say if the two drives change places."""
         return _FrameMatches(-self.turns, self.there, self.here)
 
+    def placed(self, point: Array) -> tuple[Array, float, float]:
+        """Place a point (x, y) of the later frame in the earlier one, by the nearest match.
+
+        Returns the position in metres, the rotation of the match in radians, and how far the point
+        is from the match in metres.
+        """
+        onward = point - self.there
+        far = np.hypot(*onward.T)
+        k = int(np.argmin(far))
+        turn = float(self.turns[k])
+        return self.here[k] + points_turned(turn, onward[k : k + 1])[0], turn, float(far[k])
+
     def fitting(self, over: _FrameMatches, back: _FrameMatches) -> list[bool]:
         """Whether each match agrees with two relations that lead over a third drive.
 
@@ -236,11 +241,9 @@ class _FrameMatches:
         for turn, here, at in zip(self.turns, self.here, self.there, strict=True):
             point, reach, twist = at, 2 * NEAR, turn
             for relation in (over, back):
-                onward = point - relation.there
-                k = int(np.argmin(np.hypot(*onward.T)))
-                reach += DRIFT * np.hypot(*onward[k])
-                twist -= relation.turns[k]
-                point = relation.here[k] + points_turned(relation.turns[k], onward[k : k + 1])[0]
+                point, turned, far = relation.placed(point)
+                reach += DRIFT * far
+                twist -= turned
             twist = abs((twist + math.pi) % math.tau - math.pi)
             found.append(bool(math.dist(point, here) < reach and twist < 2 * TWIST))
         return found
@@ -262,16 +265,20 @@ def _largest(found: Sequence[VisitMatch], relations: _FrameMatches) -> list[Visi
 
     The list is empty if too few visits agree, or if another relation has more than half as many.
     """
-    sets = [relations.agreeing(k) for k in range(len(found))]
-    visits = np.array([one.last for one in found], int)
-
-    def votes(mask: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> int:
-        return len(set(visits[mask].tolist()))
-
-    if not sets:
+    sets, votes = _support(found, relations)
+    most = max(votes, default=0)
+    if most < VOTES:
         return []
-    best = max(sets, key=votes)
-    rivals = [votes(sets[k]) for k in np.flatnonzero(~best)]
-    if votes(best) < VOTES or max(rivals, default=0) > votes(best) / 2:
+    best = sets[votes.index(most)]
+    if max((votes[k] for k in np.flatnonzero(~best)), default=0) > most / 2:
         return []
     return [found[k] for k in np.flatnonzero(best).tolist()]
+
+
+def _support(
+    found: Sequence[VisitMatch], relations: _FrameMatches
+) -> tuple[list[np.ndarray[tuple[int], np.dtype[np.bool_]]], list[int]]:
+    """For each match, return which matches agree with it, and how many later visits these have."""
+    visits = np.array([one.last for one in found], int)
+    sets = [relations.agreeing(k) for k in range(len(found))]
+    return sets, [len(np.unique(visits[mask])) for mask in sets]
