@@ -140,6 +140,16 @@ def test_robot_that_is_carried_without_a_pause_is_not_called_standing(
     assert "The scans show nothing of what was seen before, once: from scan 40" in notes
 
 
+def test_robot_that_drove_on_without_seeing_walls_is_not_called_carried(
+    scans: tuple[Scan, ...],
+) -> None:
+    """The laser sees nothing in 30 scans. The scans after them show other walls."""
+    blind = [replace(scan, ranges=np.full_like(scan.ranges, np.inf)) for scan in scans[30:60]]
+    drive = (*scans[:30], *blind, *scans[60:])
+    shorter = stepwise(drive, lambda _, step: (0.9 * step[0], *step[1:]))
+    assert track_and_notes(shorter)[0].breaks == ()
+
+
 @pytest.mark.slow
 def test_carried_robot_gives_a_slipped_action(scans: tuple[Scan, ...]) -> None:
     """The laser is off while the robot is carried, and the odometer is where it was."""

@@ -246,13 +246,16 @@ class _ScanMotion:
 def _carried(log: RobotLog, track: Track) -> list[int]:
     """Find scans to which the robot was carried while nothing was logged.
 
-    Such a scan and the scans after it show nothing that was seen before, although the odometer does
-    not jump.
+    Such a scan and the scans after it show nothing that was seen before, although the robot hardly
+    drove since it last saw walls.
     """
     found: list[int] = []
     for i in np.flatnonzero(track.shares < STRANGE).tolist():
+        before = (log.scans[k] for k in range(i - 1, -1, -1))
+        saw = next((scan for scan in before if len(surfaces_in(scan)) >= FEW_POINTS), None)
         if (
-            math.dist(log.scans[i - 1].odometry[:2], log.scans[i].odometry[:2]) > NEARBY
+            saw is None
+            or math.dist(saw.odometry[:2], log.scans[i].odometry[:2]) > NEARBY
             or i in track.breaks
             or i + IN_A_ROW > len(log)
             or (found and i < found[-1] + IN_A_ROW)
