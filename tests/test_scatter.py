@@ -13,11 +13,13 @@ import pytest
 from brute_force import divisions
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.solver.choosing import READABLE
+from ssh_abduction.solver.costs import weighing
 from ssh_abduction.solver.costs.facilities import Facilities
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.scatter import is_for, least_cost
@@ -182,3 +184,22 @@ def test_scatter_bound_is_off_for_other_traces_and_theories() -> None:
     assert is_for(settle(trace))
     assert not is_for(settle(trace, Theory(jumped=2.0)))
     assert not is_for(settle(replace(trace, odometry=replace(OFF, offset=0.0, facing=0.0))))
+
+
+def test_costs_are_computed_in_one_thread() -> None:
+    threads: set[int] = set()
+
+    def counted(work: Callable[..., object]) -> Callable[..., object]:
+        def call(*args: object) -> object:
+            threads.update(x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas")
+            return work(*args)
+
+        return call
+
+    with (
+        threadpool_limits(2),
+        patch.object(weighing, "least_cost", counted(least_cost)),
+        patch.object(weighing, "rivals_of", counted(weighing.rivals_of)),
+    ):
+        solve(off_its_places(0), Theory(boundary="none"), time_limit=60)
+    assert threads == {1}

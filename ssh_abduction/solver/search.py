@@ -341,12 +341,12 @@ class Search:
             if not weighing.guess(clashes):
                 self._parts.known.status = Status.UNSATISFIABLE
                 return
-        is_enough = weighing.best is not None and not self.theory.has_faults
-        self._stages.find_minimum_within(SOON if is_enough else COUNTING_SHARE)
-        if self._parts.known.status is not Status.UNSATISFIABLE:
-            # One more map shows that not all are listed.
-            most = self.limits.most and self.limits.most + 1
-            weighing.search(lambda trace, theory, s: self._solve_mended(trace, theory, most, s))
+            is_enough = weighing.best is not None and not self.theory.has_faults
+            self._stages.find_minimum_within(SOON if is_enough else COUNTING_SHARE)
+            if self._parts.known.status is not Status.UNSATISFIABLE:
+                # One more map shows that not all are listed.
+                most = self.limits.most and self.limits.most + 1
+                weighing.search(lambda trace, theory, s: self._solve_mended(trace, theory, most, s))
 
     def _solve_mended(
         self, mended: Trace, theory: Theory, most: int, seconds: float
@@ -407,8 +407,9 @@ class Search:
         """
         solution = self._answer.solution(self._answer.in_order(checked_maps(maps)))
         if self._weighing is not None:
-            support = replace(solution.support, weighed=self._weighing.weighed())
-            return replace(solution, support=support)
+            with one_thread("blas"):
+                weighed = self._weighing.weighed()
+            return replace(solution, support=replace(solution.support, weighed=weighed))
         if self._asked_weigh != "cost":
             return solution
         return replace(solution, support=replace(solution.support, weigh_warning=COUNTED))
