@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import pytest
 from brute_force import consistent_maps
 
 from ssh_abduction import SSHMap, Theory, Trace, check, solve
 from ssh_abduction.cli import main, outcome
+from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.solver import Search, Status, candidates
 from ssh_abduction.solver.fallback import clash_in
 from ssh_abduction.solver.guesses.separate import separate_map
@@ -71,6 +72,19 @@ def test_clash_of_a_whole_visit_is_found_after_the_limit(
     told = capsys.readouterr().out
     assert told.startswith("unsatisfiable: no map satisfies the axioms: in steps ")
     assert " some clash\nlook at what was seen and done from " in told
+
+
+def test_clash_of_two_drives_is_not_blamed_on_the_evidence(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No stretch of consecutive steps clashes, and there is no time to find the axioms."""
+    for name in ("monday", "tuesday"):
+        Trace.from_steps("abc", ["travel"] * 2, name=name).save(tmp_path / f"{name}.jsonl")
+    drives = [str(tmp_path / f"{name}.jsonl") for name in ("monday", "tuesday")]
+    monkeypatch.setattr(outcome, "explain", Mock(side_effect=Interrupted))
+    assert main(["solve", *drives, "--together", "--same", "monday:0,tuesday:2"]) == 20
+    told = capsys.readouterr().out
+    assert " in steps monday:0 to tuesday:2 some clash\n" in told
 
 
 def wrong_turn() -> Trace:
