@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import traces
@@ -22,7 +23,7 @@ from ssh_abduction import SSHMap, Theory, Trace, explain_trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, MapError, TheoryError, TraceError, together
 from ssh_abduction.online import route
-from ssh_abduction.output import to_networkx, to_svg
+from ssh_abduction.output import to_dot, to_networkx, to_svg
 from ssh_abduction.output.export import export_map
 from ssh_abduction.output.layout import drawable_poses, layout
 from ssh_abduction.solver import Status
@@ -205,6 +206,9 @@ def test_floors_are_drawn_below_each_other() -> None:
         ]  # fmt: skip
         nodes = json.loads(export_map(ssh_map, "nav2", level="dstates"))["features"][:5]
         assert [n["properties"]["metadata"]["floor"] for n in nodes] == [0, 0, 1, 1, 1]
+        stops = yaml.safe_load(export_map(ssh_map, "tmap2", level="dstates"))["nodes"]
+        assert [stop["node"]["properties"]["floor"] for stop in stops] == [0, 0, 1, 1, 1]
+        assert [to_dot(ssh_map).count(f"floor {i}") for i in range(3)] == [2, 3, 0]
     assert "floor" not in to_svg(solve(trace[:2]).maps[0])
 
 

@@ -57,6 +57,7 @@ def _node(s: DState, ssh_map: SSHMap) -> str:
     course = f"\npath {s.course}" if s.course else ""
     name = ssh_map.name_of("path", s.path)
     course += "" if name is None else f" ({name})"
+    course += "" if s.floor is None else f"\nfloor {s.floor}"
     return f"{s.id} [label={_quoted(f'{s.id}: {s.shown}{course}')}];"
 
 

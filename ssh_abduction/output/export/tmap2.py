@@ -95,7 +95,7 @@ def _node(
                 "xy_goal_tolerance": NEAR,
                 "yaw_goal_tolerance": facing,
                 **stop.properties,
-                **only_known(place_name=stop.name),
+                **only_known(place_name=stop.name, floor=stop.floor),
             },
             "restrictions_planning": "True",
             "restrictions_runtime": "True",
