@@ -74,19 +74,21 @@ def rooms_and_doors(told: Mapping[str, Any]) -> tuple[list[str | None], dict[int
 
 
 def told_line(rows: Sequence[dict[str, Any]]) -> str:
-    """Say how many maps of drives through floor plans tell all rooms and doors apart.
+    """Say how many simulated drives have a map, and how many maps tell all rooms and doors apart.
 
     Args:
         rows: A row for each log, as `logs.py` makes them.
     """
-    maps = [row for row in rows if "untold" in row]
+    drives = [row for row in rows if row["simulated"]]
+    maps = [row for row in drives if "untold" in row]  # of drives through floor plans
     right = [row for row in maps if row["visit_pairs"]["joined"] == row["visit_pairs"]["right"]]
     rooms, doors = ([row for row in maps if not row["untold"][kind]] for kind in ("rooms", "doors"))
     whole = [row for row in right if row in rooms and row in doors]
     return (
-        f"{sum(row['simulated'] for row in rows)} simulated drives: {len(maps)} have a map, "
-        f"{len(right)} have only right joins, {len(rooms)} tell all rooms apart, {len(doors)} tell "
-        f"all doors apart, {len(whole)} all of this"
+        f"{len(drives)} simulated drives: {sum(row.get('places') is not None for row in drives)} "
+        f"have a map. Floor plans: {len(right)} of {len(maps)} maps have only right joins, "
+        f"{len(rooms)} tell all rooms apart, {len(doors)} tell all doors apart, "
+        f"{len(whole)} all of this"
     )
 
 

@@ -349,6 +349,23 @@ def test_rooms_and_doors_need_their_own_places_or_edges(
     assert told == {"rooms": missing, "doors": confused}
 
 
+def test_drives_without_rooms_are_counted_among_those_with_a_map() -> None:
+    right = {"joined": 1, "right": 1}
+    rows = [
+        {"simulated": True, "places": 4, "visit_pairs": right},
+        {
+            "simulated": True,
+            "places": 5,
+            "visit_pairs": right,
+            "untold": {"rooms": [], "doors": []},
+        },
+        {"simulated": True, "failed": "no map"},
+        {"simulated": False, "places": 6, "visit_pairs": right},
+    ]
+    told = "3 simulated drives: 2 have a map. Floor plans: 1 of 1 maps have only right joins"
+    assert rooms.told_line(rows).startswith(told)
+
+
 def test_waypoints_fill_rooms_and_edges_cross_no_wall() -> None:
     """Two rooms of 4 x 4 m with a wall between them, and no door."""
     free = np.zeros((45, 95), bool)
