@@ -153,11 +153,13 @@ def test_map_of_least_cost_has_no_probability_if_it_fits_badly(last: int, fits: 
     assert ("the best map does not fit the displacements" in solution.weighed.sentence) is not fits
 
 
-def test_closure_sentence_names_the_offset() -> None:
+@pytest.mark.parametrize(("step", "seconds"), [(1, None), (1, 1e-9), (2, None)])
+def test_explanation_names_the_closure_of_the_two_visits(step: int, seconds: float | None) -> None:
+    """Also without a proof, and for another step of the same visit."""
     trace = closed(1, 9, (0.05, 0.05, 0.0))
     theory = Theory.topological().replace(star="none", boundary="none")
-    sentences = " ".join(explain_pair(trace, 1, 9, theory).sentences)
-    assert "the local maps of steps 1 and 9 match with an offset of 0.07 m" in sentences
+    explained = str(explain_pair(trace, step, 9, theory, time_limit=seconds))
+    assert explained.count("the local maps of steps 1 and 9 match with an offset of 0.07 m") == 1
 
 
 def test_fitted_poses_keep_the_distance_of_an_exact_closure() -> None:

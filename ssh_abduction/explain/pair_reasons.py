@@ -150,6 +150,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             stopped=why or self.stopped,
             theory=self.theory,
             loop=self._loop(),
+            matches=self._matches(),
             changes=self._changes,
         )
 
@@ -171,9 +172,19 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             else:  # the robot only turned
                 off = abs(math.degrees(closing.turned))
                 said.append(f"by the odometry their headings are {off:.1f} degrees apart")
-        pair = self.first, self.second
-        said += [match_in_words(c, *pair) for c in self.trace.closures if (c.first, c.last) == pair]
         return ", and ".join(said) or None
+
+    def _matches(self) -> tuple[str, ...]:
+        """Put the closures between the visits of the two steps into words."""
+        visits = [0]  # for each step, the first step of its visit: where the robot turns, it stays
+        for t, action in enumerate(self.trace.actions, 1):
+            visits.append(visits[-1] if action.kind == "turn" else t)
+        pair = visits[self.first], visits[self.second]
+        return tuple(
+            match_in_words(closure, closure.first, closure.last)
+            for closure in self.trace.closures
+            if (visits[closure.first], visits[closure.last]) == pair
+        )
 
     def _verdict(self) -> Verdict:
         """Return the verdict, by what is known about both sides so far."""

@@ -75,6 +75,7 @@ class PairExplanation:
         stopped: The limit that ended the search; None if it ended by itself.
         theory: The theory, with each "auto" replaced by the value that was used.
         loop: The closing error of the loop between the steps, in words; None if unknown.
+        matches: Sentences about the closures between the visits of the two steps.
         changes: Sentences about the gateways at the places of the steps that changed between drives
             in the best map, and what a map costs without changes.
     """
@@ -90,6 +91,7 @@ class PairExplanation:
     stopped: Stop | None
     theory: Theory = field(repr=False)
     loop: str | None = None
+    matches: tuple[str, ...] = ()
     changes: tuple[str, ...] = ()
 
     @property
@@ -114,7 +116,9 @@ class PairExplanation:
             Verdict.UNKNOWN: f"it is unknown whether {pair} are one dstate "
             f"({self.stopped or 'no proof'})",
         }[self.verdict]
-        return (verdict, *self._of_maps(), *self._of_costs(), *self.changes)
+        argued = str(self.derivation)  # may name a match, too
+        matches = [match for match in self.matches if match not in argued]
+        return (verdict, *self._of_maps(), *self._of_costs(), *matches, *self.changes)
 
     def _of_maps(self) -> Iterator[str]:
         """Yield sentences: the number of maps of each side, or why the trace has no map."""
