@@ -344,6 +344,7 @@ def test_check_finds_a_false_probability(
     told = capsys.readouterr().out
     assert "1 of 1 map satisfies" in told
     assert "more is left out: a claim about costs is false" in told
+    assert "nats is not checked" in told
 
 
 def test_check_finds_false_counts_of_a_weighed_map(

@@ -146,7 +146,8 @@ def run(options: argparse.Namespace) -> int:
     if unjudged:
         said.append(f"regions are not checked: {why}")
     holds = not any(violations)
-    if resolved.weigh == "cost" and isinstance(data, dict) and data.get("weighed"):
+    weighed = data.get("weighed") if isinstance(data, dict) and resolved.weigh == "cost" else None
+    if weighed:
         holds &= _costs_hold(trace, data, maps, resolved, str(options.maps), said)
     if options.bound:
         unproven = _why_no_proof(data, resolved, solved)
@@ -156,6 +157,8 @@ def run(options: argparse.Namespace) -> int:
         elif solved is None:
             doubt = "the file names no theory"
         holds &= _bound(trace, data, maps, doubt, made_by, broken, said, unproven)
+        if weighed and not unproven:
+            said.append(f"that no map costs less than {weighed['bound']:.1f} nats is not checked")
     found = _Judgement(violations, resolved, [*map(printable, said)], holds)
     print(json_line(found.to_dict()) if options.json else "\n".join(found.lines()))
     return 0 if holds else EXIT_VIOLATED
