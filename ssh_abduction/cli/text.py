@@ -22,7 +22,6 @@ from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.output.cards import table_of_dstates
 from ssh_abduction.solver import Backbone, Cost, Solution, Status, stretches
 from ssh_abduction.theory import Theory
-from ssh_abduction.theory.evidence import evidence_of
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Choice, Comparison
@@ -48,11 +47,7 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     if explanation:
         return f"{solution.status.value}: {explanation}"
     if solution.status is Status.UNSATISFIABLE:
-        kinds = ", ".join(evidence.name for evidence in evidence_of(solution.theory))
-        reason = f": the evidence rejects each map that clingo found ({kinds})"
-        if solution.stopped:
-            reason = f"; the reason was not found in time ({solution.stopped})"
-        return f"unsatisfiable: no map satisfies the axioms{reason}"
+        return "unsatisfiable: no map satisfies the axioms; to find out why: ssh-abduction explain"
     why = f" ({solution.stopped})" if solution.stopped else ""
     given = f"{solution.effort.prefix} of {counted(solution.steps, 'steps')} given to clingo"
     seconds = f"{solution.seconds.total:.2f} s, {given}"
