@@ -323,10 +323,11 @@ def test_default_time_limit_is_a_twentieth_of_the_drive() -> None:
         times = {k: 2.0 * k - 3.0 for k in range(10, 10 + 10 * back, 10)}
         clocked = tuple(replace(scan, time=times.get(i, scan.time)) for i, scan in enumerate(long))
         assert seconds_driven(RobotLog(clocked, source="back.log")) == drove
-    untimed = tuple(replace(scan, time=None) for scan in timed)
-    assert seconds_left(RobotLog(untimed, source="untimed.log"), imported) == pytest.approx(
-        5.0 / SPEED / 20 - 1.5
-    )
+    # Without a clock, or with one that counts milliseconds, the length of the drive decides.
+    for unit in (None, 1000.0):
+        untimed = tuple(replace(scan, time=unit and unit * scan.time) for scan in timed)
+        left = seconds_left(RobotLog(untimed, source="untimed.log"), imported)
+        assert left == pytest.approx(5.0 / SPEED / 20 - 1.5)
 
 
 def test_map_on_an_unreliable_track_has_no_probability(

@@ -64,8 +64,9 @@ FLOOR = 0.3
 # Largest number of seconds for a rung, because the ladder is only information for the reader.
 RUNG = 10.0
 # Speed of the robot in metres per second, assumed if the log has no clock. Robots whose logs have a
-# clock drove 0.2 to 0.4 on average.
-SPEED = 0.5
+# clock drove 0.2 to 0.4 on average. If a robot is slower than SLOWEST by its clock, it mostly
+# stood, or the clock does not count seconds.
+SPEED, SLOWEST = 0.5, 0.02
 # At most this many minimal maps are listed. They are ranked by how well their loops close.
 MAPS = 300
 # A note, if somebody ended the run.
@@ -235,7 +236,10 @@ def seconds_left(log: RobotLog, imported: Imported) -> float:
 
     Import and mapping together should take a twentieth of the time that the robot drove.
     """
-    drove = seconds_driven(log) or float(imported.track.way[-1]) / SPEED
+    metres = float(imported.track.way[-1])
+    drove = seconds_driven(log)
+    if drove is None or metres < SLOWEST * drove:
+        drove = metres / SPEED
     return SHARE * drove - math.fsum(imported.seconds.values())
 
 
