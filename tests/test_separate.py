@@ -81,14 +81,10 @@ def test_clash_of_two_drives_is_not_blamed_on_the_evidence(
     for name in ("monday", "tuesday"):
         Trace.from_steps("abc", ["travel"] * 2, name=name).save(tmp_path / f"{name}.jsonl")
     drives = [str(tmp_path / f"{name}.jsonl") for name in ("monday", "tuesday")]
-    for found, why in (
-        (Interrupted, ": in steps monday:0 to tuesday:2 some clash"),
-        ([None], "; to find out why: ssh-abduction explain"),
-    ):
-        monkeypatch.setattr(outcome, "explain", Mock(side_effect=found))
-        assert main(["solve", *drives, "--together", "--same", "monday:0,tuesday:2"]) == 20
-        told = capsys.readouterr().out
-        assert told.startswith(f"unsatisfiable: no map satisfies the axioms{why}\n")
+    monkeypatch.setattr(outcome, "explain", Mock(side_effect=Interrupted))
+    assert main(["solve", *drives, "--together", "--same", "monday:0,tuesday:2"]) == 20
+    why = "no map satisfies the axioms; to find out why: ssh-abduction explain"
+    assert capsys.readouterr().out.startswith(f"unsatisfiable: {why}\n")
 
 
 def wrong_turn() -> Trace:

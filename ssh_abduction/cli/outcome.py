@@ -15,7 +15,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeAlias
 
-from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import MapError, named
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
@@ -49,8 +48,7 @@ def exit_code(solution: Solution) -> int:
 def why_no_map(search: Search) -> Explanation | None:
     """Explain why there is no map; None if there is a map, or no time to find out.
 
-    If the time is only enough to find the steps that clash, or not even for that, no axioms are
-    named.
+    If the time is only enough to find the steps that clash, no axioms are named.
     """
     if search.status is not Status.UNSATISFIABLE or search.theory.jumped:
         return None
@@ -63,10 +61,8 @@ def why_no_map(search: Search) -> Explanation | None:
     try:
         return explain(search.trace, search.theory, over, search.clash)
     except Interrupted:
-        trace = search.trace
-        names = named_steps(drives_of(trace), len(trace))
-        clash = search.clash or range(len(trace))
-        return Explanation(names[clash.start], names[clash.stop - 1], ())
+        clash = search.clash
+        return Explanation(clash.start, clash.stop - 1, ()) if clash else None
 
 
 def answer_opening(search: Search) -> dict[str, Any]:
