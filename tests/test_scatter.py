@@ -6,6 +6,7 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -18,11 +19,13 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.choosing import READABLE
 from ssh_abduction.solver.costs import weighing
 from ssh_abduction.solver.costs.facilities import Facilities
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.scatter import is_for, least_cost
+from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.theory.pairs import NO_PAIRS
 from ssh_abduction.theory.settle import Problem, settle
 
@@ -203,3 +206,25 @@ def test_costs_are_computed_in_one_thread() -> None:
     ):
         solve(off_its_places(0), Theory(boundary="none"), time_limit=60)
     assert threads == {1}
+
+
+def test_bound_heeds_the_clock_after_each_long_step() -> None:
+    settled, ended = Poses.settled, list[str]()
+
+    def end(*args: Any) -> Any:
+        ended.append("settled")
+        return settled(*args)
+
+    def over() -> None:
+        if ended:
+            raise TimeoutError
+
+    trace = off_its_places(0)
+    problem = settle(trace, Theory(boundary="none"))
+    with (
+        patch.object(Poses, "settled", end),
+        patch.object(np.linalg, "eigh", side_effect=AssertionError),
+        heeding(over),
+        pytest.raises(TimeoutError),
+    ):
+        bound_of(problem, 1000.0)

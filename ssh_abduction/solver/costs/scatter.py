@@ -130,12 +130,14 @@ class _LinearTrack:
         columns = np.column_stack([2 * steps, 2 * steps + 1, 2 * n + steps])
         fixed = columns[np.unique(piece, return_index=True)[1]].ravel().tolist()
         squares, unknown, covariance = at_steps.settled(None, fixed, range(3 * n))
+        look_at_clock()  # in traces of 800 steps, this step and the next take seconds each
         poses, order = unknown[columns], columns.ravel()
         turned = _without_rigid_motions(poses, piece)
         scatter = spreads_of(trace)
         deviation = np.sqrt(scatter).ravel()
         relative = (turned @ covariance @ turned.T)[np.ix_(order, order)]
         values, vectors = np.linalg.eigh(relative / np.outer(deviation, deviation))
+        look_at_clock()
         values, vectors = values[::-1].clip(0.0), vectors[:, ::-1]
         moves = vectors[:, :MODES] * np.sqrt(values[:MODES]) * deviation[:, None]
         others = float(values[MODES]) if len(values) > MODES else 0.0
