@@ -7,6 +7,8 @@ import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -17,11 +19,11 @@ from perception.places import importing
 from perception.places.following import turned_wrongly
 from perception.places.importing import import_log, tracked
 from perception.places.jumps import Unknown, describe_cuts, keep_one_source, unknown_steps
-from perception.places.tracing import with_drives
+from perception.places.tracing import starts_of_drives
 from perception.places.track import Track
+from perception.places.visits import Visit
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.checker.checker import check
-from ssh_abduction.data import Action, Step, Trace, drives_of
 from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.solver import solve
@@ -92,25 +94,16 @@ def test_trace_has_no_displacement_across_a_cut(
     )
     (t,) = (t for t, step in enumerate(done.trace.steps) if t and step.displacement is None)
     assert (done.trace.steps[t].extra["cuts"], done.trace.steps[t].covariance) == ([65], None)
-    assert not any(step.action.slipped for step in done.trace.steps if step.action)
     solution = solve(done.trace, max_maps=1, time_limit=0.5)
     assert solution.maps
     assert not check(done.trace, solution.maps[0], solution.theory)
 
 
-def test_drive_starts_where_the_odometer_jumped() -> None:
-    """At visit 3 the odometer stood still, and before visit 5 the robot was carried."""
-    steps = [
-        Step(view="a", action=Action.of("travel"), extra={"visit": visit}) for visit in range(6)
-    ]
-    steps[4] = replace(steps[4], action=Action.that_slipped(4))
-    trace = Trace((*steps[:-1], replace(steps[-1], action=None)), name="drive")
-    found = with_drives(trace, [0, 1, 2, 4, 4, 5])
-    assert starts_of(found) == (1, 2)
-    assert [drive.name for drive in drives_of(found)] == ["drive", "drive part 2", "drive part 3"]
-    unnamed = with_drives(replace(trace, name=None), [0, 0, 0, 1, 1, 1])
-    assert [drive.name for drive in drives_of(unnamed)] == ["drive 1", "drive 2"]
-    assert with_drives(trace, [0] * 6) == trace
+def test_drives_start_where_the_odometer_jumped_or_the_robot_was_carried() -> None:
+    """Between visits 2 and 3 the odometer stood still, and at scan 41 the robot was carried."""
+    track = Track(np.zeros((60, 3)), np.zeros((60, 3, 3)), np.ones(60), (15, 25, 26, 35, 41), (41,))
+    visits = [SimpleNamespace(scan=scan) for scan in (0, 10, 20, 30, 50)]
+    assert starts_of_drives(track, cast("list[Visit]", visits)) == {2: 15, 4: 41}
 
 
 def test_stuck_odometer_is_replaced_by_scan_matching(
@@ -137,7 +130,7 @@ def test_robot_that_is_carried_without_a_pause_is_not_called_standing(
     untimed = [replace(scan, time=None) for scan in (*scans[:40], *scans[90:])]
     track, notes = track_and_notes(stepwise(untimed, lambda i, step: START if i == 40 else step))
     assert (track.cuts, track.breaks) == ((40,), (40,))
-    assert "The scans show nothing of what was seen before, once: from scan 40" in notes
+    assert "The scans do not fit those before them, once: from scan 40" in notes
 
 
 def test_robot_that_drove_on_without_seeing_walls_is_not_called_carried(
@@ -151,16 +144,14 @@ def test_robot_that_drove_on_without_seeing_walls_is_not_called_carried(
 
 
 @pytest.mark.slow
-def test_carried_robot_gives_a_slipped_action(scans: tuple[Scan, ...]) -> None:
+def test_drive_starts_where_the_robot_was_carried(scans: tuple[Scan, ...]) -> None:
     """The laser is off while the robot is carried, and the odometer is where it was."""
     lifted = stepwise((*scans[:60], *scans[85:]), lambda i, step: START if i == 60 else step)
     done = import_log(RobotLog(lifted, source="drive"))
     assert done.track.breaks == (60,)
-    assert "The scans show nothing of what was seen before, once" in done.notes[0]
+    assert "The scans do not fit those before them, once" in done.notes[0]
     (t,) = (t for t, step in enumerate(done.trace.steps) if t and step.displacement is None)
-    assert [
-        i for i, step in enumerate(done.trace.steps) if step.action and step.action.slipped
-    ] == [t - 1]
+    assert (starts_of(done.trace), done.starts) == ((t,), (60,))
     solution = solve(done.trace, max_maps=1, time_limit=0.5)
     assert solution.maps
     assert not check(done.trace, solution.maps[0], solution.theory)
@@ -276,4 +267,4 @@ def test_only_a_long_step_of_the_odometer_is_called_a_jump(
     track = replace(tracked(log)[1], cuts=(20,), breaks=(20,))
     notes = describe_cuts(log, track, [])
     assert sum("The odometry jumps once" in note for note in notes) == jumps
-    assert "The scans show nothing of what was seen before, once" in notes[-1]
+    assert "The scans do not fit those before them, once" in notes[-1]

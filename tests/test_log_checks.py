@@ -15,9 +15,11 @@ from coarse import every_second_beam, hall
 
 from perception.errors import LogError
 from perception.places import importing, log_checks
+from perception.places.contradictions import scans_after_a_carry
 from perception.places.importing import import_log, tracked
+from perception.places.track import Track
 from perception.readers.echoes import LaserOptions, interpret_log
-from perception.readers.scans import RobotLog, Scan
+from perception.readers.scans import LaserScanner, RobotLog, Scan
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.data.trace import Trace
@@ -113,7 +115,7 @@ def with_stuck_laser(scans: Scans) -> Scans:
             "drives backwards for 18 % of its way",
         ),
         (in_blocks, "So does a log that is not in the order of the drive"),
-        (kidnapped, "before and after scan 100 (line or message 171) contradict each other"),
+        (kidnapped, "do not fit those before them, once: from scan 100 (line or message 171) on"),
         (covered, "The laser sees no wall in 50 scans, from scan 100 "),
         (of_two_lasers, "The laser changes before scan 60"),
         (of_two_clocks, "The clock starts anew before scan 60"),
@@ -132,16 +134,30 @@ def test_warning_for_each_kind_of_bad_log(
     ("change", "told"),
     [
         (with_stuck_laser, "The laser repeats one scan"),
-        (kidnapped, "contradict each other"),
         (lambda scans: [*scans[:40], *[scans[40]] * 10], None),  # A robot may stand.
     ],
 )
-def test_track_of_a_stuck_laser_or_a_carried_robot_is_unreliable(
+def test_track_of_a_stuck_laser_is_unreliable(
     scans: tuple[Scan, ...], change: Callable[[Scans], Scans], told: str | None
 ) -> None:
     _, track, notes = tracked(RobotLog(tuple(change(scans)), source="drive"))
     assert track.is_reliable is (told is None)
     assert any(told in note for note in notes) if told else notes == ()
+
+
+@pytest.mark.parametrize(("points", "found"), [(60, [3]), (12, [])])
+def test_few_points_do_not_show_that_the_robot_was_carried(points: int, found: list[int]) -> None:
+    """The first three scans see free space, and the last three some points in it."""
+    laser = LaserScanner(-math.pi / 2, math.pi / 180, 180, 30.0)
+    free = np.full(180, 8.0)
+    walls = np.where(np.arange(180) < points, 3.0, np.nan)
+    scans = [
+        Scan(ranges, laser, (0.0, 0.0, 0.0), None, None, k)
+        for k, ranges in enumerate([free] * 3 + [walls] * 3)
+    ]
+    shares = np.array([1.0, 1.0, 1.0, 0.0, 0.9, 0.9])
+    track = Track(np.zeros((6, 3)), np.zeros((6, 3, 3)), shares)
+    assert scans_after_a_carry(RobotLog(tuple(scans), source="drive"), track) == found
 
 
 def test_missing_odometry_does_not_turn_wrongly(scans: Scans) -> None:
@@ -177,8 +193,10 @@ def test_good_log_gets_no_warning_of_a_carry(
 def test_note_says_if_scans_that_contradict_others_are_far_from_them(
     scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(log_checks, "_contradictions", lambda log, track: [17])
-    assert "m apart: take all scans" in notes_of([*scans[:17], *scans[21:]])
+    monkeypatch.setattr(log_checks, "contradicting_scans", lambda log, track: [17])
+    _, track, notes = tracked(RobotLog((*scans[:17], *scans[21:]), source="drive"))
+    assert not track.is_reliable
+    assert any("m apart: take all scans" in note for note in notes)
     assert "take all scans" not in notes_of(scans)
 
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from perception.places.contradictions import scans_after_a_carry
 from perception.places.jumps import Doubt, Unknown, is_missing, unknown_steps
 from perception.places.track import (
     Array,
@@ -30,7 +31,7 @@ from perception.places.track import (
     points_turned,
     wrapped,
 )
-from perception.places.walls import ScanFit, Surfaces, in_sight, surfaces_in
+from perception.places.walls import FEW_POINTS, ScanFit, Surfaces, in_sight, surfaces_in
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.stored import in_turn
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
@@ -42,13 +43,10 @@ POINTS = 150
 # A match is poor if less than the share POOR of the points lies on walls. Then HEADINGS headings
 # are tried, because odometers miss turns, and logs miss lines.
 POOR, HEADINGS = 0.5, 24
-# A scan is of an unseen place if less than STRANGE of its points lies on walls, in IN_A_ROW scans
-# in a row.
-STRANGE, IN_A_ROW = 0.3, 3
-# Fewer points of a scan do not show whether its place was seen before.
-FEW_POINTS = 20
-# After at most this many metres, by odometry, a robot still sees some earlier walls.
-NEARBY = 1.0
+# Matching fails in at most 1.5 % of the scans of good logs.
+FAILING = 0.05
+# This many scans show whether a robot stood while its odometer stood still.
+IN_A_ROW = 3
 # Standard deviations of the motion without odometry, in metres and radians.
 UNKNOWN = (0.5, 0.5, 0.5)
 # The odometer turned wrongly if a well-matched scan differs by more than this, in radians.
@@ -86,8 +84,9 @@ def follow(log: RobotLog) -> Track:
     if standing:
         steps = steps.without(standing)
         track = _track_of(log, steps)
-    if more := frozenset(_carried(log, track)):
-        track = _track_of(log, replace(steps, carried=steps.carried | more))
+    # If matching fails in much of the log, contradictions do not show that the robot was carried.
+    if share_failing(track) <= FAILING and (more := scans_after_a_carry(log, track)):
+        track = _track_of(log, replace(steps, carried=steps.carried.union(more)))
     return track
 
 
@@ -100,8 +99,9 @@ def _stands(log: RobotLog, track: Track, first: int, last: int) -> bool:
     off = track.poses[first : last + 1, :2] - track.poses[first - 1, :2]
     if np.hypot(*off.T).max() > CARRIED:
         return False
-    known, begin = _known_before(log, track, first, track.breaks), log.scans[first - 1].odometry
-    wide, turns, shares = np.diag(UNKNOWN) ** 2, [], []
+    since = max(0, first - RECENT, *(b for b in track.breaks if b < first))
+    known = [surfaces_in(log.scans[k]).moved(track.poses[k]) for k in range(since, first)]
+    begin, wide, turns, shares = log.scans[first - 1].odometry, np.diag(UNKNOWN) ** 2, [], []
     for scan in log.scans[last : last + IN_A_ROW]:
         if len(seen := surfaces_in(scan)):
             onward = displacement_between(begin, scan.odometry)
@@ -111,12 +111,6 @@ def _stands(log: RobotLog, track: Track, first: int, last: int) -> bool:
     if not shares:  # the laser sees nothing
         return True
     return float(np.median(shares)) >= (SURE if np.median(turns) <= HELD else WELL)
-
-
-def _known_before(log: RobotLog, track: Track, scan: int, breaks: Iterable[int]) -> list[Surfaces]:
-    """List what the scans before a scan show, back to the last break, in the frame of the track."""
-    begin = max(0, scan - RECENT, *(b for b in breaks if b < scan))
-    return [surfaces_in(log.scans[k]).moved(track.poses[k]) for k in range(begin, scan)]
 
 
 def _track_of(log: RobotLog, steps: Unknown) -> Track:
@@ -243,41 +237,6 @@ class _ScanMotion:
         return Followed(self.scan, *best, cut=True) if best[2] >= SURE else None
 
 
-def _carried(log: RobotLog, track: Track) -> list[int]:
-    """Find scans to which the robot was carried while nothing was logged.
-
-    Such a scan and the scans after it show nothing that was seen before, although the robot hardly
-    drove since it last saw walls.
-    """
-    found: list[int] = []
-    for i in np.flatnonzero(track.shares < STRANGE).tolist():
-        before = (log.scans[k] for k in range(i - 1, -1, -1))
-        saw = next((scan for scan in before if len(surfaces_in(scan)) >= FEW_POINTS), None)
-        if (
-            saw is None
-            or math.dist(saw.odometry[:2], log.scans[i].odometry[:2]) > NEARBY
-            or i in track.breaks
-            or i + IN_A_ROW > len(log)
-            or (found and i < found[-1] + IN_A_ROW)
-        ):
-            continue
-        known = _known_before(log, track, i, (*track.breaks, *found))
-        if not any(map(len, known)):
-            continue
-        wide = np.diag(UNKNOWN) ** 2
-        seen = [surfaces_in(log.scans[k]) for k in range(i, i + IN_A_ROW)]
-        if min(map(len, seen)) < FEW_POINTS:
-            continue
-        shares = [
-            _matched(surfaces, known, track.pose(k), (0.0, 0.0, 0.0), wide)[2]
-            for k, surfaces in enumerate(seen, i)
-        ]
-        # The scans must match each other; otherwise the laser sees nothing.
-        if max(shares) < STRANGE and track.shares[i + 1 : i + IN_A_ROW].min() >= POOR:
-            found.append(i)
-    return found
-
-
 def share_failing(track: Track) -> float:
     """Compute the share of the scans that show walls, but hardly match what was seen before."""
     return float((track.shares < POOR).mean())
@@ -319,7 +278,7 @@ def _matched(
         fit = ScanFit(seen.some(POINTS), walls)
         share, pose, information = fit.improved(guess, weight)
         # A poor match may have a wrong heading: try others.
-        if share < POOR:
+        if share < POOR and len(seen) >= FEW_POINTS:
             turns = (wrapped(2 * math.pi * k / HEADINGS) for k in range(HEADINGS))
             turned = [guess + np.array([0, 0, turn]) for turn in turns if abs(turn) <= most]
             best = max(

@@ -40,16 +40,15 @@ from perception.places.distinctive import WIDTH, WINDOW, find_visits
 from perception.places.following import follow, share_failing, turned_wrongly
 from perception.places.live import LiveLog
 from perception.places.partings import with_partings
-from perception.places.tracing import DRIFT, to_trace, with_drives
+from perception.places.tracing import DRIFT, starts_of_drives, to_trace
 from perception.places.track import Array, Track
 from perception.places.units import HOPELESS
-from perception.places.unrelated import closures_across_cuts, parts_of
+from perception.places.unrelated import closures_across_cuts
 from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Damage, RobotLog, Scan
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
 from ssh_abduction.data.checks import a_number
-from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.loggers import log_of
@@ -208,12 +207,11 @@ def _imported(
         track = replace(track, factor=factor_of(track, visits, closings))
         visits, closings = with_partings(track, visits, closings)
         poses = fitted_poses(track, visits, closings)
-        across, part = closures_across_cuts(track, visits, poses), parts_of(track, visits)
-        trace = with_drives(to_trace(log, track, visits, [*closings, *across], name), part)
-        begun = (part[int(trace.steps[t].extra["visit"])] for t in starts_of(trace))
-        starts = tuple(track.cuts[number - 1] for number in begun)
+        closings += closures_across_cuts(track, visits, poses)
+        trace = to_trace(log, track, visits, closings, name)
     with _timed(seconds, "views"):
         trace = with_views(trace)
+    starts = tuple(starts_of_drives(track, visits).values())
     return Imported(trace, track, width, visits, seconds, notes, starts, poses)
 
 

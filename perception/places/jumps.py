@@ -148,9 +148,9 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
     """Say in notes where the odometry of a log is wrong: at cuts, breaks and some turns.
 
     At a *cut* the odometer jumped or hung, so the motion from one scan to the next is unknown.
-    At a *break* the scans show nothing of what was seen before: the robot may have been
-    carried. `turned` has the indices of scans at which the robot turned differently from the
-    odometry, and the differences in radians. There is a note for each kind of error.
+    At a *break* the scans do not fit those before them: the robot may have been carried. `turned`
+    has the indices of scans at which the robot turned differently from the odometry, and the
+    differences in radians. There is a note for each kind of error.
     """
     # At a cut after a long step, the odometer jumped. After none, it stood still while the robot
     # moved. At the end of a usual step, only the scans show that the robot was carried.
@@ -172,9 +172,9 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
         )
     if track.breaks:
         notes.append(
-            f"The scans show nothing of what was seen before, {times(len(track.breaks))}: from "
-            f"scan {track.breaks[0]} ({_where(log, track.breaks[0])}) on. The robot may have been "
-            "carried there. The rest is mapped as a separate drive."
+            f"The scans do not fit those before them, {times(len(track.breaks))}: from scan "
+            f"{track.breaks[0]} ({_where(log, track.breaks[0])}) on. The robot may have been "
+            "carried there, or another drive begins. The rest is mapped as a separate drive."
         )
     if gaps := _gaps(log, track):
         first = gaps[0]

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain
 
 from perception.errors import LogError
-from perception.places import jumps, log_checks
+from perception.places import contradictions, jumps, log_checks
 from perception.places.agreement import disagreement
 from perception.places.distinctive import WIDTH, visits_of
 from perception.places.following import Followed, GrowingTrack, poses_of_scans, turned_wrongly
@@ -68,7 +68,7 @@ class LiveLog:
         self._damaged: list[Damage] = []
         self._scans = ScanTable()
         self._begun: list[Scan] = []  # the first COMPARED scans, with their ranges
-        self._latest: deque[Scan] = deque(maxlen=log_checks.BESIDE + 1)
+        self._latest: deque[Scan] = deque(maxlen=contradictions.BESIDE + 1)
         self._poor = self._wanted = 0  # poor matches so far, and scans to keep after the last one
         self._done = GrowingTrack()
 
@@ -122,8 +122,8 @@ class LiveLog:
         if number < COMPARED:
             self._begun.append(one.scan)
         self._latest.append(one.scan)
-        if one.share < log_checks.POORLY and self._poor < MOST_POOR:
-            self._poor, self._wanted = self._poor + 1, log_checks.BESIDE
+        if one.share < contradictions.POORLY and self._poor < MOST_POOR:
+            self._poor, self._wanted = self._poor + 1, contradictions.BESIDE
             for back, scan in enumerate(reversed(self._latest), 1):
                 self._scans[-back] = scan
         elif self._wanted:

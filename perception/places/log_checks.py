@@ -7,29 +7,30 @@ of them (docs/measurements/robustness.md). Each check says what is wrong and wha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from perception.errors import LogError
 from perception.places import jumps
-from perception.places.following import share_failing
-from perception.places.track import Array, Track, odometer_covariance, wrapped
+from perception.places.contradictions import contradicting_scans
+from perception.places.following import FAILING, share_failing
+from perception.places.track import Track, odometer_covariance, wrapped
 from perception.places.units import FAR_OFF, LEAST_WAY, SIDEWAYS, SPARSE, ahead, units_of, way_of
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.stored import in_turn
 from ssh_abduction.data.errors import named
-from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.data.words import counted
 
 # In a shuffled log, scans some steps apart are about as far apart as neighbours: the quartiles of
 # their distances differ by at most this factor. In a drive, they grow with the number of steps. If
 # two sources of odometry alternate, the lower quartile is that of one source.
 LAGS, ALIKE = (2, 4, 8), 1.3
-# In good logs, matches fail in at most 1.5 % of the scans, and contradict the odometer in at most
-# 2 % of the steps. A contradiction is a chi-square above CONTRADICTS (three degrees of freedom).
-FAILING, OVERRIDING, CONTRADICTS = 0.05, 0.08, 25.0
+# In good logs, matches contradict the odometer in at most 2 % of the steps. A contradiction is a
+# chi-square above CONTRADICTS (three degrees of freedom).
+OVERRIDING, CONTRADICTS = 0.08, 25.0
 # Scans with fewer beams often match badly. Of the scans of good logs over a half circle, 41 to 95 %
 # fail to match with 20 beams, 0 to 35 % with 45, 0 to 7 % with 60, and at most 3 % with 90.
 FEW_BEAMS = 90
@@ -38,14 +39,6 @@ TO_AND_FRO = 0.8
 # A robot returns if it comes near a point where it was before, and drove at least AWAY metres in
 # between. Near is within NEAR metres, plus DRIFT metres for each metre driven in between.
 NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
-# Points of a scan intrude if they lie in the free space of the other scans, at least MARGIN metres
-# from walls. A scan contradicts the scans before it if two things hold: less than the share POORLY
-# of its points matches, and more than the share INTRUDING of either side intrudes. BESIDE scans on
-# each side are compared. In good logs, at most 27 % of the points of scans that match so badly
-# intrude. The share INTRUDING_RARELY suffices if the share that matches is more than WORSE below
-# the RARELY-th percentile of the log.
-INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
-INTRUDING_RARELY, WORSE, RARELY = 0.15, 0.25, 1.0
 # A laser is stuck if it repeats one scan while the robot drives this many metres.
 STUCK = 2.0
 # The laser is dark if DARK scans in a row show no wall.
@@ -273,7 +266,7 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
             f"wrong.{'' if explained and not _has_few_beams(log) else f' Do this: {advice(log)}.'}"
         )
     # If matching fails in much of the log, single contradictions say nothing more.
-    elif contradictions := _contradictions(log, track):
+    elif contradictions := contradicting_scans(log, track):
         notes.append(
             f"The scans before and after scan {contradictions[0]} (line or message "
             f"{log.scans[contradictions[0]].line}) contradict each other"
@@ -376,51 +369,3 @@ def _returns(track: Track) -> bool:
         if ((gap >= AWAY) & (far <= NEAR + DRIFT * gap)).any():
             return True
     return False
-
-
-def _contradictions(log: RobotLog, track: Track) -> list[int]:
-    """Find the scans that match badly and lie in the free space of the scans before them."""
-    found: list[int] = []
-    rare = float(np.nanpercentile(track.shares, RARELY)) - WORSE
-    for i in np.flatnonzero(track.shares < POORLY).tolist():
-        before, after = range(max(0, i - BESIDE), i), range(i, min(len(log), i + BESIDE))
-        if not before or track.cuts_between(i - BESIDE, i):
-            continue
-        most = INTRUDING_RARELY if track.shares[i] < rare else INTRUDING
-        # If the next scans do not contradict, this scan alone was matched wrongly.
-        if _contradict(log, track, before, after, most) and (
-            len(after) == 1 or _contradict(log, track, before, after[1:], most)
-        ):
-            found.append(i)
-    return found
-
-
-def _contradict(log: RobotLog, track: Track, before: range, after: range, most: float) -> bool:
-    """Whether more than the share `most` of the points of either scans intrude on the others."""
-    pairs = [pair for k in before for n in after for pair in ((k, n), (n, k))]
-    inside, seen = np.sum([_intruding(log, track, *pair) for pair in pairs], axis=0)
-    return bool(inside > most * seen)
-
-
-def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, int]:
-    """Count the points of scan `one` in the free space of `other`, and those in its view."""
-    pose = moved(track.pose(one), log.scans[one].laser.mount)
-    scan, laser = log.scans[other], log.scans[other].laser
-    x, y, heading = displacement_between(moved(track.pose(other), laser.mount), pose)
-    met = np.isfinite(log.scans[one].ranges) & (log.scans[one].ranges > 0)
-    angles = log.scans[one].laser.bearings[met] + heading
-    points = log.scans[one].ranges[met] * np.exp(1j * angles) + complex(x, y)
-    onward = math.copysign(1.0, laser.step)
-    beam = np.rint(onward * (np.angle(points) - laser.first) % math.tau / abs(laser.step))
-    beam = beam.astype(int)
-    in_view = (beam >= 1) & (beam < len(scan.ranges) - 1)
-    beam, far = beam[in_view], np.abs(points[in_view])
-    free = _neighbours(np.nan_to_num(scan.ranges, nan=0.0, posinf=laser.reach), beam, np.min)
-    wall = _neighbours(np.nan_to_num(scan.ranges, nan=0.0, posinf=laser.reach), beam, np.max)
-    margin = MARGIN + MARGIN / 8 * far
-    return int((far < free - margin).sum()), int((far < wall + MARGIN).sum())
-
-
-def _neighbours(ranges: Array, beam: Array, best: Callable[..., Array]) -> Array:
-    """For each of k beams, the `best` (np.min or np.max) of its range and its neighbours', (k,)."""
-    return best([ranges[beam - 1], ranges[beam], ranges[beam + 1]], axis=0)

@@ -67,6 +67,7 @@ def to_trace(
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
     arrivals: list[tuple[int, float]] = []  # the first step of each visit, and its heading
+    begun = list(starts_of_drives(track, visits))
     for number, (visit, patch) in enumerate(zip(visits, patches_of(visits), strict=True)):
         headings = _headings(visit, track)
         arrivals.append((len(steps), headings[0]))
@@ -75,11 +76,13 @@ def to_trace(
             steps.append(_step(log, track, visit, pose, patch, last, number))
             last = (visit, pose)
         if number < len(visits) - 1:
-            carried = track.span_of(visit.scan) != track.span_of(visits[number + 1].scan)
-            onward = Action.that_slipped(len(steps) - 1) if carried else Action.of("travel")
             extra = dict(steps[-1].extra)
             if not track.cuts_between(visit.scan, visits[number + 1].scan):
                 extra["course"] = _course(track, visit, visits[number + 1], headings[-1])
+            onward = Action.of("travel")
+            if number + 1 in begun:
+                part = begun.index(number + 1) + 2
+                onward = Action(f"{name} part {part}" if name else f"drive {part}", "start")
             steps[-1] = replace(steps[-1], action=onward, extra=extra)
     return Trace(
         tuple(_with_turns(steps, visits)),
@@ -90,21 +93,19 @@ def to_trace(
     )
 
 
-def with_drives(trace: Trace, part: Sequence[int]) -> Trace:
-    """Let a drive start where the odometer jumped, as the motion to that step is unknown.
+def starts_of_drives(track: Track, visits: Sequence[Visit]) -> dict[int, int]:
+    """Find the visits with which drives start, besides the first, and the scans at which they do.
 
-    Several cuts between two visits are an odometer that stood still, and not a jump. `part` says
-    for each visit how many cuts of the track are before it.
+    A drive starts where the robot may have been carried, and where the odometer jumped once.
+    Several cuts between two visits are an odometer that stood still, and not a jump.
     """
-    steps, drives = list(trace.steps), 1
-    for t, (last, step) in enumerate(pairwise(trace.steps)):
-        before, here = (part[int(one.extra["visit"])] for one in (last, step))
-        slipped = last.action is not None and last.action.slipped  # the robot was carried
-        if here == before + 1 and not slipped:
-            drives += 1
-            called = f"{trace.name} part {drives}" if trace.name else f"drive {drives}"
-            steps[t] = replace(last, action=Action(called, "start"))
-    return replace(trace, steps=tuple(steps))
+    found = {}
+    for number, (last, visit) in enumerate(pairwise(visits), 1):
+        cuts = track.cuts_between(last.scan, visit.scan)
+        begins = [cut for cut in cuts if cut in track.breaks] or (cuts if len(cuts) == 1 else [])
+        if begins:
+            found[number] = begins[-1]
+    return found
 
 
 def closure_of(found: VisitMatch, arrivals: Sequence[tuple[int, float]]) -> Closure:

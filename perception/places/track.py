@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -94,10 +93,6 @@ class Track:
     def spans(self) -> tuple[tuple[int, int], ...]:
         """For each unbroken part, the index of its first scan and the index after its last."""
         return tuple(pairwise((0, *self.breaks, len(self.poses))))
-
-    def span_of(self, scan: int) -> tuple[int, int]:
-        """Find the unbroken part with a scan: its first scan, and the scan after its last."""
-        return self.spans[bisect(self.breaks, scan)]
 
     def part(self, begin: int, end: int) -> Track:
         """Copy an unbroken part, scans begin … end - 1, to a track of its own in the same frame."""

@@ -23,6 +23,8 @@ FARTHEST = 25.0
 # Standard deviation in metres of the distance from a point to its wall: noise of the laser and
 # unevenness of walls.
 ROUGHNESS = 0.05
+# Fewer points of a scan do not show whether the robot is where it seems to be.
+FEW_POINTS = 20
 # Errors of neighbouring points are correlated: this many points count as one independent point.
 TOGETHER = 3
 # Largest distance in metres from a point to a wall: BEGIN in the first round, then SHRINK times as
