@@ -18,9 +18,9 @@ from perception.places.local_map import CELL, PackedPatch, Patch
 from perception.places.matching import Match, Scene, Turned, match
 from perception.places.tracing import closure_of, to_trace
 from perception.places.track import Track, odometer_covariance, points_turned
-from perception.places.visits import Visit
+from perception.places.visits import Visit, Way
 from perception.places.walls import Surfaces
-from perception.readers.scans import RobotLog
+from perception.readers.scans import LaserScanner, RobotLog, Scan
 from ssh_abduction.data.odometry import displacement_between
 
 # Corners of a room that looks different from all sides, in metres, counterclockwise.
@@ -150,6 +150,27 @@ def test_trace_has_the_closures_of_its_visits() -> None:
             ahead, left = points_turned(scan[2], np.array([[x, y]]))[0]
             poses.append((scan[0] + ahead, scan[1] + left, scan[2] + turn))
         assert closure.displacement == pytest.approx(displacement_between(*poses), abs=0.1)
+
+
+def test_trace_describes_the_ways_out_of_a_place() -> None:
+    """A corridor of 2 m ends 4 m ahead at a wall. Behind, the local map ends before it does."""
+    free = np.zeros((161, 161), np.bool_)
+    free[:120, 71:90] = True  # x from -8 to 3.9 m, y from -0.9 to 0.9 m
+    walls = np.zeros_like(free)
+    walls[120, 70:91] = walls[:121, 70] = walls[:121, 90] = True
+    patch = PackedPatch.of(Patch(free, walls, free & False, np.array([-8.0, -8.0])))
+    ways = (Way(0.0), Way(math.pi))
+    visit = Visit(0, np.zeros(2), 0, 0, radius=1.0, ways=ways, patch=patch)
+    laser = LaserScanner(-math.pi / 2, math.radians(1), 181, 8.0)
+    log = RobotLog((Scan(np.full(181, 8.0), laser, (0.0, 0.0, 0.0)),), source="corridor")
+    track = Track(np.zeros((1, 3)), np.zeros((1, 3, 3)), np.ones(1))
+    (step,) = to_trace(log, track, [visit]).steps
+    assert step.star is not None
+    for gateway, branch in zip(step.star, step.extra["branches"], strict=True):
+        ahead = abs(gateway.bearing) < 1
+        assert branch["width"] == pytest.approx(1.9, abs=0.15)
+        assert branch["length"] == pytest.approx(4.0 if ahead else 8.0, abs=0.15)
+        assert branch["end_seen"] is ahead
 
 
 def test_closure_is_relative_to_the_heading_of_the_earlier_step() -> None:

@@ -15,11 +15,13 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.places.closures import NOISE, VisitMatch, uncertainty
 from perception.places.local_map import CELL, PackedPatch
+from perception.places.stays import RIM, SMALL
 from perception.places.track import Array, Track, covariance_turned, points_turned, wrapped
-from perception.places.visits import Visit, patches_of
+from perception.places.visits import Visit, Way, patches_of
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.odometry import (
@@ -48,6 +50,8 @@ SCALE, DRIFT = 0.01, 0.001
 SPREAD = 16.0
 # A course is at most this many metres away from its polygonal chain.
 DETAIL = 0.1
+# Directions to the left and to the right of a way out, relative to it, in radians.
+SIDES = (math.pi / 2, -math.pi / 2)
 # Bearings of an image: a beam in each degree, from the right (-90) to the left (90).
 BEAMS = np.radians(np.arange(-90.0, 91.0))
 
@@ -164,6 +168,8 @@ def _step(
         extra["time"] = scan.time
     if cuts:  # They explain why there is no displacement.
         extra["cuts"] = cuts
+    if visit.ways:
+        extra["branches"] = _branches(visit, patch, pose[2])
     truth = None
     seen = displacement_between(track.pose(visit.scan), pose)
     extra["seen"] = [round(x, 4) for x in seen]
@@ -199,25 +205,67 @@ def _course(track: Track, first: Visit, last: Visit, heading: float) -> list[lis
 
 def _star(visit: Visit, heading: float) -> tuple[Gateway, ...]:
     """Make the star of a place as seen with a heading, clockwise from the back."""
-    seen = [(-math.degrees(wrapped(way.bearing - heading)), way.sure) for way in visit.ways]
     return tuple(
-        Gateway(round(bearing, 1), SPREAD, open=True if sure else None)
-        for bearing, sure in sorted(seen)
+        Gateway(
+            round(-math.degrees(wrapped(way.bearing - heading)), 1),
+            SPREAD,
+            open=True if way.sure else None,
+        )
+        for way in _clockwise(visit, heading)
     )
+
+
+def _clockwise(visit: Visit, heading: float) -> list[Way]:
+    """The ways out of a place, clockwise from behind a robot with a heading in radians."""
+    return sorted(visit.ways, key=lambda way: (-wrapped(way.bearing - heading), way.sure))
 
 
 def _image(patch: PackedPatch, middle: Array, heading: float) -> Array:
     """The ranges that a laser in the middle of a place would measure: (181,), metres."""
-    mask = patch.free
+    return _free_along(patch, middle, heading + BEAMS)[0]
+
+
+def _branches(visit: Visit, patch: PackedPatch, heading: float) -> list[dict[str, object]]:
+    """Describe the ways out of a place in its local map, in the order of its star.
+
+    `width` is the free space across a way where it leaves the disc, and `length` how far the space
+    is free from the middle, in metres. `end_seen` says whether an obstacle ends it there.
+    """
+    bearings = np.array([way.bearing for way in _clockwise(visit, heading)])
+    ahead = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+    middles = np.broadcast_to(visit.middle, ahead.shape)
+    rims = middles + (max(visit.radius, SMALL) + RIM) * ahead
+    lengths, ends = _free_along(patch, middles, bearings)
+    left, right = (_free_along(patch, rims, bearings + side)[0] for side in SIDES)
+    return [
+        {"width": round(width, 2), "length": round(length, 2), "end_seen": end_seen}
+        for width, length, end_seen in zip(
+            (left + right).tolist(), lengths.tolist(), ends.tolist(), strict=True
+        )
+    ]
+
+
+def _free_along(
+    patch: PackedPatch, starts: Array, bearings: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """How far the space of a local map is free from points in some directions, (k,) in metres.
+
+    `starts` is one point, (2,), or a point for each of the k bearings, (k, 2). Also return whether
+    an obstacle ends the free space, (k,). Otherwise the space beyond was not seen.
+    """
+    mask, occupied = patch.free, np.pad(patch.occupied, 1)
     far = np.arange(0.0, min(mask.shape) * CELL / 2, CELL / 2)
-    ahead = np.stack([np.cos(heading + BEAMS), np.sin(heading + BEAMS)], axis=1)
-    points = middle + far[None, :, None] * ahead[:, None, :]
+    ahead = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+    points = np.atleast_2d(starts)[:, None, :] + far[None, :, None] * ahead[:, None, :]
     cells = np.rint((points - patch.corner) / CELL).astype(int)
     inside = ((cells >= 0) & (cells < mask.shape)).all(axis=2)
     cells = np.clip(cells, 0, np.array(mask.shape) - 1)
     free = mask[cells[..., 0], cells[..., 1]] & inside
-    free[:, :4] = True  # The middle itself, within two cells, counts as free.
-    return np.asarray(np.where(free.all(axis=1), far[-1], far[np.argmin(free, axis=1)]))
+    free[:, :4] = True  # The point itself, within two cells, counts as free.
+    end = np.where(free.all(axis=1), len(far) - 1, np.argmin(free, axis=1))
+    rows, columns = cells[np.arange(len(end)), end].T
+    near = [occupied[rows + row, columns + column] for row in range(3) for column in range(3)]
+    return far[end], np.any(near, axis=0) & ~free.all(axis=1)
 
 
 @lru_cache(4096)
