@@ -57,7 +57,7 @@ def _intruding_shares(log: RobotLog, track: Track) -> dict[int, float]:
     for i in np.flatnonzero(track.shares < POORLY).tolist():
         before = [k for k in range(max(0, i - BESIDE), i) if seeing[k]]
         after = [k for k in range(i, min(len(log), i + BESIDE)) if seeing[k]]
-        if before and not track.cuts_between(i - BESIDE, i):
+        if before and not track.cuts_between(i - BESIDE, i + BESIDE - 1):
             # If the next scans do not contradict, this scan alone was matched wrongly.
             found[i] = min(
                 _intruding_share(log, track, before, some) for some in (after, after[1:]) if some
