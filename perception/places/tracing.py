@@ -71,7 +71,8 @@ def to_trace(
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
     arrivals: list[tuple[int, float]] = []  # the first step of each visit, and its heading
-    begun = list(starts_of_drives(track, visits))
+    # For each visit with which another drive starts, the number of this drive.
+    drives = {visit: drive for drive, visit in enumerate(starts_of_drives(track, visits), 2)}
     for number, (visit, patch) in enumerate(zip(visits, patches_of(visits), strict=True)):
         headings = _headings(visit, track)
         arrivals.append((len(steps), headings[0]))
@@ -84,9 +85,8 @@ def to_trace(
             if not track.cuts_between(visit.scan, visits[number + 1].scan):
                 extra["course"] = _course(track, visit, visits[number + 1], headings[-1])
             onward = Action.of("travel")
-            if number + 1 in begun:
-                part = begun.index(number + 1) + 2
-                onward = Action(f"{name} part {part}" if name else f"drive {part}", "start")
+            if drive := drives.get(number + 1):
+                onward = Action(f"{name} part {drive}" if name else f"drive {drive}", "start")
             steps[-1] = replace(steps[-1], action=onward, extra=extra)
     return Trace(
         tuple(_with_turns(steps, visits)),
