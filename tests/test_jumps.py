@@ -24,7 +24,7 @@ from perception.places.track import Track
 from perception.places.visits import Visit
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.checker.checker import check
-from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.drives import drives_of, starts_of
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.solver import solve
 
@@ -94,6 +94,7 @@ def test_trace_has_no_displacement_across_a_cut(
     )
     (t,) = (t for t, step in enumerate(done.trace.steps) if t and step.displacement is None)
     assert (done.trace.steps[t].extra["cuts"], done.trace.steps[t].covariance) == ([65], None)
+    assert [drive.name for drive in drives_of(done.trace)] == ["drive 1", "drive 2"]
     solution = solve(done.trace, max_maps=1, time_limit=0.5)
     assert solution.maps
     assert not check(done.trace, solution.maps[0], solution.theory)

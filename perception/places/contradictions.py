@@ -87,8 +87,8 @@ def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, 
     beam = beam.astype(int)
     in_view = (beam >= 1) & (beam < len(scan.ranges) - 1)
     beam, far = beam[in_view], np.abs(points[in_view])
-    free = _neighbours(np.nan_to_num(scan.ranges, nan=0.0, posinf=laser.reach), beam, np.min)
-    wall = _neighbours(np.nan_to_num(scan.ranges, nan=0.0, posinf=laser.reach), beam, np.max)
+    ranges = np.nan_to_num(scan.ranges, nan=0.0, posinf=laser.reach)
+    free, wall = (_neighbours(ranges, beam, best) for best in (np.min, np.max))
     margin = MARGIN + MARGIN / 8 * far
     return int((far < free - margin).sum()), int((far < wall + MARGIN).sum())
 
