@@ -3,10 +3,7 @@
     python benchmarks/cell.py TOOL INSTANCE SEED SECONDS MIB [CLOCK]
 
 TOOL is another program (a peer), ssh-abduction, or "ssh-abduction without" and names of speed-ups,
-separated by commas. `following` is a name for this script only, and no speed-up that users can
-switch off. Without it, the solver does not guess maps of the beginning of a long causal trace, to
-follow them along the rest. CLOCK is wall, or cpu: then seconds and limits are CPU seconds of this
-process.
+separated by commas. CLOCK is wall, or cpu: then seconds and limits are CPU seconds of this process.
 
 A first line is printed when the clock starts, and a second line with the result. A signal ends the
 process when its time is over. Loading programs, making the trace and checking the answer do not
@@ -77,7 +74,7 @@ def main() -> None:
         with contextlib.redirect_stdout(io.StringIO()):
             if tool.startswith(OURS):
                 end_after(limit * (1 + MARGIN) + 1, timer)
-                speedups = all_but(tool.removeprefix(OURS).removeprefix(WITHOUT))
+                speedups = Speedups.without(tool.removeprefix(OURS).removeprefix(WITHOUT))
                 search = Search(
                     trace,
                     theory,
@@ -147,16 +144,6 @@ def of_machine(machine: Machine, trace: Trace, proven: bool) -> dict[str, Any]:
     if states is None:
         return {"status": "wrong", "reason": "the machine does not show the views of the trace"}
     return {"status": "ok", "reason": "", "dstates": states, "proven": proven}
-
-
-def all_but(names: str) -> Speedups:
-    """Return all speed-ups except those named, separated by commas."""
-    off = names.split(",")
-    if "following" in off:
-        off.remove("following")
-        small = importlib.import_module("ssh_abduction.solver.engines.small_maps")
-        small.SmallMaps.from_beginning = lambda *_: iter(())
-    return Speedups.without(off)
 
 
 def cpu_seconds() -> float:

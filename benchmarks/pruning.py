@@ -7,10 +7,9 @@ of a seed is the seconds without the speed-up divided by the seconds with it. In
 compares the dstates of the best maps at the time limit instead. A speed-up stays if the median
 ratio over the seeds is at least GAIN on two families. Seconds are CPU seconds unless TRIALS says
 otherwise, so other work on the machine hardly matters. A search that hits its limit counts as if it
-had ended at the limit, so the true ratio is at least as far from 1. `following` is no speed-up that
-users can switch off; cell.py says what is left out without it. Each run has its own process, and
-only one runs at a time. Results are stored as JSON after each run; --resume continues a stored run.
-readme.py writes the table into docs/measurements/performance.md.
+had ended at the limit, so the true ratio is at least as far from 1. Each run has its own process,
+and only one runs at a time. Results are stored as JSON after each run; --resume continues a stored
+run. readme.py writes the table into docs/measurements/performance.md.
 """
 
 from __future__ import annotations
@@ -37,7 +36,6 @@ STAYING = 2  # on this many families of instances.
 FAMILIES = 3  # Fewer families are too few to remove a speed-up.
 LIMIT = 4.0  # Seconds of a search.
 LONGER = 12.0  # Seconds if little gain was expected, or if maps take long.
-PROVING = 60.0  # seconds where only a long search proves anything
 SHORT = 3.0  # Seconds if the first map matters, before a proof is possible.
 MEMORY = 4096  # MiB
 
@@ -81,7 +79,6 @@ BARE_CORRIDORS, PATTERNS = (
     "full maze 4x4 n=40, corridors followed, no stars",
     "full maze 3x3 n=60, stars as patterns",
 )
-LONG = ("maze 4x4 n=10000", "maze 5x5 n=10000, corridors followed", "moore 16/2 n=10000")
 
 
 def _timed(switch: str, *families: str, limit: float = LIMIT, clock: str = "cpu") -> list[Trial]:
@@ -93,9 +90,6 @@ def _ended(switch: str, *families: str, limit: float = LIMIT, clock: str = "cpu"
 
 
 TRIALS = (
-    *_timed("following", *LONG, limit=LONGER),
-    *_ended("following", "maze 6x6 n=10000", "maze 5x5 n=10000", limit=LONGER),
-    *_ended("following", "maze 8x8 n=10000", limit=2 * LONGER),
     *_timed("names", QUICK_MAZE, MACHINE_16, STARS),
     *_timed("clique", QUICK_MAZE, MACHINE_16, STARS),
     *_timed("lazy", QUICK_MAZE, MACHINE_16, CORRIDORS, STARS),
@@ -114,13 +108,6 @@ TRIALS = (
         "full maze 5x5 n=1600, no stars",
         limit=2 * LIMIT,
     ),
-    *_timed("annealed", QUICK_MAZE),
-    *_ended("annealed", "maze 6x6 n=1600", "full maze 10x10 n=400", limit=2 * LIMIT),
-    *_ended("annealed", "maze 6x6 n=10000", limit=LONGER),
-    *_ended("annealed", "maze 6x6 n=10000", limit=PROVING),
-    *_ended("annealed", "maze 8x8 n=10000", limit=2 * LONGER),
-    *_timed("annealed", "maze 5x5 n=10000", limit=PROVING),
-    *_timed("annealed", "full maze 5x5 n=1600", limit=LONGER),
     *_timed("greedy", QUICK_MAZE),
     *_ended("greedy", "maze 6x6 n=10000", "full maze 10x10 n=4000", limit=SHORT),
 )

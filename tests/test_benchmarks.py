@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import random
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +20,7 @@ from peers import PEERS, Machine, Words
 from suite import INSTANCES, SUITE
 
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
+from ssh_abduction.theory.speedups import SPEEDUPS
 
 pytestmark = pytest.mark.slow
 
@@ -283,22 +280,6 @@ def test_benchmark_limit_counts_processor_time() -> None:
     assert late["status"] == "timeout"
     assert late["seconds"] == pytest.approx(late["cpu"], abs=0.1)
     assert 0.3 < late["seconds"] < 5
-
-
-def test_following_is_switched_off_though_users_cannot() -> None:
-    script = (
-        "from cell import all_but; from ssh_abduction.solver.engines.small_maps import SmallMaps "
-        "as E; print(all_but('following'), list(E.from_beginning(E)))"
-    )
-    said = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=ROOT / "benchmarks",
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert said.stdout == f"{Speedups()} []\n"
 
 
 def test_growth_picture_is_drawn_from_the_stored_run(tmp_path: Path) -> None:

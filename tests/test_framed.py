@@ -10,7 +10,7 @@ from unittest.mock import patch
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from instances import Walk, maze
+from instances import maze
 from strategies import STARS, step_pairs
 
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
@@ -36,8 +36,6 @@ from ssh_abduction.solver.engines.framed_paths import FramedPaths
 from ssh_abduction.solver.engines.framed_sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
 from ssh_abduction.solver.engines.visit_program import VisitProgram
-from ssh_abduction.solver.guesses import annealing, sampling
-from ssh_abduction.solver.guesses.annealing import annealed
 from ssh_abduction.solver.guesses.merging import merged
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
@@ -587,50 +585,6 @@ def test_search_with_a_known_cost_lists_maps_of_the_whole_trace() -> None:
     assert not again.prefix
     assert set(again) == set(solve(trace, max_maps=None).maps)
     assert again.prefix == len(trace)
-
-
-def places(walk: Walk, chart: FramedChart) -> list[object]:
-    """The true place of each visit."""
-    place = {
-        chart.facing[node][0]: state[:2]
-        for node, state in zip(chart.node_of, walk.truth, strict=True)
-        if isinstance(state, tuple)
-    }
-    return list(place.values())
-
-
-def test_annealing_finds_the_true_places_of_a_maze() -> None:
-    walk = maze(4, 4, steps=400, seed=0, stars=True)
-    chart = Chart.framed(walk.trace, Log(walk.trace, Theory(star="frame")))
-    guess = annealed(chart)
-    assert guess.sure.all()
-    guessed = (guess.states // 4).tolist()
-    assert (
-        len(set(zip(guessed, places(walk, chart), strict=True)))
-        == len(set(guessed))
-        == len(set(places(walk, chart)))
-    )
-
-
-@settings(max_examples=15)
-@given(framed_traces(), st.integers(1, 20))
-def test_annealed_visits_of_a_place_have_one_star(trace: Trace, sweeps: int) -> None:
-    """Check an uncertain guess, too: the visits of a place have the same star in its frame."""
-    chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
-    if chart is None:
-        return
-    with (
-        patch.object(annealing, "STAGES", ((0.5, sweeps),)),
-        patch.object(annealing, "SECONDS", 0.0),
-        patch.object(sampling, "LAST", 1),
-    ):
-        guess = annealed(chart)
-    assert len(guess.states) == len(guess.sure) == len(chart.stars)
-    stars: dict[int, tuple[int, ...]] = {}
-    for state, star in zip(guess.states.tolist(), chart.stars, strict=True):
-        place, turned = divmod(state, 4)
-        framed_star = tuple(star[(slot - turned) % 4] for slot in range(4))
-        assert stars.setdefault(place, framed_star) == framed_star
 
 
 def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:

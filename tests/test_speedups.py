@@ -33,7 +33,6 @@ from ssh_abduction.solver.engines import (
     name_program,
     name_search,
     pinned,
-    small_maps,
 )
 from ssh_abduction.solver.engines import named_labels as named
 from ssh_abduction.solver.guesses import robust
@@ -92,7 +91,6 @@ def test_any_speedups_give_the_maps_of_the_plain_encoding(
         patch.multiple(name_search, PATIENCE=patience, CORES=cores),
         patch.object(name_program, "MORE_LINKS", 2),
         patch.object(pinned, "AT_ONCE", at_once),
-        patch.object(small_maps, "AT_ONCE", at_once),
         patch.object(choosing, "FEW_STEPS", 0),
     ):
         found = solve(trace, Theory.causal(), max_maps=None, speedups=Speedups.without(off))
@@ -156,8 +154,8 @@ def reads_of(case: str) -> list[str]:
 def test_each_speedup_is_used_in_some_case() -> None:
     """If no case used a speed-up, the tests below would not test it."""
     read = {name for case in CASES for name in reads_of(case)}
-    # tests/test_onto.py tests `digest`, and tests/test_nearby.py tests `annealed`.
-    assert read == set(NAMES) - {"digest", "annealed"}
+    # tests/test_onto.py tests `digest`, and tests/test_nearby.py tests `guessed`.
+    assert read == set(NAMES) - {"digest", "guessed"}
 
 
 @pytest.mark.slow
@@ -292,13 +290,13 @@ def test_dstates_merged_joins_equal_dstates() -> None:
 
 
 def test_interrupted_search_returns_a_map_of_merged_steps() -> None:
-    """If clingo is slow and no guess is annealed, the map is smaller than a greedy one."""
+    """If clingo is slow and no map is guessed, the map is smaller than a greedy one."""
     walk = maze(5, 5, steps=1600, seed=0)
     with (
         patch.multiple(name_search, PATIENCE=1, CORES=1),
         patch.object(name_program.NameProgram, "more_links", side_effect=[[], KeyboardInterrupt]),
     ):
-        speedups = Speedups.without("prefixes,annealed")
+        speedups = Speedups.without("prefixes,guessed")
         solution = solve(walk.trace, Theory.causal(), speedups=speedups)
     assert solution.status is Status.FEASIBLE
     assert solution.cost

@@ -43,7 +43,7 @@ class Speedups:
     lazy: bool = True
     core_guided: bool = True
     sides: bool = True
-    annealed: bool = True
+    guessed: bool = True
     framing: bool = True
     ways: bool = True
     greedy: bool = True
@@ -99,8 +99,17 @@ def checked_speedups(value: object) -> Speedups:
 SPEEDUPS = tuple(f.name for f in fields(Speedups))
 EVERY: Final = None
 NOTHING: frozenset[str] = frozenset()
-# Speed-ups of version 0.1.0 that gained too little.
-REMOVED = ("from_below", "apart", "small_cores", "watched", "one_by_one", "threads", "processes")
+# Speed-ups that gained too little.
+REMOVED = (
+    "from_below",
+    "apart",
+    "small_cores",
+    "watched",
+    "one_by_one",
+    "threads",
+    "processes",
+    "annealed",
+)
 
 
 @dataclass(frozen=True)
@@ -363,8 +372,8 @@ TABLE = (
         "Raise the lower bound by unsat cores, instead of improving a map step by step.",
     ),
     Speedup(
-        "annealed",
-        "annealed",
+        "guessed",
+        "guessed",
         "If clingo takes long, search for a map near a guess. The checker judges this map.",
     ),
     Speedup(

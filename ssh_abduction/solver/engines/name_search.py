@@ -149,9 +149,7 @@ class NameSearch:
     @property
     def _may_help(self) -> bool:
         """Whether to look for small maps in other ways. These obey the causal axioms only."""
-        return self._fitting is None and (
-            self._task.speedups.greedy or self._task.speedups.annealed
-        )
+        return self._fitting is None and (self._task.speedups.greedy or self._task.speedups.guessed)
 
     def _helped(self) -> Iterator[list[int]]:
         """Look for small maps in other ways, as clingo takes long. Yield the dstates of steps."""
@@ -166,9 +164,8 @@ class NameSearch:
 
     def _near_a_guess(self) -> Iterator[list[int]]:
         """Guess maps. Yield the labels of each with fewer dstates than all maps before."""
-        is_long = self._program.pinned.is_long
         known = self._incumbent.labels
-        for labels in self._small.from_beginning() if is_long else self._small.guessed():
+        for labels in self._small.guessed():
             if known is None or len(set(labels)) < len(set(known)):
                 known = labels
                 yield labels

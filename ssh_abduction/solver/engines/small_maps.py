@@ -3,31 +3,25 @@
 They are for long traces. If the search has to stop, there is at least a good map. And if a map has
 as few dstates as the lower bound, the search can end.
 
-First, steps are merged by evidence (`guesses/merging.py`). Then a map is guessed: by annealing
-(`guesses/annealing.py`) the places, if turns may be rotations by right angles, or otherwise by EM
-(`guesses/robust.py`) the dstates. Of a long trace, only the first steps are guessed. The guess is
-then followed along the other steps (`guesses/continuing.py`).
+First, steps are merged by evidence (`guesses/merging.py`). Then, if actions are neither travels nor
+turns, dstates are guessed by EM (`guesses/robust.py`).
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
 
-from ssh_abduction.solver.engines.base import AT_ONCE, Task
+from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.pinned import Pinned
-from ssh_abduction.solver.guesses.annealing import annealed
-from ssh_abduction.solver.guesses.continuing import labels_continued
 from ssh_abduction.solver.guesses.merging import dstates_merged, merged
 from ssh_abduction.solver.guesses.robust import machine_labels
 from ssh_abduction.solver.steps.chart import Chart
 
-# If turns cannot be rotations, stop after this many guesses, even if none of them is a map. Guesses
-# are slow, and later ones are rarely better.
+# Stop after this many guesses, even if none of them is a map. Guesses are slow, and later ones are
+# rarely better.
 GUESSES = 10
-# Guess at most this many steps of a long trace at once. More steps take minutes.
-GUESSED = 24_000
 
 
 class SmallMaps:
@@ -42,59 +36,23 @@ class SmallMaps:
         if self._task.speedups.greedy:
             yield merged(self._pinned.chart, self._pinned.clique)
 
-    def from_beginning(self) -> Iterator[list[int]]:
-        """Guess a map of the first steps of a long trace, extend it, and yield labels of all steps.
-
-        Guess ever longer prefixes, until the map of the whole trace needs no more dstates than the
-        map of the prefix.
-        """
-        chart = self._pinned.chart
-        size, steps = len(chart.seen), AT_ONCE
-        most = size if size <= GUESSED else 2 * AT_ONCE
-        while self._task.speedups.annealed:
-            beginning = Pinned.of_steps(self._task.log, steps)
-            near = min(self._maps_of_guesses(beginning), key=_dstates, default=None)
-            tried = () if near is None else (dstates_merged(beginning.chart, near), near)
-            for known in tried:
-                if labels := labels_continued(self._task.log, known):
-                    yield labels[:size]
-                    yield (labels := dstates_merged(chart, labels[:size]))
-                    if _dstates(labels) <= _dstates(known):
-                        return
-            if steps == most:
-                return
-            steps = min(2 * steps, most)
-
     def guessed(self) -> Iterator[list[int]]:
-        """Yield the labels of guessed maps, if speed-up `annealed` is on."""
-        if self._task.speedups.annealed:
-            for near in self._maps_of_guesses(self._pinned):
-                yield dstates_merged(self._pinned.chart, near)
-
-    def _maps_of_guesses(self, pinned: Pinned) -> Iterator[list[int]]:
-        """Guess dstates, and yield the labels of a map near each guess.
+        """Yield the labels of a map near each guess at the dstates, if speed-up `guessed` is on.
 
         The first guess that is itself a map is the last one. There is no guess if that takes too
-        much memory.
+        much memory, of a long trace, and where a robot travels and turns: there merging does as
+        well in less time.
         """
-        steps = pinned.chart
-        chart = Chart.turned(self._task.trace, self._task.log, len(steps.seen))
-        if chart is None:  # turns cannot be rotations by right angles
-            actions = [action for _, action, _ in steps.links]
-            guesses: Iterable[list[int]] = islice(machine_labels(steps.seen, actions), GUESSES)
-        else:
-            labels = annealed(chart).labels(chart)
-            guesses = [[labels[node] for node in chart.node_of]]
-        for labels in guesses:
+        steps, speedups = self._pinned.chart, self._task.speedups
+        drives = all(action.kind for action in self._task.trace.actions)
+        if not speedups.guessed or drives or self._pinned.is_long:
+            return
+        actions = [action for _, action, _ in steps.links]
+        for labels in islice(machine_labels(steps.seen, actions), GUESSES):
             guess = mended(labels, steps)
-            yield merged(steps, guess=guess)
+            yield dstates_merged(steps, merged(steps, guess=guess))
             if steps.is_map(guess):
                 return
-
-
-def _dstates(labels: Sequence[int]) -> int:
-    """Count the dstates of labels."""
-    return len(set(labels))
 
 
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:

@@ -101,57 +101,10 @@ class Chart:
         )
 
     @staticmethod
-    def turned(trace: Trace, log: Log, size: int) -> FramedChart | None:
-        """Make the chart of the first `size` steps of a trace without stars, as if it had frames.
-
-        The observations ahead, right, back and left are used instead of a star (the openings seen).
-        This is a guess, as turns need not rotate the robot in the causal theory. Returns None if
-        `around` finds no views, or if some visit contradicts them.
-        """
-        around = Chart.around(trace, log, size)
-        return None if around is None else Chart.framed(trace, log, size, around)
-
-    @staticmethod
-    def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]] | None:
-        """For each observation, find what the robot there sees ahead, right, back and left.
-
-        Returns None if some action is neither turn nor travel, if a turn leads from one observation
-        to two different ones, or if some of the four observations are unknown.
-        """
-        # For an observation and a number of quarters clockwise: the observation after that turn.
-        after: dict[tuple[int, int], int] = {}
-        for action, before, then in zip(
-            trace.actions[: size - 1], log.seen, log.seen[1:], strict=False
-        ):
-            if action.kind is None:
-                return None
-            if action.turn:
-                quarters = QUARTERS[action.turn]
-                if (
-                    after.setdefault((before, quarters), then) != then
-                    or after.setdefault((then, 4 - quarters), before) != before
-                ):
-                    return None
-        found: dict[int, list[int]] = {}
-        for seen in dict.fromkeys(log.seen[:size]):
-            views = _views_around(seen, after)
-            if views is None:
-                return None
-            found[seen] = views
-        return found
-
-    @staticmethod
-    def framed(
-        trace: Trace,
-        log: Log,
-        size: int | None = None,
-        around: Mapping[int, Sequence[int]] | None = None,
-    ) -> FramedChart | None:
+    def framed(trace: Trace, log: Log, size: int | None = None) -> FramedChart | None:
         """Make the chart of the first steps, or of all, for places with frames.
 
-        `around` has, for each observation, the four observations ahead, right, back and left of a
-        robot that makes it. They replace the stars of the trace. Returns None if some visit
-        contradicts itself, so that there is no map with frames.
+        Returns None if some visit contradicts itself, so that there is no map with frames.
         """
         size = len(trace) if size is None else size
         node: dict[tuple[int, int], int] = {}
@@ -166,7 +119,7 @@ class Chart:
                 visit, slot = visit + 1, 0
             elif t:
                 slot = (slot + QUARTERS[action.turn]) % 4
-            openings = (trace.steps[t].openings if around is None else around[log.seen[t]]) or ()
+            openings = trace.steps[t].openings or ()
             star = tuple(int(openings[(k - slot) % 4]) for k in range(4))
             if visit == len(stars):
                 stars.append(star)
@@ -322,24 +275,3 @@ def _rotations(node: Mapping[tuple[int, int], int]) -> Iterator[Link]:
 def _pairs_within(earlier: Earlier, size: int) -> list[tuple[int, int]]:
     """List the pairs of steps that are both among the first `size`, the earlier step first."""
     return [(i, t) for t, others in earlier.items() if t < size for i in others]
-
-
-def _views_around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int] | None:
-    """Find the observations ahead, right, back and left of a robot that makes an observation.
-
-    `after` has, for (observation, quarters clockwise), the observation after that turn. Returns
-    None if some are unknown, or if turns contradict each other.
-    """
-    views = {0: seen}
-    waiting = [0]
-    while waiting:
-        here = waiting.pop()
-        for quarters in QUARTERS.values():
-            there = (here + quarters) % 4
-            if (then := after.get((views[here], quarters))) is None:
-                continue
-            if there not in views:
-                waiting.append(there)
-            if views.setdefault(there, then) != then:
-                return None
-    return [views[slot] for slot in range(4)] if len(views) == 4 else None
