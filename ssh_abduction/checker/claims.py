@@ -23,7 +23,7 @@ from ssh_abduction.theory.theory import Theory
 
 STATUSES = ("optimal", "feasible", "unsatisfiable", "unknown")
 # Why a search may have been stopped.
-REASONS = ("time limit", "memory limit", "interrupted", "maps limit", "no proof")
+REASONS = ("work limit", "time limit", "memory limit", "interrupted", "maps limit", "no proof")
 
 
 def false_claims(

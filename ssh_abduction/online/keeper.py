@@ -139,7 +139,7 @@ class MapKeeper:
         found = tuple(search.unranked())
         said = search.solution()
         self.search, self._found, self.searches = search, said, self.searches + 1
-        was_stopped = search.stopped in ("time limit", "interrupted")
+        was_stopped = search.stopped in ("work limit", "time limit", "interrupted")
         later = max(len(trace) + PAUSE, int(RETRY * len(trace)))
         self._next_search = later if was_stopped else 0
         proves = said.status in (Status.OPTIMAL, Status.UNSATISFIABLE)

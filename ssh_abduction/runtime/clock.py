@@ -1,4 +1,8 @@
-"""Check time limits and Ctrl-C in code that has no access to the search that called it.
+"""Count work, and check limits and Ctrl-C in code without access to the search that called it.
+
+Work is counted for each thread: a unit of work is about a second of a quiet core. The same search
+does the same work on each machine and under each load, so a work limit always gives the same
+answer. Loops count their work as they call `look_at_clock`.
 
 A search passes a function that checks its limits to `heeding`. The checker, the evidence and the
 guesses call `look_at_clock` in long loops, which calls this function. Outside of a search,
@@ -15,6 +19,8 @@ TimeoutError: the time is over
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -22,11 +28,70 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 
+# The work of a turn of a loop that looks at the clock, in microunits, if it names no other number.
+TURN = 100
+MICRO = 1_000_000  # microunits in a unit; whole numbers add up to the same sum in each order
+
+
+class _Done(threading.local):
+    """The work that this thread has done, in microunits."""
+
+    micro = 0
+
+
+_done = _Done()
+_counting: ContextVar[bool] = ContextVar("counting", default=False)
 _check: ContextVar[Callable[[], None] | None] = ContextVar("check", default=None)
 
 
-def look_at_clock() -> None:
-    """Call the checks of the surrounding `heeding` blocks. They raise if the work has to end."""
+def count_work(micro: int) -> None:
+    """Add to the work that this thread has done, in microunits."""
+    _done.micro += micro
+
+
+def work_done() -> float:
+    """Return the units of work that this thread has done."""
+    return _done.micro / MICRO
+
+
+def counts_work() -> bool:
+    """Whether the surrounding search measures its time by work, not in seconds."""
+    return _counting.get()
+
+
+def now() -> float:
+    """Return the time on the clock of the surrounding search: units of work, or seconds."""
+    return work_done() if _counting.get() else time.perf_counter()
+
+
+@contextmanager
+def counting(is_on: bool) -> Iterator[None]:
+    """Make `now` measure work inside a `with` block, or seconds if `is_on` is False."""
+    before = _counting.set(is_on)
+    try:
+        yield
+    finally:
+        _counting.reset(before)
+
+
+def each_counting(is_on: bool, items: Iterator[Item]) -> Iterator[Item]:
+    """Yield the items of an iterator. Only its own work runs within `counting(is_on)`."""
+    while True:
+        with counting(is_on):
+            try:
+                item = next(items)
+            except StopIteration:
+                return
+        yield item
+
+
+def look_at_clock(micro: int = TURN) -> None:
+    """Count work, and call the checks of the `heeding` blocks. They raise if it has to end.
+
+    Args:
+        micro: The work since the last call, in microunits.
+    """
+    _done.micro += micro
     check = _check.get()
     if check is not None:
         check()

@@ -55,7 +55,7 @@ class Answer:
         parts, known, task = self._parts, self._parts.known, self._parts.task
         levels = tuple(replace(level, complete=parts.rivals.listed) for level in self._levels)
         asker = parts.engine.asker
-        seconds = Seconds(parts.watch.elapsed(), asker.ground_seconds, asker.solve_seconds)
+        seconds = Seconds(parts.watch.seconds(), asker.ground_seconds, asker.solve_seconds)
         # If a limit came before the pairs of steps were compared, the evidence said nothing yet.
         is_said = task.log.has_pairs or known.stopped is None
         kinds = task.problem.evidence if is_said else ()

@@ -19,7 +19,7 @@ from ssh_abduction.data.drives import joined_drives, together
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Trace, checked_trace
-from ssh_abduction.runtime.clock import heeding
+from ssh_abduction.runtime.clock import counting, heeding
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
@@ -55,6 +55,7 @@ def solve(
     max_maps: int | None = 100,
     within: int = 0,
     memory_limit: int | None = None,
+    work_limit: float | None = None,
     speedups: Speedups = ALL,
     on_progress: Callable[[Progress], None] | None = None,
     corrections: Corrections | None = None,
@@ -70,6 +71,9 @@ def solve(
             (`data.together`). `ssh_map.labels` has one sequence of labels for each trace.
         theory: The axioms and the preference; Theory.topological() by default.
         time_limit: Seconds of wall-clock time. At this limit the best answer so far is returned.
+        work_limit: Units of work, at which the best answer so far is returned. A unit is about a
+            second of a quiet core. One trace, theory and work limit give one answer, on each
+            machine and under each load, unless the time limit comes first.
         max_maps: List at most this many maps; None lists all. After the last map, the search goes
             on for a second, or for a tenth of the time so far if that is more. The answer is
             `complete` only if this proves that no further map exists.
@@ -100,15 +104,16 @@ def solve(
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
     joint = together(trace) if isinstance(trace, list | tuple | Iterator) else checked_trace(trace)
-    Limits(time_limit, memory_limit)  # checks them
-    watch = Watch(time_limit, memory_limit)
+    Limits(time_limit, memory_limit, work_limit=work_limit)  # checks them
+    watch = Watch(time_limit, memory_limit, work=work_limit)
     watch.start()
 
     def find(trace: Trace, theory: Theory, known: Sequence[SSHMap] = ()) -> Solution:
         search = Search(
             trace,
             theory,
-            time_limit=None if time_limit is None else max(watch.left(), LEAST_SECONDS),
+            time_limit=None if time_limit is None else max(watch.seconds_left(), LEAST_SECONDS),
+            work_limit=None if work_limit is None else max(watch.left(), LEAST_SECONDS),
             max_maps=max_maps,
             within=within,
             memory_limit=memory_limit,
@@ -119,7 +124,8 @@ def solve(
         return search.solution(tuple(search))
 
     if onto is not None:
-        solution = solve_onto(joint, onto, theory, corrections, Solving(find, speedups, watch))
+        with counting(watch.counts_work):
+            solution = solve_onto(joint, onto, theory, corrections, Solving(find, speedups, watch))
         return _with_warnings(solution, corrections, time_limit, memory_limit)
     theory = checked_theory(theory)
     theory.check_steps(joint)

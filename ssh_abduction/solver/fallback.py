@@ -10,7 +10,7 @@ from itertools import zip_longest
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.clock import each_looking, heeding
+from ssh_abduction.runtime.clock import counts_work, each_looking, heeding
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.candidates import has_quick_map
@@ -114,7 +114,7 @@ def late_clash(
     said = [max(pair) for pair in (*task.theory.same, *task.theory.same_place)]
     ends = dict.fromkeys((*parts.candidates.contradicting, *said))
     stretches = _stretches(task.trace, [end for end in ends if end < len(task.trace)])
-    part = Watch().part(CLASHING, time.thread_time)
+    part = Watch().part(CLASHING, None if counts_work() else time.thread_time)
     with suppress(LimitError, KeyboardInterrupt), heeding(part.check):
         clash = clash_in(task.trace, task.theory, stretches, maps_of)
     if clash is not None:
@@ -138,7 +138,8 @@ def best_map(parts: Parts) -> Iterator[Priced]:
 
 def overtime(parts: Parts) -> float:
     """Return the seconds that are left to make a map without a search, or to check one."""
-    limit = parts.limits.time_limit
-    if parts.known.stopped != "time limit" or limit is None:
+    limits = parts.limits
+    limit = limits.time_limit if limits.work_limit is None else limits.work_limit
+    if parts.known.stopped != parts.limit_reached or limit is None:
         return INTERRUPTED
     return max(parts.watch.left() + OVERTIME_SHARE * limit + OVERTIME, 0.0)

@@ -51,7 +51,8 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
             watch.stop()
             yield ssh_map, cost
             watch.start()
-            if known.count == most:
+            # Clasp ends its search for one more map by its limit of conflicts if work is counted.
+            if known.count == most and not watch.counts_work:
                 spent = watch.elapsed()
                 watch.stage_ends = min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent))
     known.complete = True

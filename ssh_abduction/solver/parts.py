@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from ssh_abduction.runtime.loggers import PROGRESS
 from ssh_abduction.solver import prefixes
-from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.asp.limits import Stop, Watch
 from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.choosing import may_name, new_engine
@@ -49,7 +49,13 @@ class Parts:
         began: float,
     ) -> None:
         self.limits, self.speedups = limits, speedups
-        self.watch = Watch(limits.time_limit, limits.memory_limit, self.report)
+        self.watch = Watch(
+            limits.time_limit,
+            limits.memory_limit,
+            self.report,
+            work=limits.work_limit,
+            around=start.around,
+        )
         self._on_progress = on_progress
         self._news: tuple[Cost | None, Bound] = (None, Bound())  # what the last report said
         self.watch.start(began)  # settling the theory compares pairs of steps, which may take long
@@ -93,6 +99,11 @@ class Parts:
             known.raise_bound(known.cost[0] if known.cost else None)
 
     @property
+    def limit_reached(self) -> Stop:
+        """Which limit ends a search whose time is over."""
+        return "work limit" if self.watch.counts_work else "time limit"
+
+    @property
     def engine(self) -> Engine:
         """The engine that was used last."""
         return self.near.engine if self.near else self.prefixes.engine
@@ -116,7 +127,7 @@ class Parts:
             known.best_cost,
             known.bound,
             known.count,
-            self.watch.elapsed(),
+            self.watch.seconds(),
         )
         news = (progress.cost, progress.bound)
         PROGRESS.log(logging.DEBUG if news == self._news else logging.INFO, "%s", progress.sentence)

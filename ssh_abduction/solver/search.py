@@ -22,12 +22,12 @@ from ssh_abduction.data.floors import with_floors
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
-from ssh_abduction.runtime.clock import each_heeding, heeding
+from ssh_abduction.runtime.clock import counting, each_counting, each_heeding, heeding, now
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.answer import Answer
-from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop, Watch, now
+from ssh_abduction.solver.asp.limits import EARLY, LimitError, StageTimeError, Stop, Watch
 from ssh_abduction.solver.asp.rule_checks import check_rules
 from ssh_abduction.solver.fallback import (
     CLASHING,
@@ -79,7 +79,8 @@ class Search:
     Args:
         trace: The views and actions to explain.
         theory: The axioms and the preference; Theory.topological() by default.
-        time_limit, max_maps, within, memory_limit, speedups, on_progress: As in `solve`.
+        time_limit, max_maps, within, memory_limit, work_limit, speedups, on_progress: As in
+            `solve`.
 
     Attributes:
         trace: The trace.
@@ -98,13 +99,27 @@ class Search:
         max_maps: int | None = 100,
         within: int = 0,
         memory_limit: int | None = None,
+        work_limit: float | None = None,
         speedups: Speedups = ALL,
         on_progress: Callable[[Progress], None] | None = None,
         _start: Start = ANEW,
     ) -> None:
-        began = now()
         checked_trace(trace)
-        self.limits = Limits(time_limit, memory_limit, max_maps, within)
+        self.limits = Limits(time_limit, memory_limit, max_maps, within, work_limit)
+        self._counts_work = work_limit is not None
+        with counting(self._counts_work):
+            self._prepare(trace, theory, speedups, on_progress, _start)
+
+    def _prepare(
+        self,
+        trace: Trace,
+        theory: Theory | None,
+        speedups: Speedups,
+        on_progress: Callable[[Progress], None] | None,
+        _start: Start,
+    ) -> None:
+        """Settle the theory, and make the parts of the search."""
+        began, within = now(), self.limits.within
         if on_progress is not None and not callable(on_progress):
             raise SolverError(
                 f"on_progress: expected a function of one Progress, got {brief(on_progress)}"
@@ -240,7 +255,8 @@ class Search:
         )
 
         ranking = Ranking(self.trace) if self.theory.displacement == "use" else None
-        return map(Deriving(self.trace, self.theory).mapped, self._given(ranking))
+        maps = map(Deriving(self.trace, self.theory).mapped, self._given(ranking))
+        return each_counting(self._counts_work, maps)
 
     def unranked(self) -> Iterator[SSHMap]:
         """Iterate over the maps in the order in which they are found, instead of over the search.
@@ -248,7 +264,7 @@ class Search:
         This is faster if the trace has displacements: the maps are not ranked by them and have no
         poses.
         """
-        return self._given(None)
+        return each_counting(self._counts_work, self._given(None))
 
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
         """Yield the maps. `ranking` sorts maps of one cost; None keeps their order."""
@@ -278,7 +294,7 @@ class Search:
         )
         if self._weighing is not None:
             # If this takes too long after a limit, the map has no cost in nats.
-            ended = known.stopped in ("time limit", "interrupted")
+            ended = known.stopped in EARLY
             seconds = _late(parts) if ended else math.inf
             with suppress(LimitError), heeding(Watch().part(seconds).check):
                 self._weighing.keep_best()
@@ -313,7 +329,8 @@ class Search:
                 maps = listed(parts, found, keeps_time=self._reasons)
                 yield from each_heeding(watch.check, maps)
         except StageTimeError:
-            known.stopped = "maps limit" if known.count == self.limits.most else "time limit"
+            is_listed = known.count == self.limits.most
+            known.stopped = "maps limit" if is_listed else parts.limit_reached
         except LimitError as limit:
             known.stopped = limit.reason
         except KeyboardInterrupt:
@@ -357,14 +374,16 @@ class Search:
         maps (none if the trace has no map) and True; or the best map known after that time and
         False.
         """
+        limit = max(seconds, SHORTEST)
         search = Search(
             mended,
             theory,
-            time_limit=None if seconds == math.inf else max(seconds, SHORTEST),
+            time_limit=None if self._counts_work or limit == math.inf else limit,
+            work_limit=limit if self._counts_work else None,
             max_maps=most or None,
             memory_limit=self.limits.memory_limit,
             speedups=self._parts.speedups,
-            on_progress=lambda _: self._parts.watch.check(),
+            _start=Start(around=self._parts.watch),
         )
         maps = tuple(search.unranked())
         if search.stopped == "interrupted":
@@ -407,7 +426,7 @@ class Search:
         """
         solution = self._answer.solution(self._answer.in_order(checked_maps(maps)))
         if self._weighing is not None:
-            with one_thread("blas"):
+            with one_thread("blas"), counting(self._counts_work):
                 weighed = self._weighing.weighed()
             return replace(solution, support=replace(solution.support, weighed=weighed))
         if self._asked_weigh != "cost":

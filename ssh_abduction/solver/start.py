@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ssh_abduction.data.checks import a_count_of_maps, a_flag
 from ssh_abduction.data.errors import SolverError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
-from ssh_abduction.solver.asp.limits import check_limit
+from ssh_abduction.solver.asp.limits import Watch, check_limit
 
 if TYPE_CHECKING:
     from ssh_abduction.solver.parts import Parts
@@ -22,6 +22,7 @@ class Limits:
         time_limit: Seconds of wall-clock time; None for no limit.
         memory_limit: MiB that the process may use at its peak; None for no limit.
         max_maps: The number of maps to list at most; None for all.
+        work_limit: Units of work, each about a second of a quiet core; None for no limit.
         within: The number of dstates above the minimum that a listed map may have.
 
     Raises:
@@ -32,6 +33,7 @@ class Limits:
     memory_limit: int | None = None
     max_maps: int | None = None
     within: int = 0
+    work_limit: float | None = None
 
     def __post_init__(self) -> None:
         a_count_of_maps(self.max_maps, SolverError)
@@ -41,6 +43,7 @@ class Limits:
                 f"{brief(self.within)}; give how much more than a minimal map others may cost"
             )
         check_limit("time_limit (--time-limit)", "seconds", self.time_limit)
+        check_limit("work_limit (--work-limit)", "units of work", self.work_limit)
         check_limit("memory_limit (--memory-limit)", "MiB", self.memory_limit)
 
     @property
@@ -64,12 +67,14 @@ class Start:
             none. With such a map, the search only lists maps.
         known: Maps of the trace that an earlier search found. The search begins with those that
             the checker accepts, so that its best map costs no more than they do.
+        around: The watch of a search that this search is a part of. Its limits hold here, too.
     """
 
     reasons: bool = False
     after: Parts | None = None
     minimal: SSHMap | None = None
     known: tuple[SSHMap, ...] = ()
+    around: Watch | None = None
 
     def __post_init__(self) -> None:
         a_flag("reasons", self.reasons, SolverError)

@@ -7,15 +7,17 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from typing import Any, TypeVar
 
 import clingo
 
 from ssh_abduction.runtime import program
+from ssh_abduction.runtime.clock import MICRO, count_work, counts_work, now
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch, peak_memory
 from ssh_abduction.solver.values import Grounding
+from ssh_abduction.solver.work import ANSWER, ASKED, ATOM, CONFLICT
 from ssh_abduction.theory import encodings
 
 # After grounding, clasp prepares the program and cannot be stopped. This takes about these
@@ -23,6 +25,8 @@ from ssh_abduction.theory import encodings
 # reach a limit while it prepares.
 PREPARING = 0.6, 1.0
 
+# While clingo grounds for a search that counts work, check its limits after each of so many calls.
+CALLS = 1000
 SLOW = 0.05  # log the grounding if it takes more seconds than this
 _log = log_of(__name__)
 _ONE = clingo.Number(1)
@@ -74,7 +78,7 @@ class Control(clingo.Control):
     Attributes:
         preparing: The time and the memory that clasp needs to prepare the program, as multiples of
             what grounding took. The default is PREPARING.
-        seconds: How many seconds grounding took since clingo last solved.
+        seconds: What grounding took since clingo last solved, on the clock of the search.
         mebibytes: The memory in MiB that this grounding added.
     """
 
@@ -156,9 +160,11 @@ class Control(clingo.Control):
         """Ground program parts, and add up the time and the memory that this takes."""
         asked = _GroundingCheck(self._check)
         with self._alone():
-            began, before = time.perf_counter(), peak_memory()
+            began, before = now(), peak_memory()
+            atoms = len(self.symbolic_atoms)
             try:
                 super().ground(parts, context or asked)
+                count_work(ATOM * (len(self.symbolic_atoms) - atoms))
             except BaseException:
                 if asked.raised is not None:
                     # Clingo raises a copy of the exception that lacks its attributes. Raise the
@@ -166,7 +172,7 @@ class Control(clingo.Control):
                     raise asked.raised from None
                 raise
             finally:
-                seconds, mebibytes = time.perf_counter() - began, peak_memory() - before
+                seconds, mebibytes = now() - began, peak_memory() - before
                 self.seconds += seconds
                 self.mebibytes += mebibytes
                 if seconds > SLOW:
@@ -179,13 +185,17 @@ class _GroundingCheck:
 
     def __init__(self, check: Callable[[], None]) -> None:
         self.raised: BaseException | None = None
-        self._check = check
+        self._check, self._calls = check, 0
         self._next = time.perf_counter() + POLL
 
     def go_on(self, *_: clingo.Symbol) -> clingo.Symbol:
-        """Return 1, unless `check` raises. To save time, call `check` only every POLL seconds."""
+        """Return 1, unless `check` raises. To save time, call `check` only now and then."""
+        count_work(ASKED)
+        self._calls += 1
         try:
-            if time.perf_counter() > self._next:
+            if counts_work() and self._calls % CALLS == 0:
+                self._check()
+            elif time.perf_counter() > self._next:
                 self._check()
                 self._next = time.perf_counter() + POLL
         except BaseException as error:
@@ -266,14 +276,19 @@ class Asker:
         configuration: Any = control.configuration.solve
         configuration.opt_mode, configuration.models = mode, models
         configuration.project = "no" if mode.partition(",")[0] == "opt" else "project"
-        configuration.solve_limit = f"{conflicts},-1"
+        allowed = self.watch.conflicts_left()
+        most = min((n for n in (conflicts, allowed) if n >= 0), default=-1)
+        configuration.solve_limit = f"{most},-1"
         # Nothing can stop clasp while it prepares the program. So check first that time is left.
         self.watch.check(
             control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes
         )
         control.seconds = control.mebibytes = 0.0
         began = time.perf_counter()
-        with control.searching(assumptions=assumptions, yield_=True, on_unsat=on_bound) as handle:
+        with (
+            self._counted(control),
+            control.searching(assumptions=assumptions, yield_=True, on_unsat=on_bound) as handle,
+        ):
             self.solve_seconds += time.perf_counter() - began
             handle.resume()
             while True:
@@ -282,15 +297,31 @@ class Asker:
                 model = handle.model()
                 if model is None:
                     result = handle.get()
-                    if result.interrupted and conflicts < 0:
-                        raise LimitError("interrupted")
-                    return bool(result.exhausted)
+                    break
+                count_work(round(MICRO * ANSWER))
                 answer = read(model)
-                if ahead:
+                # Where work is counted, clasp must stand still at an answer when a caller stops.
+                if ahead and not counts_work():
                     handle.resume()
                 yield answer
-                if not ahead:
+                if not ahead or counts_work():
                     handle.resume()
+        if result.interrupted and most == allowed >= 0:
+            self.watch.check()
+        if result.interrupted and conflicts < 0:
+            raise LimitError("interrupted")
+        return bool(result.exhausted)
+
+    @contextmanager
+    def _counted(self, control: Control) -> Iterator[None]:
+        """Count what clasp does in this context as work."""
+        try:
+            yield
+        finally:
+            if counts_work():
+                with suppress(RuntimeError, KeyError):  # clingo did not begin
+                    solved = control.statistics["solving"]["solvers"]
+                    count_work(round(MICRO * CONFLICT * solved["conflicts"]))
 
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
         """Wait for an answer or the end; False if `until` ended the wait. May raise LimitError."""
@@ -298,7 +329,7 @@ class Asker:
         try:
             while not handle.wait(POLL):
                 self.watch.check()
-                if until():
+                if not counts_work() and until():
                     return False
             self.watch.check()
             return True

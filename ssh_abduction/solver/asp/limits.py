@@ -10,6 +10,8 @@ from contextlib import contextmanager, suppress
 from typing import Literal, TypeAlias
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
+from ssh_abduction.runtime.clock import counting, counts_work, now, work_done
+from ssh_abduction.solver.work import CONFLICT
 
 # A search that has found no map of the whole trace ends when this share of the time limit is left.
 # The rest of the time is for making a map without a search.
@@ -23,12 +25,11 @@ TICK = 0.5
 # WAITING times as many seconds are over.
 WAITING = 4.0
 
-Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit", "no proof"]
-
-
-def now() -> float:
-    """Return the time in seconds, by the clock that time limits use."""
-    return time.perf_counter()
+Stop: TypeAlias = Literal[
+    "work limit", "time limit", "memory limit", "interrupted", "maps limit", "no proof"
+]
+# Reasons that end a search before it has done what it could. More of the same may give more.
+EARLY: tuple[Stop, ...] = ("work limit", "time limit", "interrupted")
 
 
 def processor_clock(
@@ -36,8 +37,12 @@ def processor_clock(
 ) -> Callable[[], float]:
     """Make a clock of processor time, at least 1 / `waiting` of the wall-clock time.
 
-    `processor` returns the processor time, in seconds: of this thread, or of the whole process.
+    In a search that counts work, the clock counts work. `processor` returns the processor time, in
+    seconds: of this thread, or of the whole process.
     """
+    if counts_work():
+        done = work_done()
+        return lambda: work_done() - done
     used, began = processor(), now()
 
     def clock() -> float:
@@ -73,8 +78,8 @@ class StageTimeError(Exception):
 class Watch:
     """The clock and the limits of a search. `check` raises when a limit is reached.
 
-    The clock counts only between `start` and `stop`. So the time that a caller spends with a map
-    does not count.
+    The clock counts units of work if there is a work limit, else seconds. It counts only between
+    `start` and `stop`. So the time that a caller spends with a map does not count.
     """
 
     def __init__(
@@ -83,26 +88,46 @@ class Watch:
         memory: float | None = None,
         on_tick: Callable[[], None] = lambda: None,
         clock: Callable[[], float] | None = None,
+        *,
+        work: float | None = None,
+        around: Watch | None = None,
     ) -> None:
-        """Set the limits in seconds and MiB. The clock does not run until `start`.
+        """Set the limits. The clock does not run until `start`.
 
-        `check` calls `on_tick` every TICK seconds, to report progress.
+        Args:
+            limit: The time limit in seconds; None for no limit. If there is a work limit, this is
+                only a cap, which decides nothing else.
+            memory: The largest memory of the process in MiB; None for no limit.
+            on_tick: `check` calls this every TICK seconds, to report progress.
+            clock: Another clock for `limit`; None for that of the surrounding search.
+            work: The work limit in units; None for no limit.
+            around: A watch whose limits also end this one; None for no such watch.
         """
-        self._on_tick, self._clock = on_tick, clock or now
-        self._next_tick = TICK
-        self._limit = limit
+        self._on_tick, self._around = on_tick, around
+        counts = work is not None or (clock is None and counts_work())
+        self._clock = work_done if counts else clock or time.perf_counter
+        self._next_tick = time.perf_counter() + TICK
+        self._limit = limit if work is None else work
+        self._cap = limit if work is not None else None
         self._memory = memory
         self._started: float | None = None
+        self._began = self._seconds = 0.0
         self._spent = 0.0
-        # `check` raises StageTimeError once, when the clock shows more seconds than this.
+        # `check` raises StageTimeError once, when the clock shows more than this.
         self.stage_ends = math.inf
         self.interrupted = False
-        # Whether the last part of the time limit is reserved for making a map without a search.
+        # Whether the last part of the limit is reserved for making a map without a search.
         self.lacks_map: Callable[[], bool] = lambda: False
+
+    @property
+    def counts_work(self) -> bool:
+        """Whether the clock counts units of work."""
+        return self._clock is work_done
 
     def start(self, since: float | None = None) -> None:
         """Let the clock run, from `since` if it is given. If it runs already, do nothing."""
         if self._started is None:
+            self._began = time.perf_counter()
             self._started = self._clock() if since is None else since
 
     @property
@@ -112,17 +137,18 @@ class Watch:
 
     def stop(self) -> None:
         """Stop the clock. `start` lets it go on."""
+        self._seconds = self.seconds()
         self._spent, self._started = self.elapsed(), None
 
-    def part(self, seconds: float, clock: Callable[[], float] | None = None) -> Watch:
-        """Start a new watch whose limit is this many seconds. Limits of this watch also end it."""
-        part = Watch(seconds, self._memory, self.check, clock)
+    def part(self, limit: float, clock: Callable[[], float] | None = None) -> Watch:
+        """Start a new watch with this limit on its clock. Limits of this watch also end it."""
+        part = Watch(limit, self._memory, clock=clock or self._clock, around=self)
         part.start()
         return part
 
     @contextmanager
     def stage(self, ends: float) -> Iterator[None]:
-        """End the work in this context by StageTimeError when the clock shows `ends` seconds.
+        """End the work in this context by StageTimeError when the clock shows more than `ends`.
 
         The end of a stage around this one remains as it was.
         """
@@ -134,25 +160,35 @@ class Watch:
             self.stage_ends = around
 
     def shorten(self, seconds: float) -> None:
-        """Lower the time limit to this many seconds since the start."""
+        """Lower the limit to this much on the clock since the start."""
         self._limit = seconds if self._limit is None else min(seconds, self._limit)
 
     def elapsed(self) -> float:
-        """Return the seconds on the clock."""
+        """Return what the clock shows: units of work or seconds."""
         return self._spent + (0 if self._started is None else self._clock() - self._started)
+
+    def seconds(self) -> float:
+        """Return the wall-clock seconds for which the clock has run."""
+        running = 0.0 if self._started is None else time.perf_counter() - self._began
+        return self._seconds + running
 
     def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
         """Raise LimitError if a limit is reached, or would be reached during the next work.
 
-        That work takes `ahead` seconds and some memory, and cannot be interrupted. Raises
+        That work takes `ahead` on the clock and some memory, and cannot be interrupted. Raises
         StageTimeError if the time of the present stage is over.
         """
         if self.interrupted:
             raise LimitError("interrupted")
-        if self.elapsed() > self._next_tick:
-            self._next_tick = self.elapsed() + TICK
+        if self._around is not None:
+            self._around.check()
+        at = time.perf_counter()
+        if at > self._next_tick:
+            self._next_tick = at + TICK
             self._on_tick()
         if not self.allows(ahead):
+            raise LimitError("work limit" if self.counts_work else "time limit")
+        if self._cap is not None and self.seconds() > self._cap:
             raise LimitError("time limit")
         if self._memory is not None and peak_memory() + mebibytes > self._memory:
             raise LimitError("memory limit")
@@ -162,21 +198,22 @@ class Watch:
 
     def later(self, seconds: float) -> Callable[[], None]:
         """Make a `check` that ignores the time limit for some seconds of processor time."""
-        used = processor_clock()
+        with counting(self.counts_work):
+            used = processor_clock()
 
         def check() -> None:
             try:
                 self.check()
             except LimitError as limit:
-                if limit.reason != "time limit" or used() > seconds:
+                if limit.reason not in ("time limit", "work limit") or used() > seconds:
                     raise
 
         return check
 
-    def allows(self, seconds: float) -> bool:
-        """Whether there is time for work that takes this many seconds and cannot be interrupted."""
+    def allows(self, ahead: float) -> bool:
+        """Whether the limit allows work that takes this much and cannot be interrupted."""
         reserved = RESERVE * self._limit if self._limit and self.lacks_map() else 0.0
-        return seconds + reserved <= self.left()
+        return ahead + reserved <= self.left()
 
     def memory_left(self) -> float | None:
         """Return the MiB that are left until the memory limit; None for no limit."""
@@ -185,8 +222,28 @@ class Watch:
         return self._memory - peak_memory()
 
     def left(self) -> float:
-        """Return the seconds that are left until the time limit; infinity for no limit."""
+        """Return what is left until the limit, on the clock; infinity for no limit."""
         return math.inf if self._limit is None else self._limit - self.elapsed()
+
+    def seconds_left(self) -> float:
+        """Return the seconds that are left until the time limit; infinity for no limit."""
+        if not self.counts_work:
+            return self.left()
+        return math.inf if self._cap is None else self._cap - self.seconds()
+
+    def conflicts_left(self) -> int:
+        """Return after how many conflicts of clasp a limit is reached; -1 if work is not counted.
+
+        Seconds are checked while clasp runs. Work is counted when it has ended, so that it always
+        ends at the same conflict.
+        """
+        if not self.counts_work:
+            return -1
+        reserved = RESERVE * self._limit if self._limit and self.lacks_map() else 0.0
+        left = min(self.left() - reserved, self.stage_ends - self.elapsed())
+        least = -1 if left == math.inf else max(int(left / CONFLICT) + 1, 1)
+        around = self._around.conflicts_left() if self._around is not None else -1
+        return min((n for n in (least, around) if n >= 0), default=-1)
 
 
 def resident_memory() -> float:

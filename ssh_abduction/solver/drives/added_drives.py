@@ -34,7 +34,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.clock import heeding
-from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.asp.limits import EARLY, LimitError, Watch
 from ssh_abduction.solver.choosing import READABLE
 from ssh_abduction.solver.drives.digest import Digest
 from ssh_abduction.solver.drives.laying import can_lay, laid, unproven
@@ -56,7 +56,7 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 LAYING = 5.0
 # The fields of a theory that say which returns displacements reject.
 _JUDGES = ("level", "displacement", "reject", "joint", "without")
-_LIMITS = ("time limit", "memory limit", "interrupted")  # what ends a search early
+_LIMITS = (*EARLY, "memory limit")  # what ends a search early
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def _of_joint_trace(
         effort=replace(
             found.effort,
             prefix=min(found.effort.prefix, len(joint)),  # a digest may have more steps
-            seconds=replace(found.seconds, total=watch.elapsed()),
+            seconds=replace(found.seconds, total=watch.seconds()),
         ),
         levels=(Level(found.cost, len(maps), found.complete),) if found.within else (),
         shared=None,

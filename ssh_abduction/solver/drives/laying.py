@@ -106,7 +106,7 @@ def unproven(
         complete=False,
         theory=problem.theory,
         steps=len(joint),
-        effort=Effort(0, Seconds(watch.elapsed(), 0.0, 0.0)),
+        effort=Effort(0, Seconds(watch.seconds(), 0.0, 0.0)),
         stopped=stopped,
         trace=joint,
         support=Support(

@@ -1,0 +1,13 @@
+"""What the steps of a search weigh as work.
+
+A unit of work is about a second of one quiet core. The weights were fitted to the processor time of
+solving mazes, offices and logs of robots (`benchmarks/work.py` measures them again).
+"""
+
+from __future__ import annotations
+
+# A conflict of clasp, and an answer of it, in units.
+CONFLICT, ANSWER = 2e-4, 2e-4
+# An atom that clingo grounds, and a call of `@go_on` by which it asks whether to go on, in
+# microunits.
+ATOM, ASKED = 4, 2

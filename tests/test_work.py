@@ -1,0 +1,93 @@
+"""A work limit gives one answer, whatever the machine and its load."""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.data.errors import SolverError
+from ssh_abduction.runtime.clock import counting, look_at_clock, now, work_done
+from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
+
+ROUTE = Path(__file__).parent.parent / "examples" / "aces3-route.jsonl"
+COSTS = Theory.topological().replace(weigh="cost")
+
+
+def answer_by_a_random_clock(trace: Trace, theory: Theory, work: float, seed: int) -> Any:
+    """Return the answer without its times while the clock of seconds runs at random."""
+    jumps, shown = random.Random(seed), [0.0]
+
+    def seconds() -> float:
+        shown[0] += jumps.expovariate(1.0)
+        return shown[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(time, "perf_counter", seconds)
+        solution = solve(trace, theory, work_limit=work)
+    answer = solution.to_dict()
+    answer.pop("seconds")
+    return solution.maps, solution.stopped, answer
+
+
+@pytest.mark.parametrize("work", [0.02, 0.2, 1.0])
+@pytest.mark.parametrize("theory", [Theory.topological(), COSTS, Theory.causal()], ids=str)
+def test_one_work_limit_gives_one_answer(work: float, theory: Theory) -> None:
+    trace = Trace.load(ROUTE)
+    first, *others = (answer_by_a_random_clock(trace, theory, work, seed) for seed in range(3))
+    assert others == [first, first]
+
+
+@pytest.mark.parametrize("work", [0, -1, math.nan, "much"])
+def test_work_limit_out_of_range_is_refused(work: Any) -> None:
+    with pytest.raises(SolverError, match=r"^work_limit \(--work-limit\): expected a number"):
+        solve(Trace.load(ROUTE), work_limit=work)
+
+
+def test_work_is_counted_inside_counting_only() -> None:
+    with counting(is_on=True):
+        begun = now()
+        look_at_clock(3)
+        assert now() - begun == pytest.approx(3e-6)
+    assert now() != work_done()
+
+
+def test_stage_ends_before_the_limit() -> None:
+    watch = Watch(work=1.0)
+    watch.start()
+    with watch.stage(0.1):
+        look_at_clock(200_000)
+        with pytest.raises(StageTimeError):
+            watch.check()
+    watch.check()
+    look_at_clock(900_000)
+    with pytest.raises(LimitError) as limit:
+        watch.check()
+    assert limit.value.reason == "work limit"
+
+
+def test_time_limit_is_a_cap_of_a_work_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    watch = Watch(5.0, work=1.0)
+    watch.start()
+    watch.check()
+    seconds = time.perf_counter
+    monkeypatch.setattr(time, "perf_counter", lambda: seconds() + 10)
+    assert watch.left() == 1.0
+    with pytest.raises(LimitError) as limit:
+        watch.check()
+    assert limit.value.reason == "time limit"
+
+
+def test_part_obeys_the_watch_around_it() -> None:
+    around = Watch(work=0.2)
+    around.start()
+    part = around.part(5.0)
+    assert part.conflicts_left() == around.conflicts_left() > 0
+    look_at_clock(300_000)
+    with pytest.raises(LimitError):
+        part.check()
