@@ -29,7 +29,7 @@ from perception.views import ViewClusterer
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.paper.experiments import one_to_one, true_dstates
+from ssh_abduction.evaluation.paper_experiments import one_to_one, true_dstates
 from ssh_abduction.learning.learner import BootstrapLearner, LearnerError
 from ssh_abduction.learning.traces import Traces
 from ssh_abduction.theory.theory import Theory

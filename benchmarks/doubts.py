@@ -30,7 +30,7 @@ from simulator.laser import Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.paper.experiments import (
+from ssh_abduction.evaluation.paper_experiments import (
     VIEWS_ALONE,
     notched,
     one_to_one,

@@ -25,7 +25,7 @@ from simulator.laser import Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import BootstrapLearner, Theory, Trace
-from ssh_abduction.learning.labels import LearnerError
+from ssh_abduction.learning.learner import LearnerError
 
 WORLDS = ("notched-rectangle", "taylor-hall", "three-ways", "five-ways", "triangle")
 DRIVES = 4

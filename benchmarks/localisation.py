@@ -40,7 +40,7 @@ from simulator.world import World
 from ssh_abduction import Localiser, SSHMap, Trace
 from ssh_abduction.data import Step
 from ssh_abduction.data.maps import DState
-from ssh_abduction.evaluation.paper.figures import draw_beliefs
+from ssh_abduction.evaluation.figures import draw_beliefs
 from ssh_abduction.online import Belief
 from ssh_abduction.online.belief import BeliefVerdict
 

@@ -45,7 +45,7 @@ from simulator.panorama import Camera, Paint
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.paper.experiments import VIEWS_ALONE, one_to_one, true_dstates
+from ssh_abduction.evaluation.paper_experiments import VIEWS_ALONE, one_to_one, true_dstates
 from ssh_abduction.learning.learner import (
     AmbiguousMapWarning,
     BootstrapLearner,

@@ -44,7 +44,7 @@ SAID_BY = {
     "ssh_abduction/cli/next_experiment.py": ("next",),
     "ssh_abduction/cli/options.py": (*WITH_MAP, *WITH_THEORY),
     "ssh_abduction/cli/text.py": ("solve", "compare"),
-    "ssh_abduction/evaluation/paper": ("reproduce",),
+    "ssh_abduction/evaluation/paper_report.py": ("reproduce",),
     "ssh_abduction/evaluation": ("evaluate",),
     "ssh_abduction/explain/no_map.py": WITH_THEORY,
     "ssh_abduction/solver/front.py": ("solve",),

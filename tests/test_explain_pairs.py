@@ -16,12 +16,10 @@ from strategies import TOYS, theories, traces
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, Odometry, TraceError
-from ssh_abduction.explain.axioms import Axioms
-from ssh_abduction.explain.derivation import Derivation
-from ssh_abduction.explain.mend import explain_trace
+from ssh_abduction.explain.axioms import Axioms, Piece
+from ssh_abduction.explain.no_map import explain_trace
 from ssh_abduction.explain.pair_reasons import explain_pair
-from ssh_abduction.explain.piece import Piece
-from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
+from ssh_abduction.explain.verdict import Derivation, PairExplanation, Side, Verdict
 from ssh_abduction.rivals import Listing
 from ssh_abduction.rivals.listing import PairInMap
 from ssh_abduction.solver import Cost, Search, Solution, Start, Status

@@ -37,25 +37,26 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import Step, together
 from ssh_abduction.data.errors import TraceError
-from ssh_abduction.evaluation.paper import experiments
-from ssh_abduction.evaluation.paper.claim_table import claims, summary
-from ssh_abduction.evaluation.paper.experiments import (
+from ssh_abduction.evaluation import paper_experiments as experiments
+from ssh_abduction.evaluation.paper_experiments import (
     EXPERIMENTS,
     FoundMaps,
     SeedRun,
+    claims,
     measure,
     one_to_one,
     outcome,
     rate,
+    summary,
     true_dstates,
 )
-from ssh_abduction.learning.labels import warn_of_pieces
 from ssh_abduction.learning.learner import (
     AmbiguousMapWarning,
     BootstrapLearner,
     LearnerError,
     RunnerUpWarning,
     labels_of,
+    warn_of_pieces,
 )
 from ssh_abduction.learning.runner_up import runner_up, second_map, with_runner_up
 
@@ -704,7 +705,7 @@ def test_reproduce_writes_the_page_and_its_data(
     monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
     known = {("notched-rectangle", 500): measured}
     monkeypatch.setattr(
-        "ssh_abduction.evaluation.paper.report.measure", lambda *asked: known[asked]
+        "ssh_abduction.evaluation.paper_report.measure", lambda *asked: known[asked]
     )
     words = (
         f"reproduce notched-rectangle --seeds 500 --jobs 1 --set outcomes=false -o {tmp_path}"
@@ -749,7 +750,7 @@ def test_reproduce_writes_the_page_and_its_data(
     claimed = json.loads((tmp_path / "claims.json").read_text())
     assert all(row["seeds"] == 1 for row in claimed)
     monkeypatch.setattr(
-        "ssh_abduction.evaluation.paper.report._draw", lambda *_: None
+        "ssh_abduction.evaluation.paper_report._draw", lambda *_: None
     )  # once is enough
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["claims"] == claimed

@@ -28,8 +28,7 @@ from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
 from ssh_abduction.explain import explain, explain_pair, explain_trace
-from ssh_abduction.explain.axioms import Axioms, Interrupted
-from ssh_abduction.explain.piece import Piece
+from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
 from ssh_abduction.solver import Search, Status, check_rules, find_backbone
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.control import Control

@@ -262,7 +262,7 @@ def test_failed_picture_loses_no_other_output(
 def test_reproduce_writes_its_data_before_it_draws(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ssh_abduction.evaluation.paper import report
+    from ssh_abduction.evaluation import paper_report as report
 
     def fails(*_: Any) -> None:
         raise OSError(28, "No space left on device")

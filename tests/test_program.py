@@ -21,7 +21,7 @@ from worlds import TOURS, drive
 from perception.readers.writers import write_carmen
 from ssh_abduction import AbductionError, Solution, Theory, Trace
 from ssh_abduction.cli import main
-from ssh_abduction.evaluation.paper import report
+from ssh_abduction.evaluation import paper_report as report
 from ssh_abduction.evaluation.rungs import UnderWay
 from ssh_abduction.robot_logs.log_maps import LogMapping
 from ssh_abduction.runtime import program

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-MOST_LINES, MOST_METHODS, MOST_ATTRIBUTES = 500, 25, 15
+MOST_LINES, MOST_METHODS, MOST_ATTRIBUTES = 600, 25, 15
 # The fields of a theory are the choices that a user has, each with a name of its own.
 MANY_FIELDS = {"Theory"}
 ROOT = Path(__file__).parent.parent
@@ -75,7 +75,7 @@ def made_in(method: ast.FunctionDef) -> Iterator[str]:
 
 
 def test_modules_and_classes_are_small() -> None:
-    assert len(MODULES) > 300
+    assert len(MODULES) > 200
     found = {
         str(path.relative_to(ROOT)): faults
         for path in MODULES
@@ -87,7 +87,7 @@ def test_modules_and_classes_are_small() -> None:
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("\n" * 501, "501 lines"),
+        ("\n" * 601, "601 lines"),
         ("class A:\n" + "".join(f"    def f{i}(self): ...\n" for i in range(26)), "A: 26 methods"),
         ("class A:\n" + "".join(f"    f{i}: int\n" for i in range(16)), "A: 16 attributes"),
         ("class A:\n    def f(self):\n        self.x, self.z = self.y, 2", "A: f makes x, z"),

@@ -44,7 +44,7 @@ from ssh_abduction.data import (
     maps,
     save_corrections,
 )
-from ssh_abduction.learning.labels import LearnerError
+from ssh_abduction.learning.learner import LearnerError
 from ssh_abduction.robot_logs import log_report
 from ssh_abduction.solver import Certificate, Progress, Search, Status
 from ssh_abduction.solver.judging import InternalError

@@ -19,7 +19,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import TraceError
 from ssh_abduction.data.odometry import Pose, displacement_between
 from ssh_abduction.evaluation import evaluate_visits
-from ssh_abduction.evaluation.relations import Relation, Relations
+from ssh_abduction.evaluation.trajectory import Relation, Relations
 
 FREIBURG = Path(__file__).parent.parent.parent / "shared" / "data" / "logs"
 

@@ -26,7 +26,7 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.evaluation.paper.figures import (
+from ssh_abduction.evaluation.figures import (
     draw_quality,
     draw_telling,
     draw_views,

@@ -104,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
     warn(runner_up_doubts(clustered))
     if options.plot:
         sys.stdout.flush()  # print first, in case drawing fails
-        from ssh_abduction.evaluation.paper.figures import draw_quality
+        from ssh_abduction.evaluation.figures import draw_quality
 
         draw_quality(options.plot, clusterer.quality_, uncertainty, clusterer.k_)
     return 0

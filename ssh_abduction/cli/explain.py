@@ -35,7 +35,7 @@ from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.map_parts import thing_named
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
-from ssh_abduction.explain.mend import TraceExplanation, TraceQuestion
+from ssh_abduction.explain.no_map import TraceExplanation, TraceQuestion
 from ssh_abduction.explain.pair_reasons import PairQuestion
 from ssh_abduction.explain.place_reasons import PlaceExplanation, PlaceQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Verdict

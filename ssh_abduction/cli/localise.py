@@ -112,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
         print(table((*HEAD, *place, *NUMBERS), rows))
     if options.plot:
         sys.stdout.flush()  # print first, in case drawing fails
-        from ssh_abduction.evaluation.paper.figures import draw_beliefs
+        from ssh_abduction.evaluation.figures import draw_beliefs
 
         draw_beliefs(options.plot, beliefs)
     return 0
@@ -123,7 +123,7 @@ def _localiser(options: argparse.Namespace) -> tuple[Localiser, Trace]:
 
     Raises AbductionError, which names the file.
     """
-    from ssh_abduction.online.chances import Chances
+    from ssh_abduction.online.belief import Chances
     from ssh_abduction.online.localiser import Localiser
 
     data = read_maps(options.maps)

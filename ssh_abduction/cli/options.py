@@ -302,7 +302,7 @@ def picture_file(text: str) -> str:
 def check_picture(file: str | None) -> None:
     """Check before long work that a figure can be drawn. Raise AbductionError if it cannot."""
     if file is not None:
-        from ssh_abduction.evaluation.paper.figures import require_matplotlib
+        from ssh_abduction.evaluation.figures import require_matplotlib
 
         require_matplotlib()
 

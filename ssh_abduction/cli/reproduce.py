@@ -42,7 +42,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.evaluation.paper.report import reproduce, steps
+    from ssh_abduction.evaluation.paper_report import reproduce, steps
 
     seeds, name = _seeds(options.seeds), options.experiment
     check_jobs(options.jobs, "processes", default=2)
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
-    from ssh_abduction.evaluation.paper.report import claimed, spread_of
+    from ssh_abduction.evaluation.paper_report import claimed, spread_of
 
     if options.json:
         record = {"experiment": options.experiment, "claims": rows}

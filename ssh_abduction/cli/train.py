@@ -149,7 +149,7 @@ def run_learning_curve(options: argparse.Namespace) -> int:
         print(table(["images", "recognised", "worst fold", "best fold"], rows))
     if options.plot:
         sys.stdout.flush()  # print first, in case drawing fails
-        from ssh_abduction.evaluation.paper.figures import draw_learning
+        from ssh_abduction.evaluation.figures import draw_learning
 
         draw_learning(options.plot, {"map": curve})
     return 0
@@ -213,7 +213,7 @@ def run_tell_apart(options: argparse.Namespace) -> int:
         print(table(["dstates", "recognised", *beams], rows))
     if options.plot:
         sys.stdout.flush()  # print first, in case drawing fails
-        from ssh_abduction.evaluation.paper.figures import draw_telling
+        from ssh_abduction.evaluation.figures import draw_telling
 
         draw_telling(options.plot, ranges, labels, found)
     return 0

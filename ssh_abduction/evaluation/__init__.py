@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from ssh_abduction.evaluation.pose_truth import VisitsEvaluation as VisitsEvaluation
     from ssh_abduction.evaluation.pose_truth import evaluate_visits as evaluate_visits
     from ssh_abduction.evaluation.pose_truth import told_poses as told_poses
-    from ssh_abduction.evaluation.relations import Relation as Relation
-    from ssh_abduction.evaluation.relations import Relations as Relations
+    from ssh_abduction.evaluation.trajectory import Relation as Relation
+    from ssh_abduction.evaluation.trajectory import Relations as Relations
     from ssh_abduction.evaluation.trajectory import Trajectory as Trajectory
     from ssh_abduction.evaluation.trajectory import TrajectoryWarning as TrajectoryWarning
 

@@ -41,8 +41,7 @@ from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import attributes_of, counted
 from ssh_abduction.evaluation.named_truth import map_of_trace
-from ssh_abduction.evaluation.relations import Relations
-from ssh_abduction.evaluation.trajectory import checked_pose, checked_time, three_numbers
+from ssh_abduction.evaluation.trajectory import Relations, checked_pose, checked_time, three_numbers
 
 # By default two poses within this many metres are one place.
 NEAR = 2.0

@@ -29,12 +29,10 @@ from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.argument import Argument
-from ssh_abduction.explain.axioms import Axioms
-from ssh_abduction.explain.derivation import Derivation
+from ssh_abduction.explain.axioms import Axioms, Piece
 from ssh_abduction.explain.no_map import Explanation, check_two_steps, explain
-from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
-from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
+from ssh_abduction.explain.verdict import Derivation, PairExplanation, Side, Verdict
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import EQUAL, Cost, Judging, Status, Stop, facts
 from ssh_abduction.theory.old_choices import with_old_choices

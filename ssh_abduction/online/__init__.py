@@ -6,7 +6,7 @@ TYPE_CHECKING = False
 
 if TYPE_CHECKING:
     from ssh_abduction.online.belief import Belief as Belief
-    from ssh_abduction.online.chances import Chances as Chances
+    from ssh_abduction.online.belief import Chances as Chances
     from ssh_abduction.online.explorer import Exploration as Exploration
     from ssh_abduction.online.explorer import Explorer as Explorer
     from ssh_abduction.online.localiser import Localiser as Localiser

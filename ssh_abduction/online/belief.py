@@ -5,7 +5,7 @@ A dstate (distinctive state) is a place and the direction that the robot faces t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.errors import LocaliserError
-from ssh_abduction.online.motion import Away
+from ssh_abduction.online.estimates import Away, Observation
 
 # The robot is located if one dstate has at least this probability.
 LOCATED = 0.9
@@ -45,33 +45,6 @@ class BeliefVerdict(Enum):
     # again since.
     LOST = "lost"
     NOWHERE = "nowhere"  # the robot is at no dstate of the map, with a probability above 0.5
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Observation:
-    """How well an observation o fits each of N dstates x. `localiser.py` defines f and q."""
-
-    # The ids of k dstates, of shape (k,), or a slice of all dstates.
-    where: NDArray[np.intp] | slice
-    # f(o|x) / q(o) for each of these dstates, of shape (k,). For all others it is 0.
-    ratio: NDArray[np.float64]
-    # Probability, given o, that an unknown place looks like no dstate of the map. A priori, the N +
-    # 1 cases are equally likely: it looks like one of the dstates, or none.
-    novel: float
-
-    def __and__(self, other: Observation) -> Observation:
-        """Return the observation of both, if they are independent at each of the N + 1 cases.
-
-        `other` has the ratios of all N dstates.
-        """
-        cases = len(other.ratio) + 1
-        ratio = self.ratio * other.ratio[self.where]
-        none = self.novel * other.novel * cases
-        usual = float(ratio.sum()) / cases + none
-        return Observation(self.where, ratio / usual, none / usual) if usual else NOVEL
-
-
-NOVEL = Observation(np.empty(0, np.intp), np.empty(0), 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,3 +181,41 @@ class Belief:
 def _rounded(value: float) -> float:
     """Round to six significant digits."""
     return float(f"{value:.6g}")
+
+
+@dataclass(frozen=True, slots=True)
+class Chances:
+    """The probabilities, for each step, that the robot and the map disagree.
+
+    The defaults are those of other localisers. `misread` and `slipped` are 0.01, as openFABMAP
+    leaves 0.01 (1 - sFactor) to what its model does not explain. `unmapped` and `reentered` are
+    0.1, as in RTAB-Map (Labbé and Michaud 2013): Bayes/PredictionLC for a robot that comes to an
+    unknown place, and 1 - Bayes/VirtualPlacePriorThr for a robot that comes back.
+
+    Attributes:
+        misread: Probability that the observation does not fit the dstate where the robot is. For
+            example, a person stands in front of the laser, or an image got the wrong view.
+        slipped: Probability that the action does not lead where the link of the map says: it
+            failed, or the robot was kidnapped.
+        unmapped: Probability that the robot is at no dstate of the map if its position is unknown:
+            at the start, after a slip, and after an action that has no link.
+        reentered: Probability that a robot at no dstate of the map is at one after its next action.
+    """
+
+    misread: float = 0.01
+    slipped: float = 0.01
+    unmapped: float = 0.1
+    reentered: float = 0.1
+
+    def __post_init__(self) -> None:
+        for chance in fields(self):
+            value, mend = getattr(self, chance.name), "take 0 for what never happens"
+            a_number(chance.name, value, LocaliserError, 0, 1, what="a probability", mend=mend)
+
+    @classmethod
+    def none(cls) -> Chances:
+        """Make chances for a map that holds without exception (equation 4 of `localiser.py`).
+
+        Localisation then restarts at an observation that the map does not allow.
+        """
+        return cls(misread=0.0, slipped=0.0, unmapped=0.0, reentered=1.0)

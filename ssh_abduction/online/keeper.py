@@ -1,6 +1,7 @@
 """Keep the minimal maps of a growing trace up to date, for a theory that allows no faults.
 
-A fault is a step that a map treats as wrong.
+A fault is a step that a map treats as wrong. A minimal map is kept by replaying it: following its
+links along the steps of the trace, as long as it predicts what the robot sees.
 
 A *sketch* (`solver/guesses/sketch.py`) is made without a search: a step gets a new dstate (a place
 and a heading) unless the axioms imply at which known dstate it is. A *draft* is a sketch that
@@ -11,13 +12,15 @@ sketch that begins at the first step is mostly larger. It is used if there is no
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.online.replay import MinimalMaps
+from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.solver import (
     Cost,
     Effort,
@@ -27,6 +30,8 @@ from ssh_abduction.solver import (
     Sketch,
     Solution,
     Status,
+    Stop,
+    observation,
     sketch_beyond,
     sketches_of,
 )
@@ -34,6 +39,7 @@ from ssh_abduction.theory.evidence import said_by
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups, row
+from ssh_abduction.theory.theory import Theory
 
 # After a search that was stopped, the trace grows by this factor before the next one, so that few
 # steps are slow.
@@ -55,11 +61,69 @@ class StepOptions:
     speedups: Speedups  # flags that say which speed-ups of the solver to use
 
 
-class MapKeeper:
+class Keeper(ABC):
+    """Keeps the maps of a growing trace up to date, by a search at some steps.
+
+    `problem` has the steps so far, and the theory, in which no field is "auto". `before` is the
+    keeper of fewer steps that this one replaces; None for the first.
+    """
+
+    retry = RETRY  # after a search that was stopped, the trace grows by this factor
+
+    def __init__(self, problem: Problem, options: StepOptions, before: Keeper | None) -> None:
+        self._problem, self._options = problem, options
+        self._judging = Judging(problem)
+        self.searches: int = before.searches if before else 0  # by clingo, so far
+        self._next_search = 0  # no search before the trace has this many steps
+        self._spent = 0.0  # seconds that all steps took
+
+    def take(self, problem: Problem) -> None:
+        """Add the last step: keep the maps that predict it, and drop those that it contradicts."""
+        self._problem = problem
+        if self._follow():
+            self._next_search = 0
+
+    def answer(self, began: float) -> Solution:
+        """Search the steps so far if that is due, and return what is known.
+
+        `began` is when the step began, by `time.perf_counter`.
+        """
+        steps = len(self._problem.trace)
+        if not self._is_settled and steps >= self._next_search:
+            self.searches += 1
+            was_stopped = self._ask() in ("work limit", "time limit", "interrupted")
+            self._next_search = max(steps + PAUSE, int(self.retry * steps)) if was_stopped else 0
+        return self._solution(began)
+
+    @abstractmethod
+    def _follow(self) -> bool:
+        """Follow all maps along the last step. Return whether the maps are proven no longer."""
+
+    @property
+    @abstractmethod
+    def _is_settled(self) -> bool:
+        """Whether another search would find nothing new."""
+
+    @abstractmethod
+    def _ask(self) -> Stop | None:
+        """Search for minimal maps, keep them, and return why the search ended early."""
+
+    @abstractmethod
+    def _solution(self, began: float) -> Solution:
+        """The solution so far: the minimal maps, else the best map known, else none."""
+
+    def _judge(self, maps: Sequence[SSHMap], began: float) -> None:
+        """Test the first map by evidence about whole maps, unless that takes too long."""
+        trace = self._problem.trace
+        self._spent += time.perf_counter() - began
+        if maps and self._judging.has_time_for(len(trace), self._spent):
+            self._judging.pass_grown_map(trace, maps[0])
+
+
+class MapKeeper(Keeper):
     """Keeps the minimal maps up to date, or the best map that is found in time.
 
-    `problem` has the steps so far, and the theory: it allows no faults, and no field is "auto".
-    `before` is the keeper of fewer steps that this one replaces; None for the first.
+    The theory of `problem` allows no faults.
     """
 
     standing = None  # only `Recovery`, for theories with faults, has a standing
@@ -67,18 +131,12 @@ class MapKeeper:
     def __init__(
         self, problem: Problem, options: StepOptions, before: MapKeeper | None = None
     ) -> None:
-        trace, theory = problem.trace, problem.theory
-        self._problem, self._options = problem, options
-        self._judging = Judging(problem)
-        self.minimal = MinimalMaps(trace, theory, self._judging)
+        super().__init__(problem, options, before)
+        self.minimal = MinimalMaps(problem.trace, problem.theory, self._judging)
         self.drafts = Drafts(problem, self._judging)  # maps that were made without a search
-        # The number of searches by clingo so far.
-        self.searches: int = before.searches if before else 0
         # The last search, which the next one continues; None before the first.
         self.search: Search | None = None
         self._found: Solution | None = None  # the solution of this search, without its maps
-        self._next_search = 0  # no search before the trace has this many steps
-        self._spent = 0.0  # seconds that all steps took
 
     def restarted(self, problem: Problem) -> MapKeeper:
         """Make a keeper for the theory of `problem`, which changed with the last step.
@@ -92,32 +150,26 @@ class MapKeeper:
                 keeper.drafts.add(ssh_map, problem.trace)
         return keeper
 
-    def take(self, problem: Problem) -> None:
-        """Add the last step: keep the maps that predict it, and drop those that it contradicts."""
-        self._problem, trace = problem, problem.trace
+    def _follow(self) -> bool:
+        problem, trace = self._problem, self._problem.trace
         action = trace.steps[-2].action
         assert action
         if self.minimal.is_impossible:
-            return
+            return False
         was_proven = self.minimal.status is Status.OPTIMAL
         untried = self.minimal.follow(action, trace, problem.pairs)
         self.drafts.follow(action, trace.steps[-1])
-        if was_proven and self.minimal.status is Status.UNKNOWN:
-            self._next_search = 0
         for rival in untried[:DRAFTS]:
             self.drafts.add(rival.explained(), trace)
+        return was_proven and self.minimal.status is Status.UNKNOWN
 
-    def answer(self, began: float) -> Solution:
-        """Search for minimal maps of the steps so far if needed, and return what is known.
+    @property
+    def _is_settled(self) -> bool:
+        minimal = self.minimal
+        is_complete = minimal.complete or len(minimal.maps) == self._options.max_maps
+        return minimal.is_impossible or (minimal.status is Status.OPTIMAL and is_complete)
 
-        `began` is when the step began, by `time.perf_counter`.
-        """
-        is_settled = self.minimal.is_impossible or self.minimal.is_settled(self._options.max_maps)
-        if not is_settled and len(self._problem.trace) >= self._next_search:
-            self._ask()
-        return self._solution(began)
-
-    def _ask(self) -> None:
+    def _ask(self) -> Stop | None:
         """Search for minimal maps with clingo and keep them.
 
         If a minimal map is known, only the others are searched for.
@@ -138,19 +190,16 @@ class MapKeeper:
         # The maps are not ranked, as ranking takes longer than a step may.
         found = tuple(search.unranked())
         said = search.solution()
-        self.search, self._found, self.searches = search, said, self.searches + 1
-        was_stopped = search.stopped in ("work limit", "time limit", "interrupted")
-        later = max(len(trace) + PAUSE, int(RETRY * len(trace)))
-        self._next_search = later if was_stopped else 0
+        self.search, self._found = search, said
         proves = said.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
         if proves or not self.minimal.replays:
             self.minimal.replace(found, said.status, said.complete, said.cost)
             self.drafts.clear()
         elif found:
             self.drafts.add(found[0], trace)
+        return search.stopped
 
     def _solution(self, began: float) -> Solution:
-        """The solution so far: the minimal maps, else one consistent map, else no map."""
         asked = self._found
         assert asked is not None
         minimal, trace, steps = self.minimal, self._problem.trace, len(self._problem.trace)
@@ -158,9 +207,7 @@ class MapKeeper:
         maps = tuple(m.explained() for m in minimal.maps)
         if status is Status.UNKNOWN and (best := self.drafts.best(trace, self._problem.pairs)):
             maps, status, cost = (best,), Status.FEASIBLE, Cost.of(best)
-        self._spent += time.perf_counter() - began
-        if maps and self._judging.has_time_for(steps, self._spent):
-            self._judging.pass_grown_map(trace, maps[0])
+        self._judge(maps, began)
         was_asked = asked.steps == steps  # at this step
         return Solution(
             status=status,
@@ -277,3 +324,55 @@ class Drafts:
         if not sketch.certain or not self._trusts_sketches:
             sketch.certain = not check(trace, sketch.map(), self._other_axioms)
         return sketch.certain
+
+
+class MinimalMaps:
+    """The minimal maps of the steps so far, with how much is proven about them."""
+
+    def __init__(self, trace: Trace, theory: Theory, judging: Judging) -> None:
+        # The minimal maps. If `replays` is false, the maps that clingo found last, which may not be
+        # proven minimal.
+        self.maps: list[ExtendedMap] = []
+        self.status = Status.UNKNOWN  # UNKNOWN until clingo has proven which maps are minimal
+        self.complete = False  # whether `maps` are all minimal maps
+        self.cost: Cost | None = None  # the counts of a minimal map; None if they are unknown
+        # Whether the claim in `mapper.py` holds for the theory, so that maps are replayed.
+        self.replays = row("prefixes").holds_for(theory)
+        self._trace, self._theory, self._judging = trace, theory, judging
+
+    def follow(self, action: Action, trace: Trace, pairs: Pairs) -> list[ExtendedMap]:
+        """Keep the maps that predict the last step. If none does, reset the status to UNKNOWN.
+
+        `trace` has this step, and `action` led to it. If no map is kept, return the maps
+        that have no link for the action, else an empty list.
+        """
+        self._trace, seen = trace, observation(trace.steps[-1], self._theory)
+        untried = [m for m in self.maps if m.is_unknown(action.name)]
+        longer = (m.predicting(action.name, seen) for m in self.maps)
+        self.maps = [m for m in longer if m and m.is_allowed(trace, pairs, self._judging)]
+        # A map without a link for the action may be extended to further minimal maps.
+        self.complete = self.complete and not untried
+        if not self.replays:
+            self.maps = []
+        if self.maps:
+            return []
+        self.status, self.complete = Status.UNKNOWN, False
+        return untried
+
+    def replace(
+        self, found: Iterable[SSHMap], status: Status, complete: bool, cost: Cost | None
+    ) -> None:
+        """Take the result of a search. Keep the known minimal maps if the search listed fewer.
+
+        `complete` says whether these are all minimal maps. `cost` has the counts of a minimal map,
+        if there is one.
+        """
+        maps, was_proven = list(found), self.status is Status.OPTIMAL
+        self.status, self.complete, self.cost = status, complete, cost
+        if len(maps) >= len(self.maps) or not was_proven:
+            self.maps = [ExtendedMap.of(m, self._trace, self._theory) for m in maps]
+
+    @property
+    def is_impossible(self) -> bool:
+        """Whether it is proven that these steps have no map, however the trace goes on."""
+        return self.status is Status.UNSATISFIABLE and self.replays

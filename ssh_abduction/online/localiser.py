@@ -69,10 +69,18 @@ from ssh_abduction.data.maps import SSHMap, check_labels, checked_map
 from ssh_abduction.data.odometry import Displacement, Odometry, checked_displacement
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace, View, checked_trace
-from ssh_abduction.online.belief import AKIN, NOVEL, TINY, Belief, Observation
-from ssh_abduction.online.chances import Chances
-from ssh_abduction.online.estimates import Links, Moves, Stars, view_ratios
-from ssh_abduction.online.motion import Away, DeadReckoning, Motion
+from ssh_abduction.online.belief import AKIN, TINY, Belief, Chances
+from ssh_abduction.online.estimates import (
+    NOVEL,
+    Away,
+    DeadReckoning,
+    Links,
+    Motion,
+    Moves,
+    Observation,
+    Stars,
+    view_ratios,
+)
 
 if TYPE_CHECKING:
     from perception.likelihood import ImageLikelihood

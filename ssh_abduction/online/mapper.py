@@ -82,8 +82,7 @@ from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.online.recovery import Recovery
-    from ssh_abduction.online.standing import Standing
+    from ssh_abduction.online.recovery import Recovery, Standing
 
 
 class OnlineMapper:

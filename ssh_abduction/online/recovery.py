@@ -27,9 +27,9 @@ the logical representation can be restored" (Kuipers & Beeson 2002). This module
   never tried: each map is extended by a link to each dstate that looks right. These extensions
   cost nothing, and all others cost more. If no minimal map predicts the step, the trace
   is solved again, within the time of a step.
-* **Rivals** (`rival_maps.py`): besides the minimal maps, explanations that cost a little more,
+* **Rivals** (`RivalMaps`): besides the minimal maps, explanations that cost a little more,
   each with its probability (`hypotheses.py`).
-* **Where the robot is** (`standing.py`), by Markov localisation in the best map. It begins just
+* **Where the robot is** (`Confidence`), by Markov localisation in the best map. It begins just
   before the first step that contradicted the map. The robot may be at no dstate of the map.
 
 The mapper is certain if one map is proven minimal and has a probability of at least CERTAIN (0.99)
@@ -40,83 +40,84 @@ and localisation finds the robot where this map has it.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
-from ssh_abduction.online.keeper import StepOptions
-from ssh_abduction.online.rival_maps import RivalMaps
-from ssh_abduction.online.standing import Confidence, Standing
-from ssh_abduction.solver import Effort, Judging, Seconds, Solution, Status, cost_as_counted, solve
+import numpy as np
+
+from ssh_abduction.checker.checker import check
+from ssh_abduction.data.maps import Fault, SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.online.belief import Belief, Chances
+from ssh_abduction.online.hypotheses import ExtendedMap, Seen, shares_of_rivals
+from ssh_abduction.online.keeper import Keeper, StepOptions
+from ssh_abduction.online.localiser import Localiser
+from ssh_abduction.solver import (
+    Bound,
+    Effort,
+    Judging,
+    Seconds,
+    Solution,
+    Status,
+    Stop,
+    cost_as_counted,
+    observation,
+    solve,
+)
 from ssh_abduction.theory.settle import Problem
-
-# After each search with a time limit the trace has to grow by this factor, and by at least this
-# many steps, before the next search.
-RETRY = 1.05
-PAUSE = 2
+from ssh_abduction.theory.speedups import row
+from ssh_abduction.theory.theory import Theory
 
 
-class Recovery:
-    """Keeps the maps up to date for a theory that allows faults, and says how sure they are.
+class Recovery(Keeper):
+    """Keeps the maps up to date for a theory that allows faults, and says how sure they are."""
 
-    `problem` has the steps so far, and the theory, in which no field is "auto". `before` is the
-    Recovery of fewer steps that this one replaces; None for the first.
-    """
+    retry = 1.05  # each search begins anew, and takes longer than one that is continued
 
     def __init__(
         self, problem: Problem, options: StepOptions, before: Recovery | None = None
     ) -> None:
-        self._trace, self._theory, self._options = problem.trace, problem.theory, options
-        self._judging = Judging(problem)
+        super().__init__(problem, options, before)
         self._maps = RivalMaps(problem, options.max_maps, self._judging)
-        self.searches: int = before.searches if before else 0  # by clingo, so far
-        self._next_search = 0  # no search before the trace has this many steps
         self._confidence: Confidence = before._confidence if before else Confidence(problem.theory)
-        self._spent = 0.0  # seconds that all steps took
         self.standing: Standing | None = None  # before the first answer
 
     def restarted(self, problem: Problem) -> Recovery:
         """Make a Recovery for a theory that changed with the last step. It has no proofs yet."""
         return Recovery(problem, self._options, before=self)
 
-    def take(self, problem: Problem) -> None:
-        """Add the last step to all rivals, and record whether the step contradicts the best map."""
-        trace = problem.trace
-        self._trace, lead = trace, self._maps.lead
+    def _follow(self) -> bool:
+        problem, lead = self._problem, self._maps.lead
         if lead and self._confidence.known is None:
             self._confidence.known = lead.explained()
         change = self._maps.follow(problem)
-        if change.lost_proof:
-            self._next_search = 0
-        self._confidence.note(len(trace) - 1, change.broke)
+        self._confidence.note(len(problem.trace) - 1, change.broke)
+        return change.lost_proof
 
     def answer(self, began: float) -> Solution:
-        """Solve the trace again if that is due, and return what is known.
-
-        `began` is when the step began, by `time.perf_counter`.
-        """
-        if not self._maps.is_settled and len(self._trace) >= self._next_search:
-            self._solve()
-        solution = self._solution(began)
-        self.standing = self._confidence.standing(self._maps, self._trace, solution.maps)
+        """Also say how sure the maps are."""
+        solution = super().answer(began)
+        self.standing = self._confidence.standing(self._maps, self._problem.trace, solution.maps)
         return solution
 
-    def _solve(self) -> None:
-        """Solve the trace within the time of a step."""
-        steps, options = len(self._trace), self._options
-        self._next_search = 0
-        if options.time_limit is not None:
-            self._next_search = max(steps + PAUSE, int(RETRY * steps))
-        self.searches += 1
+    @property
+    def _is_settled(self) -> bool:
+        return self._maps.is_settled
+
+    def _ask(self) -> Stop | None:
+        trace, options = self._problem.trace, self._options
         found = solve(
-            self._trace,
-            self._theory.of_steps(0, steps),
+            trace,
+            self._problem.theory.of_steps(0, len(trace)),
             time_limit=options.time_limit,
             max_maps=options.max_maps,
             speedups=options.speedups,
         )
         self._maps.absorb(found)
+        return found.stopped
 
     def _solution(self, began: float) -> Solution:
-        """The solution so far: the minimal maps, else the best rival, else none."""
-        maps, steps = self._maps, len(self._trace)
+        maps, theory = self._maps, self._problem.theory
         maps.drop_inconsistent()
         lead, solved = maps.lead, maps.solved
         assert solved is not None
@@ -124,18 +125,16 @@ class Recovery:
         listed = tuple(rival.explained() for rival in maps.minimal)
         if lead and not listed:
             listed = (lead.explained(),)
-        self._spent += time.perf_counter() - began
-        if listed and self._judging.has_time_for(steps, self._spent):
-            self._judging.pass_grown_map(self._trace, listed[0])
+        self._judge(listed, began)
         status = self._status()
         return Solution(
             status=status,
             maps=listed,
-            cost=cost_as_counted(listed[0], lead.cost, self._theory) if lead else None,
+            cost=cost_as_counted(listed[0], lead.cost, theory) if lead else None,
             bound=maps.bound,
             complete=maps.is_complete or status is Status.UNSATISFIABLE,
-            theory=self._theory,
-            steps=steps,
+            theory=theory,
+            steps=len(self._problem.trace),
             effort=Effort(solved.steps, Seconds(time.perf_counter() - began, 0.0, 0.0)),
             stopped=None if maps.is_complete or maps.is_impossible else solved.stopped,
             partial=None if listed else self._confidence.known,
@@ -148,3 +147,395 @@ class Recovery:
         if self._maps.rivals:
             return Status.FEASIBLE
         return Status.UNSATISFIABLE if self._maps.is_impossible else Status.UNKNOWN
+
+
+# A map can be certain only if it has at least this probability among its rivals.
+CERTAIN = 0.99
+# At most this many hypotheses are reported. If there are more, the last one is for all others.
+LISTED = 10
+# Localisation begins at most this many steps before the last one.
+REPLAYED = 200
+
+
+@dataclass(frozen=True, slots=True)
+class PossibleMap:
+    """One possible explanation of the steps so far, with its probability.
+
+    Attributes:
+        weight: The probability. The weights of all hypotheses sum to 1.
+        map: A map of all steps so far, with its faults; None if this entry is for all remaining
+            hypotheses together, or if no map is known.
+        said: Text that names the new faults since the mapper was last certain, and the dstate where
+            the robot is.
+    """
+
+    weight: float
+    map: SSHMap | None
+    said: str
+
+    def __str__(self) -> str:
+        return f"{self.weight:.3f}  {self.said}"
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """How sure the mapper is of its map, and which explanations are possible.
+
+    Attributes:
+        certain: Whether the first map of the solution is proven minimal, and nearly all hypotheses
+            predict the same from here on. They may still differ in the past: which step to treat as
+            wrong.
+        broke: A sentence for each step that contradicted the best map since the mapper was last
+            certain. They are still listed at the step at which the mapper becomes certain again.
+        hypotheses: The possible explanations, the most probable first.
+        where: The belief about where the robot is in the first map, by Markov localisation that
+            begins just before the first step in `broke`; None if `broke` is empty.
+    """
+
+    certain: bool
+    broke: tuple[str, ...]
+    hypotheses: tuple[PossibleMap, ...]
+    where: Belief | None = None
+
+    def __str__(self) -> str:
+        if self.certain:
+            return f"certain: {self.hypotheses[0].said}"
+        return "; ".join([f"uncertain, most likely: {self.hypotheses[0].said}", *self.broke[-1:]])
+
+
+def chances_of(theory: Theory) -> Chances:
+    """Convert the prices of faults in a theory to probabilities for localisation.
+
+    A fault that costs twice as much as another kind is as rare as two faults of that kind. If the
+    theory allows only one kind of fault, the other kind gets twice its price. Otherwise
+    localisation would explain every error by the one kind that is allowed.
+    """
+    cheapest = min(price for price in (theory.misread, theory.slipped) if price)
+    misread, slipped = (
+        RARE ** min(2.0, (price or 2 * cheapest) / cheapest)
+        for price in (theory.misread, theory.slipped)
+    )
+    return Chances(misread=misread, slipped=slipped)
+
+
+@dataclass(frozen=True, slots=True)
+class _LocatedBelief:
+    """The belief in a map after the first steps, and the localiser that continues it."""
+
+    map_key: object
+    localiser: Localiser
+    belief: Belief
+    steps: int
+
+
+class Confidence:
+    """Computes how sure the mapper is after each step, for a theory that allows faults."""
+
+    def __init__(self, theory: Theory) -> None:
+        # The last map that was certain. If none was certain yet, the best map of the first answer.
+        self.known: SSHMap | None = None
+        self._chances = chances_of(theory)
+        self._broke: list[tuple[int, str]] = []  # step and sentence, since the map was certain
+        self._located: _LocatedBelief | None = None
+
+    def note(self, step: int, broke: str | None) -> None:
+        """Record that a step contradicted the best map, if `broke` has a sentence on it."""
+        if broke:
+            self._broke.append((step, broke))
+
+    def standing(self, maps: RivalMaps, trace: Trace, listed: Sequence[SSHMap]) -> Standing:
+        """Compute how sure the mapper is now, by the rivals and the maps listed, best first."""
+        broke = tuple(sentence for _, sentence in self._broke)
+        lead = maps.lead
+        if lead is None:
+            said = "no map of these steps is known yet"
+            if maps.is_impossible:
+                said = "no map satisfies the axioms"
+            return Standing(False, broke, (PossibleMap(1.0, None, said),))
+        rivals, shares = maps.undecided()
+        where = self._locate(lead, trace) if self._broke else None
+        certain = _is_decided(maps, rivals, shares) and (
+            where is None or self._has_recovered(where, lead, trace)
+        )
+        standing = Standing(certain, broke, self._hypotheses(rivals, shares), where)
+        # From here on only later faults are reported.
+        if certain:
+            self.known, self._located = listed[0], None
+            self._broke.clear()
+        return standing
+
+    def _has_recovered(self, where: Belief, lead: ExtendedMap, trace: Trace) -> bool:
+        """Whether the mapper has recovered from the last step that contradicted the best map.
+
+        This needs a later step, and localisation has to agree with the best map: it gives more than
+        half of the probability to the dstate where this map has the robot.
+        """
+        is_later = self._broke[-1][0] < len(trace) - 1
+        return is_later and where.likeliest == lead.here and where.probability > 0.5
+
+    def _hypotheses(
+        self, rivals: Sequence[ExtendedMap], shares: Sequence[float]
+    ) -> tuple[PossibleMap, ...]:
+        """Make hypotheses from the most probable rivals, and one from all others together."""
+        order = sorted(range(len(shares)), key=lambda i: -shares[i])
+        first = order if len(order) <= LISTED else order[: LISTED - 1]
+        listed = [
+            PossibleMap(shares[i], rivals[i].explained(), self._said(rivals[i])) for i in first
+        ]
+        if rest := order[len(first) :]:
+            others = "the one other" if len(rest) == 1 else f"one of {len(rest)} others"
+            listed.append(PossibleMap(sum(shares[i] for i in rest), None, others))
+        return tuple(listed)
+
+    def _said(self, rival: ExtendedMap) -> str:
+        """Describe a rival: its new faults since the mapper was certain, and the robot's dstate."""
+        excused = set(self.known.faults) if self.known else set()
+        new = sorted(set(rival.faults) - excused, key=lambda fault: fault.step)
+        faults = ", ".join(str(fault) for fault in new) or "nothing new is taken as wrong"
+        return f"{faults}; the robot is at dstate {rival.here} of {len(rival.shows)}"
+
+    def _locate(self, lead: ExtendedMap, trace: Trace) -> Belief:
+        """Locate the robot in the best map.
+
+        Begin where this map has the robot just before the first step that contradicted the best
+        map since the mapper was certain, but at most REPLAYED steps back.
+        """
+        t = len(trace) - 1
+        key = (lead.shows, frozenset(lead.links.items()))
+        if self._located is not None and self._located.map_key == key:
+            localiser, belief = self._located.localiser, self._located.belief
+            after = self._located.steps
+        else:  # another map than at the last step
+            localiser = Localiser(lead.explained(), chances=self._chances)
+            after = max(self._broke[0][0] - 1, t - REPLAYED, 0)
+            there = np.zeros(len(lead.shows))
+            there[lead.labels[after]] = 1.0
+            belief = Belief(there, 0.0)
+        for i in range(after, t):
+            done = trace.steps[i].action
+            assert done
+            belief = localiser.update(belief, done, trace.steps[i + 1].view)
+        self._located = _LocatedBelief(key, localiser, belief, t)
+        return belief
+
+
+def _is_decided(maps: RivalMaps, rivals: Sequence[ExtendedMap], shares: Sequence[float]) -> bool:
+    """Whether the future is decided, whatever the past.
+
+    All minimal maps must be known and predict the same from here on. Rivals that predict this too
+    must have at least the probability CERTAIN, together with the minimal maps.
+    """
+    if not maps.is_complete:
+        return False
+    future = maps.rivals[0].future()
+    if any(rival.future() != future for rival in maps.minimal[1:]):
+        return False
+    agreeing = sum(
+        share
+        for rival, share in zip(rivals, shares, strict=True)
+        if maps.is_minimal(rival) or rival.future() == future
+    )
+    return agreeing >= CERTAIN
+
+
+# Probability of a fault of the cheapest kind, at each step.
+RARE = Chances().misread
+# At most this many rivals cost more than the minimal maps.
+RIVALS = 50
+# Rivals that are less probable than this share of the most probable one are dropped.
+LEAST_SHARE = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class StepEffect:
+    """The effect of one more step on the rivals."""
+
+    # Whether the maps are not proven minimal any more, or further minimal maps may exist.
+    lost_proof: bool = False
+    # A sentence about what the best map expected instead; None if it predicted the step.
+    broke: str | None = None
+
+
+class RivalMaps:
+    """The rivals of the steps so far, with how much is proven about them.
+
+    The theory of `problem` allows faults, and no field is "auto". At most `max_maps` of the
+    cheapest rivals are kept; None keeps all.
+    """
+
+    def __init__(self, problem: Problem, max_maps: int | None, judging: Judging) -> None:
+        trace, theory = problem.trace, problem.theory
+        self.rivals: list[ExtendedMap] = []  # the cheapest first, then others by probability
+        self.solved: Solution | None = None  # the last result of the solver
+        self.bound = Bound()  # the best lower bound of the cost so far
+        # Whether it is proven that the cheapest rivals are minimal, that all minimal maps are
+        # listed, and that no map satisfies the axioms.
+        self.is_proven = self.is_complete = self.is_impossible = False
+        self._problem, self._max_maps, self._judging = problem, max_maps, judging
+        self._views = {step.view for step in trace.steps}
+        self._least: tuple[int, ...] = ()  # what a minimal map costs, while proven
+        self._replays = row("prefixes").holds_for(theory.replace(misread=0, slipped=0))
+        self._has_evidence = bool(problem.evidence)
+        # Under the two causal axioms alone, `ExtendedMap.ways_on` lists all possible links.
+        self._lists_links = (
+            theory.level == "causal"
+            and not self._has_evidence
+            and not theory.rules
+            and not theory.without
+        )
+
+    @property
+    def _trace(self) -> Trace:
+        return self._problem.trace
+
+    @property
+    def _theory(self) -> Theory:
+        return self._problem.theory
+
+    @property
+    def lead(self) -> ExtendedMap | None:
+        """The best rival; None if there is none."""
+        return self.rivals[0] if self.rivals else None
+
+    @property
+    def minimal(self) -> list[ExtendedMap]:
+        """The rivals that are proven minimal; empty without a proof."""
+        if not self.is_proven:
+            return []
+        return [rival for rival in self.rivals if rival.cost == self._least]
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether solving again would add nothing."""
+        return self.is_impossible or (
+            self.is_proven and (self.is_complete or len(self.minimal) == self._max_maps)
+        )
+
+    def is_minimal(self, rival: ExtendedMap) -> bool:
+        """Whether a rival has the cost that was last proven minimal."""
+        return rival.cost == self._least
+
+    def follow(self, problem: Problem) -> StepEffect:
+        """Extend the rivals by the last step of `problem`, which has all steps and the theory."""
+        self._problem, trace = problem, problem.trace
+        t = len(trace) - 1
+        self._views.add(trace.steps[t].view)
+        if self.is_impossible and self._replays:
+            return StepEffect()
+        done = trace.steps[t - 1].action
+        assert done
+        seen = observation(trace.steps[t], self._theory)
+        lead = self.lead
+        contradicted = lead.contradiction(done.name, seen) if lead else None
+        has_unknown = any(rival.is_unknown(done.name) for rival in self.minimal)
+        self.rivals = self._gone_on(self.rivals, t)
+        if not self._replays:  # the answer for fewer steps says nothing about more steps
+            self.rivals, self.bound = [], Bound()
+            self.is_proven = self.is_complete = self.is_impossible = False
+            return StepEffect(lost_proof=True)
+        lost_proof = False
+        if self.is_proven and self.is_complete and has_unknown and not self._lists_links:
+            self.is_complete, lost_proof = False, True
+        if self.is_proven and not self.minimal:
+            self.is_proven, self.is_complete, lost_proof = False, False, True
+        if lead and contradicted is not None and all(r.cost > lead.cost for r in self.rivals):
+            return StepEffect(lost_proof, self._sentence(t, lead, contradicted, seen))
+        return StepEffect(lost_proof)
+
+    def absorb(self, found: Solution) -> None:
+        """Add the maps of a solution of all steps to the rivals, and record what is proven."""
+        self.solved = found
+        if (found.bound.tenths or 0) >= (self.bound.tenths or 0):
+            self.bound = found.bound
+        if found.status is Status.UNSATISFIABLE:
+            self.is_impossible, self.rivals = True, []
+            return
+        rivals = [ExtendedMap.of(ssh_map, self._trace, self._theory) for ssh_map in found.maps]
+        if found.status is Status.OPTIMAL and rivals:
+            self.is_proven, self.is_complete, self._least = True, found.complete, rivals[0].cost
+        # Keep the other rivals. But if all minimal maps are listed, no other rival can be as cheap.
+        known = {(rival.labels, rival.faults) for rival in rivals}
+        others = [
+            rival
+            for rival in self.rivals
+            if (rival.labels, rival.faults) not in known
+            and not (self.is_complete and rival.cost <= self._least)
+        ]
+        self.rivals = self._ranked([*rivals, *others])
+
+    def drop_inconsistent(self) -> None:
+        """Drop the best rival until the checker accepts the best one that is left.
+
+        This is not needed if the maps are proven, or if the theory has only the causal axioms.
+        """
+        if self.is_proven or self._lists_links:
+            return
+        theory = self._theory.of_steps(0, len(self._trace))
+        while self.rivals and check(self._trace, self.rivals[0].explained(), theory):
+            del self.rivals[0]
+
+    def undecided(self) -> tuple[list[ExtendedMap], list[float]]:
+        """List the rivals that later steps have to decide between, and their probabilities.
+
+        Among rivals with the same faults, only the cheapest ones by the theory count,
+        because no evidence ever refutes a superfluous dstate.
+        """
+        least: dict[frozenset[Fault], tuple[int, ...]] = {}
+        for rival in self.rivals:
+            faults = frozenset(rival.faults)
+            least[faults] = min(least.get(faults, rival.cost), rival.cost)
+        rivals = [r for r in self.rivals if r.cost == least[frozenset(r.faults)]]
+        return rivals, self._shares(rivals)
+
+    def _gone_on(self, rivals: Iterable[ExtendedMap], t: int) -> list[ExtendedMap]:
+        """Extend rivals of the steps before `t` by step `t`, and rank the results."""
+        done, step = self._trace.steps[t - 1].action, self._trace.steps[t]
+        assert done
+        seen = observation(step, self._theory)
+        new = [
+            way for rival in rivals for way in rival.ways_on(done.name, step, seen, self._theory)
+        ]
+        # Evidence tests only the new step, as it has already tested the earlier ones.
+        if self._has_evidence:
+            trace = self._trace.prefix(t + 1)
+            pairs = self._problem.changed(trace, self._theory.of_steps(0, t + 1)).pairs
+            new = [rival for rival in new if rival.is_allowed(trace, pairs, self._judging)]
+        return self._ranked(new)
+
+    def _ranked(self, rivals: list[ExtendedMap]) -> list[ExtendedMap]:
+        """Sort rivals, the best first, and drop the improbable ones.
+
+        The cheapest rivals come first, and at most `max_maps` of them stay. Then come up to RIVALS
+        others that are probable enough, by probability.
+        """
+        if not rivals:
+            return []
+        least = min(rival.cost for rival in rivals)
+        shares = self._shares(rivals)
+        order = sorted(range(len(rivals)), key=lambda i: (rivals[i].cost != least, -shares[i]))
+        ranked = [
+            rivals[i]
+            for i in order
+            if rivals[i].cost == least or shares[i] >= LEAST_SHARE * max(shares)
+        ]
+        ties = sum(rival.cost == least for rival in ranked)
+        if self._max_maps and ties > self._max_maps:
+            ranked = ranked[: self._max_maps] + ranked[ties:]
+            self.is_complete, ties = False, self._max_maps
+        return ranked[: ties + RIVALS]
+
+    def _shares(self, rivals: list[ExtendedMap]) -> list[float]:
+        """Compute the probability of each rival. They sum to 1."""
+        dstates = len(min(rivals, key=lambda rival: rival.cost).shows)
+        return shares_of_rivals(rivals, self._theory, RARE, dstates, len(self._views))
+
+    def _sentence(self, t: int, lead: ExtendedMap, there: int, seen: Seen) -> str:
+        """Describe step t, which contradicts the best map: the map expected dstate `there`."""
+        kinds = [kind for kind in ("misread", "slipped") if getattr(self._theory, kind)]
+        expected = lead.shows[there]
+        what = (
+            f"seen {seen[0]}, expected {expected[0]}"
+            if seen[0] != expected[0]
+            else "seen another star than expected"
+        )
+        return f"step {t}: {what} at dstate {there}: {', '.join(kinds)}, or the map is wrong"

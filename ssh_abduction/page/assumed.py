@@ -17,9 +17,8 @@ import time
 from collections.abc import Iterator
 
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain.axioms import Axioms, Interrupted
+from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
 from ssh_abduction.explain.pair_reasons import SMALL, UNCUT
-from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import Cost, Status, facts, solve

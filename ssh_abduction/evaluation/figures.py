@@ -20,7 +20,7 @@ from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.evaluation.paper.experiments import NotchOutcome
+from ssh_abduction.evaluation.paper_experiments import NotchOutcome
 from ssh_abduction.output import plot
 
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"

@@ -23,9 +23,8 @@ from simulator.world import World
 from ssh_abduction.data.checks import one_of
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import filled, write_file
-from ssh_abduction.evaluation.paper import figures
-from ssh_abduction.evaluation.paper.claim_table import summary
-from ssh_abduction.evaluation.paper.experiments import (
+from ssh_abduction.evaluation import figures
+from ssh_abduction.evaluation.paper_experiments import (
     EXPERIMENTS,
     VIEWS_ALONE,
     WITH_STARS,
@@ -33,6 +32,7 @@ from ssh_abduction.evaluation.paper.experiments import (
     SeedRun,
     measure,
     outcome,
+    summary,
     true_dstates,
 )
 from ssh_abduction.learning.learner import BootstrapLearner
@@ -273,7 +273,7 @@ def _page(name: str, runs: Sequence[SeedRun], table: Sequence[dict[str, Any]], f
     differs = "\n".join(f"<li>{escape(text)}</li>" for text in DIFFERENCES[name])
     title = World.named(EXPERIMENTS[name].world).name
     return filled(
-        Path(__file__).parent / "report.html",
+        Path(__file__).parent / "paper_report.html",
         title=escape(title),
         seeds=str(len(runs)),
         first=str(runs[0].seed),
