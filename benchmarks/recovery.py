@@ -47,7 +47,7 @@ from instances import Walk
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace
 from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.solver import Cost
-from ssh_abduction.solver.asp.facts import answer_maps
+from ssh_abduction.solver.asp import facts
 
 COLUMNS = (
     "noticed",
@@ -206,7 +206,7 @@ def true_map(case: Case, theory: Theory, steps: int) -> SSHMap:
     """Make the true map of the first `steps` steps, with its faults."""
     trace = case.walk.trace
     faults = [(t, kind) for t, kind in case.faults if t + (kind == "slipped") < steps]
-    return answer_maps.causal_map(case.walk.truth[:steps], trace.prefix(steps), faults, theory)
+    return facts.causal_map(case.walk.truth[:steps], trace.prefix(steps), faults, theory)
 
 
 def cells(records: Sequence[Record]) -> list[str]:

@@ -31,7 +31,7 @@ SAID_BY = {
     "perception/places": ("import", "map"),
     "perception/readers": ("import", "map"),
     "simulator": ("simulate",),
-    "ssh_abduction/solver/asp/rule_checks.py": WITH_THEORY,
+    "ssh_abduction/solver/asp/own_rules.py": WITH_THEORY,
     "ssh_abduction/data/checks.py": WITH_MAPS,
     "ssh_abduction/cli/batch.py": ("solve",),
     "ssh_abduction/cli/cluster_jobs.py": ("solve", "map"),

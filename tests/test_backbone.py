@@ -36,11 +36,11 @@ from ssh_abduction.solver import (
     map_list,
     prefixes,
 )
-from ssh_abduction.solver.engines.framed import FramedEngine
-from ssh_abduction.solver.engines.frameless import FramelessEngine
-from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.solution.sharing import Backbone, Shared
 from ssh_abduction.solver.solution.writing import summary_of
+from ssh_abduction.solver.sources.exact.framed import FramedEngine
+from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
+from ssh_abduction.solver.sources.exact.readable import StepEngine
 
 ACES3 = "examples/aces3-route.jsonl"
 LIMIT = 100  # seconds: a search that does not end is a failure, not a hang

@@ -13,7 +13,8 @@ from strategies import STARS
 from ssh_abduction import Theory, Trace
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.trace import Action
-from ssh_abduction.solver import Search, choosing, mending
+from ssh_abduction.solver import Search, mending
+from ssh_abduction.solver.sources.exact import choosing
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.speedups import SPEEDUPS
 

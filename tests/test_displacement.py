@@ -26,7 +26,7 @@ from ssh_abduction.checker.geometry import _square_together
 from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.data.closure import Closure
 from ssh_abduction.runtime.clock import heeding
-from ssh_abduction.solver.asp.facts.answer_maps import causal_map
+from ssh_abduction.solver.asp.facts import causal_map
 from ssh_abduction.solver.geometry.fit import Poses, fit
 from ssh_abduction.solver.geometry.linear import inverse, least_squares, system_solved
 from ssh_abduction.solver.geometry.ranking import noise_warning, units_warning

@@ -23,7 +23,7 @@ from ssh_abduction.explain.verdict import Derivation, PairExplanation, Side, Ver
 from ssh_abduction.rivals import Listing
 from ssh_abduction.rivals.listing import PairInMap
 from ssh_abduction.solver import Cost, Search, Solution, Start, Status
-from ssh_abduction.solver.asp.facts import derivation_lp, further_rules
+from ssh_abduction.solver.asp import facts
 from ssh_abduction.theory.encodings import axioms
 from ssh_abduction.theory.settle import settle
 
@@ -49,9 +49,9 @@ def possible(
     """Whether the pair may be otherwise if only these axioms hold at these steps."""
     piece = Piece.of(settle(trace, theory), derivation.steps)
     pair = piece.steps.index(derivation.first), piece.steps.index(derivation.second)
-    active = [derivation_lp.active(axiom, piece.steps.index(step)) for axiom, step in links]
+    active = [facts.active(axiom, piece.steps.index(step)) for axiom, step in links]
     return Axioms(piece, never, relaxed=True).consistent(
-        active, [(further_rules.are_one(*pair), not derivation.one)]
+        active, [(facts.are_one(*pair), not derivation.one)]
     )
 
 

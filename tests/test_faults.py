@@ -25,12 +25,12 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Step
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
-from ssh_abduction.solver import Status, choosing
-from ssh_abduction.solver.engines import faulty, faulty_control
-from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.blocks import Blocks
+from ssh_abduction.solver import Status
 from ssh_abduction.solver.front import fault_front
 from ssh_abduction.solver.guesses.robust import Explainer
+from ssh_abduction.solver.sources.exact import choosing, faulty, faulty_program
+from ssh_abduction.solver.sources.exact.blocks import Blocks
+from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import Problem
 
@@ -155,7 +155,7 @@ def test_few_names_and_short_prefixes_do_not_change_answers(data: st.DataObject)
             GUESSED=data.draw(st.sampled_from([3, 10])),
             ASKED_FIRST=data.draw(st.sampled_from([0.0, 3.0])),
         ),
-        patch.multiple(faulty_control, AROUND=0, NAMES=1, MORE_NAMES=1),
+        patch.multiple(faulty_program, AROUND=0, NAMES=1, MORE_NAMES=1),
         patch.object(choosing, "FEW_STEPS", 0),
     ):
         solution = solve(trace, theory, max_maps=None)

@@ -18,26 +18,24 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.action import QUARTERS, Action
 from ssh_abduction.online.keeper import MapKeeper
-from ssh_abduction.solver import Search, Start, Status, choosing
+from ssh_abduction.solver import Search, Start, Status
 from ssh_abduction.solver.asp.control import Control
-from ssh_abduction.solver.asp.facts import paths_lp, sides_lp, visits_lp
-from ssh_abduction.solver.asp.facts.atoms import number_symbols
+from ssh_abduction.solver.asp.facts import number_symbols
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.engines import base as engine
-from ssh_abduction.solver.engines import (
-    framed,
-    framed_paths,
-    transitive,
-    visit_program,
-)
-from ssh_abduction.solver.engines import visit_labels as same
-from ssh_abduction.solver.engines.framed import FramedEngine
-from ssh_abduction.solver.engines.framed_paths import FramedPaths
-from ssh_abduction.solver.engines.framed_sides import FramedSides
-from ssh_abduction.solver.engines.visit_labels import VisitLabels
-from ssh_abduction.solver.engines.visit_program import VisitProgram
 from ssh_abduction.solver.guesses.merging import merged
-from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.solver.sources.exact import choosing, engine, framed, framed_paths, visit_program
+from ssh_abduction.solver.sources.exact import visits as same
+from ssh_abduction.solver.sources.exact.framed import FramedEngine
+from ssh_abduction.solver.sources.exact.framed_paths import FramedPaths
+from ssh_abduction.solver.sources.exact.path_facts import (
+    read_contrary,
+    settled_labels,
+    sides_framed_facts,
+    turn_facts,
+)
+from ssh_abduction.solver.sources.exact.prefixes import Prefixes
+from ssh_abduction.solver.sources.exact.visit_program import FramedSides, VisitProgram, visit_facts
+from ssh_abduction.solver.sources.exact.visits import VisitLabels
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import Speedups, encodings
@@ -105,7 +103,7 @@ def test_framed_maps_equal_those_of_the_plain_encoding(
     theory = theory.replace(**said)
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, engine.FIRST_PREFIXES]), label="first prefixes")
-    at_a_time = data.draw(st.sampled_from([1, transitive.AT_A_TIME]), label="at a time")
+    at_a_time = data.draw(st.sampled_from([1, visit_program.AT_A_TIME]), label="at a time")
     cores = {
         "FIRST_PAIRS": data.draw(
             st.sampled_from([0, 2, 10, same.FIRST_PAIRS]), label="first pairs"
@@ -122,7 +120,7 @@ def test_framed_maps_equal_those_of_the_plain_encoding(
         patch.object(choosing, "FEW_STEPS", 0),
         prefixes,
         patch.multiple(same, **cores),
-        patch.object(transitive, "AT_A_TIME", at_a_time),
+        patch.object(visit_program, "AT_A_TIME", at_a_time),
         patch.multiple(framed_paths, **fitted),
         patch.multiple(framed, MANY_PAIRS=many_pairs),
     ):
@@ -199,7 +197,7 @@ def test_framed_mapper_maps_a_maze_step_by_step() -> None:
     paths = set()
     with (
         patch.object(same, "GROWN", 100),
-        patch.object(transitive, "AT_A_TIME", 5),
+        patch.object(visit_program, "AT_A_TIME", 5),
         patch.object(choosing, "FEW_STEPS", 10),
     ):
         mapper = OnlineMapper(first.view or "", star=first.star, time_limit=None, max_maps=None)
@@ -229,7 +227,7 @@ def test_framed_maps_are_equal_without_each_speedup() -> None:
     trace = maze(2, 2, steps=36, seed=0, stars=True).trace
     expected = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without("names"))
     for off in ("", "clique", "core_guided", "sides"):
-        with patch.object(transitive, "AT_A_TIME", 5):
+        with patch.object(visit_program, "AT_A_TIME", 5):
             found = solve(
                 trace, Theory.topological(), max_maps=None, speedups=Speedups.without(off)
             )
@@ -404,11 +402,9 @@ def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
         labels = engine._visits.fewest()
         assert labels
         chart = engine._chart
-        control = engine._fitting._control(chart, paths_lp.settled_labels(enumerate(labels)))
+        control = engine._fitting._control(chart, settled_labels(enumerate(labels)))
         control.ground([("base", []), ("contrary", [])])
-        contrary, _ = next(
-            engine.asker.answers(paths_lp.read_contrary, "ignore", 1, control=control)
-        )
+        contrary, _ = next(engine.asker.answers(read_contrary, "ignore", 1, control=control))
         contradicted += len(contrary)
 
         def atoms(name: str, arity: int, control: Control = control) -> set[tuple[int, ...]]:
@@ -436,13 +432,13 @@ def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
             control.load(encodings.path("sides_framed"))
             given = [(node, visit, slot) for node, _, visit, slot in nodes]
             leaves = [(visit, *how) for visit, how in chart.leaves.items()]
-            control.add("visits", [], visits_lp.visit_facts(0, given, leaves, pairs))
+            control.add("visits", [], visit_facts(0, given, leaves, pairs))
             control.add(
                 "visits",
                 [],
-                sides_lp.turn_facts(0, chart, range(len(chart.stars)), chart.turns(trace)),
+                turn_facts(0, chart, range(len(chart.stars)), chart.turns(trace)),
             )
-            control.add("visits", [], sides_lp.sides_framed_facts(theory))
+            control.add("visits", [], sides_framed_facts(theory))
             control.add("visits", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
             street = ("path", number_symbols(*chart.facing[labels.index(dstate)], 0))
             control.ground(

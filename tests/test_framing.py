@@ -11,10 +11,11 @@ from instances import maze
 from strategies import theories, traces
 
 from ssh_abduction import Theory, check, solve
-from ssh_abduction.solver import Status, Watch, choosing
+from ssh_abduction.solver import Status, Watch
 from ssh_abduction.solver.asp.limits import StageTimeError
-from ssh_abduction.solver.engines.framed import maps_with_frames
-from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.solver.sources.exact import choosing
+from ssh_abduction.solver.sources.exact.framed import maps_with_frames
+from ssh_abduction.solver.sources.exact.prefixes import Prefixes
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import SPEEDUPS, row

@@ -17,7 +17,7 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Status, fallback
-from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
+from ssh_abduction.solver.asp.own_rules import can_be_asked, keeps_own_rules
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond, sketches_of
 from ssh_abduction.solver.steps.log import Log

@@ -8,11 +8,12 @@ from unittest.mock import patch
 import pytest
 
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.solver import Status, choosing
-from ssh_abduction.solver.asp.facts.paths_lp import Segments
-from ssh_abduction.solver.engines import frameless_paths as frameless
-from ssh_abduction.solver.engines.frameless_paths import PlacesAndPaths
-from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
+from ssh_abduction.solver import Status
+from ssh_abduction.solver.sources.exact import choosing
+from ssh_abduction.solver.sources.exact import frameless_paths as frameless
+from ssh_abduction.solver.sources.exact.frameless_paths import PlacesAndPaths
+from ssh_abduction.solver.sources.exact.homes import fewest_paths, homes_of
+from ssh_abduction.solver.sources.exact.path_facts import Segments
 from ssh_abduction.solver.steps.apart import pairwise_distinct
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 

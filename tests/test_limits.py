@@ -33,10 +33,10 @@ from ssh_abduction.solver import Search, Status, check_rules, find_backbone
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
-from ssh_abduction.solver.asp.rule_checks import EXAMPLE
+from ssh_abduction.solver.asp.own_rules import EXAMPLE
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.steps import certificate
-from ssh_abduction.solver.steps.noise import noise_in
+from ssh_abduction.solver.steps.certificate import noise_in
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.settle import settle
 

@@ -12,8 +12,8 @@ from ssh_abduction import Theory, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver import Search
-from ssh_abduction.solver.engines import visit_labels as same
-from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver.sources.exact import visits as same
+from ssh_abduction.solver.sources.exact.framed import FramedEngine
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.localising import Located, State, faced, located
 from ssh_abduction.solver.steps.log import Log

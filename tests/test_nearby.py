@@ -16,17 +16,10 @@ from test_speedups import PLAIN, machines
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.action import Action
-from ssh_abduction.solver import Search, Status, choosing
+from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.engines import base as engine
-from ssh_abduction.solver.engines import (
-    name_program,
-    name_search,
-    named_labels,
-    pinned,
-    small_maps,
-)
-from ssh_abduction.solver.engines.causal import CausalEngine
+from ssh_abduction.solver.sources.exact import choosing, engine, name_program, names
+from ssh_abduction.solver.sources.exact.causal import CausalEngine
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import Speedups
@@ -59,8 +52,8 @@ def test_search_near_a_guess_changes_no_answer(
     with (
         patch.object(choosing, "FEW_STEPS", 0),
         patch.object(engine, "FIRST_PREFIXES", len(trace)),
-        patch.multiple(name_search, PATIENCE=0, CORES=cores),
-        patch.object(small_maps, "machine_labels", lambda *_: iter([guess])),
+        patch.multiple(names, PATIENCE=0, CORES=cores),
+        patch.object(names, "machine_labels", lambda *_: iter([guess])),
     ):
         found = solve(trace, CAUSAL, max_maps=most or None)
     assert found.status is Status.OPTIMAL
@@ -75,7 +68,7 @@ def test_search_near_a_guess_changes_no_answer(
 
 
 def test_known_labels_end_a_search_only_if_they_reach_the_bound() -> None:
-    known = name_search.Incumbent()
+    known = names.Incumbent()
     known.raise_bound(2)
     assert not known.is_settled()
     known.labels = [0, 1, 2, 0]
@@ -89,8 +82,8 @@ def test_first_map_near_a_guess_equals_a_listed_map(seed: int) -> None:
     """There may be fewer names than dstates. An answer with a step at a rest is no map."""
     trace = moore(7, 2, steps=60, seed=seed).trace
     with (
-        patch.object(name_search, "PATIENCE", 1),
-        patch.object(small_maps, "GUESSES", 1),
+        patch.object(names, "PATIENCE", 1),
+        patch.object(names, "GUESSES", 1),
     ):
         some, every = (
             solve(
@@ -126,9 +119,9 @@ def test_limit_leaves_the_small_map_found_near_a_guess() -> None:
     truth = {state: number for number, state in enumerate(dict.fromkeys(walk.truth))}
     guess = [truth[state] for state in walk.truth]
     with (
-        patch.object(small_maps, "machine_labels", lambda *_: iter([guess])),
+        patch.object(names, "machine_labels", lambda *_: iter([guess])),
         patch.object(name_program.NameProgram, "more_links", stop),
-        patch.multiple(name_search, PATIENCE=1, CORES=1),
+        patch.multiple(names, PATIENCE=1, CORES=1),
     ):
         solution = limited.solution(tuple(limited))
     assert solution.stopped == "interrupted"
@@ -152,9 +145,9 @@ def test_clingo_gets_links_of_a_long_trace_in_parts() -> None:
 
     expected = solve(walk.trace, CAUSAL)
     with (
-        patch.object(named_labels, "AT_ONCE", 500),
-        patch.object(pinned, "AT_ONCE", 500),
-        patch.object(name_search, "PATIENCE", 10),
+        patch.object(names, "AT_ONCE", 500),
+        patch.object(name_program, "AT_ONCE", 500),
+        patch.object(names, "PATIENCE", 10),
         patch.object(name_program, "MORE_LINKS", 50),
         patch.object(name_program.NameProgram, "add", counted),
     ):
@@ -171,7 +164,7 @@ def test_next_prefix_grows_until_the_clique_grows() -> None:
     log = Log(trace, CAUSAL)
     long = CausalEngine(engine.Task.of(Problem.of(trace, CAUSAL), Watch(100.0)))
     long._named.size = 32
-    with patch.object(engine, "AT_ONCE", 50), patch.object(named_labels, "AT_ONCE", 50):
+    with patch.object(engine, "AT_ONCE", 50), patch.object(names, "AT_ONCE", 50):
         size = long.next_size(32)
         assert long.next_size(10) == size
         long._named.size = size

@@ -26,13 +26,14 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import TheoryError
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.online.hypotheses import ExtendedMap
-from ssh_abduction.solver import Search, Status, choosing, prefixes
-from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.causal import CausalEngine
-from ssh_abduction.solver.engines.framed import FramedEngine
-from ssh_abduction.solver.engines.frameless import FramelessEngine
-from ssh_abduction.solver.engines.stepwise import StepEngine
+from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.judging import InternalError
+from ssh_abduction.solver.sources.exact import choosing, prefixes
+from ssh_abduction.solver.sources.exact.causal import CausalEngine
+from ssh_abduction.solver.sources.exact.engine import Task
+from ssh_abduction.solver.sources.exact.framed import FramedEngine
+from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
+from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory import settle as problems
 from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs, evidence_of

@@ -20,12 +20,12 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.runtime.clock import heeding
-from ssh_abduction.solver.choosing import READABLE
 from ssh_abduction.solver.costs import weighing
 from ssh_abduction.solver.costs.facilities import Facilities
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.scatter import is_for, least_cost
 from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.sources.exact.choosing import READABLE
 from ssh_abduction.theory.pairs import NO_PAIRS
 from ssh_abduction.theory.settle import Problem, settle
 

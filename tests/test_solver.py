@@ -33,16 +33,16 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.solver import Progress, Search, Status, fallback, map_list, prefixes
+from ssh_abduction.solver import Progress, Search, Status, fallback, map_list
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.engines import base as engine_module
-from ssh_abduction.solver.engines import stepwise
-from ssh_abduction.solver.engines.base import Found, Task
-from ssh_abduction.solver.engines.causal import CausalEngine
-from ssh_abduction.solver.engines.framed import FramedEngine
-from ssh_abduction.solver.engines.stepwise import StepEngine
+from ssh_abduction.solver.sources.exact import engine_module, prefixes, readable
+from ssh_abduction.solver.sources.exact.causal import CausalEngine
+from ssh_abduction.solver.sources.exact.engine import Task
+from ssh_abduction.solver.sources.exact.framed import FramedEngine
+from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.solver.steps.faults import links_of
 from ssh_abduction.solver.steps.log import Log, Outcome
+from ssh_abduction.solver.values import Found
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import Problem, settle
 
@@ -118,7 +118,7 @@ def test_maps_by_prefixes_from_one_step_equal_whole_traces(case: tuple[Trace, Th
     trace, theory = case
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(prefixes, "FIRST_PREFIX", 1)
-        patch.setattr(stepwise, "GROWTH", 1.0)
+        patch.setattr(readable, "GROWTH", 1.0)
         patch.setattr(prefixes, "FIRST_PATHS", 1)
         by_prefix = solve(trace, theory, max_maps=None)
     at_once = solve(trace, theory, max_maps=None, speedups=Speedups(prefixes=False))

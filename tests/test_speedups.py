@@ -25,19 +25,14 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import SolverError
-from ssh_abduction.solver import Search, Status, choosing
-from ssh_abduction.solver.asp.facts import answer_maps
+from ssh_abduction.solver import Search, Status
+from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError
-from ssh_abduction.solver.engines import base as engine
-from ssh_abduction.solver.engines import (
-    name_program,
-    name_search,
-    pinned,
-)
-from ssh_abduction.solver.engines import named_labels as named
 from ssh_abduction.solver.guesses import robust
 from ssh_abduction.solver.guesses.merging import dstates_merged, merged
 from ssh_abduction.solver.guesses.robust import machine_labels
+from ssh_abduction.solver.sources.exact import choosing, engine, name_program, names
+from ssh_abduction.solver.sources.exact import names as named
 from ssh_abduction.solver.steps.apart import Continuations, clique
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
@@ -88,9 +83,9 @@ def test_any_speedups_give_the_maps_of_the_plain_encoding(
     with (
         patch.multiple(engine, FIRST_PREFIXES=first, AT_ONCE=at_once),
         patch.multiple(named, AT_ONCE=at_once, WHOLE=whole, HELD_BACK=held, SPARES=spares),
-        patch.multiple(name_search, PATIENCE=patience, CORES=cores),
+        patch.multiple(names, PATIENCE=patience, CORES=cores),
         patch.object(name_program, "MORE_LINKS", 2),
-        patch.object(pinned, "AT_ONCE", at_once),
+        patch.object(name_program, "AT_ONCE", at_once),
         patch.object(choosing, "FEW_STEPS", 0),
     ):
         found = solve(trace, Theory.causal(), max_maps=None, speedups=Speedups.without(off))
@@ -137,7 +132,7 @@ def hurried() -> Iterator[None]:
     """Steps that need a slow search are done at once."""
     with (
         patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0),
-        patch.multiple(name_search, PATIENCE=0, CORES=0),
+        patch.multiple(names, PATIENCE=0, CORES=0),
     ):
         yield
 
@@ -275,7 +270,7 @@ def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     assert fewest
     known = merged(chart, chart.continuations.clique())
     for labels in known, dstates_merged(chart, range(len(trace))), dstates_merged(chart, known):
-        found = answer_maps.causal_map(labels, trace)
+        found = facts.causal_map(labels, trace)
         assert check(trace, found, theory) == ()
         assert fewest.dstates <= len(found.dstates) <= len(trace)
         if labels is not known:
@@ -293,7 +288,7 @@ def test_interrupted_search_returns_a_map_of_merged_steps() -> None:
     """If clingo is slow and no map is guessed, the map is smaller than a greedy one."""
     walk = maze(5, 5, steps=1600, seed=0)
     with (
-        patch.multiple(name_search, PATIENCE=1, CORES=1),
+        patch.multiple(names, PATIENCE=1, CORES=1),
         patch.object(name_program.NameProgram, "more_links", side_effect=[[], KeyboardInterrupt]),
     ):
         speedups = Speedups.without("prefixes,guessed")
@@ -321,7 +316,7 @@ def test_interrupted_search_returns_the_small_map_of_a_guess(seed: int) -> None:
         return more_links(program)
 
     with (
-        patch.multiple(name_search, PATIENCE=1, CORES=1),
+        patch.multiple(names, PATIENCE=1, CORES=1),
         patch.object(name_program.NameProgram, "more_links", stop),
     ):
         solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,clique"))

@@ -17,15 +17,15 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import Search, Start, Status, choosing
-from ssh_abduction.solver.asp.facts.readable import most_paths
+from ssh_abduction.solver import Search, Start, Status
+from ssh_abduction.solver.asp.facts import most_paths
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.engines import frameless_paths as ways
-from ssh_abduction.solver.engines import name_search, named_labels
-from ssh_abduction.solver.engines.base import Task
-from ssh_abduction.solver.engines.frameless import FramelessEngine
-from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.sources.exact import choosing, names
+from ssh_abduction.solver.sources.exact import frameless_paths as ways
+from ssh_abduction.solver.sources.exact.engine import Task
+from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
+from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem, settle
@@ -66,14 +66,14 @@ def test_frameless_maps_equal_those_of_the_plain_encoding(data: st.DataObject) -
     theory = data.draw(bare_theories(), label="theory").replace(**said)
     contrary = data.draw(st.sampled_from([0, 1, ways.CONTRARY]), label="contrary")
     spares = data.draw(st.sampled_from([0, 2]), label="spare names")
-    patience = data.draw(st.sampled_from([0, name_search.PATIENCE]), label="patience")
-    cores = data.draw(st.sampled_from([0, name_search.CORES]), label="cores")
+    patience = data.draw(st.sampled_from([0, names.PATIENCE]), label="patience")
+    cores = data.draw(st.sampled_from([0, names.CORES]), label="cores")
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     if not expected.cost:
         return  # the engine is asked only where some map is known
     with (
-        patch.object(named_labels, "SPARES", spares),
-        patch.multiple(name_search, PATIENCE=patience, CORES=cores),
+        patch.object(names, "SPARES", spares),
+        patch.multiple(names, PATIENCE=patience, CORES=cores),
         patch.object(ways, "CONTRARY", contrary),
     ):
         known = data.draw(st.sampled_from([None, expected.maps[0].labels]), label="known")
@@ -148,7 +148,7 @@ def test_limit_during_listing_of_labels_stops_the_search() -> None:
     trace = maze(3, 3, steps=30, seed=0).trace
     theory = settle(trace).theory
     known = solve(trace, theory).maps[0].labels
-    with patch.object(named_labels, "SPARES", 0):
+    with patch.object(names, "SPARES", 0):
         engine = FramelessEngine(Task.of(Problem.of(trace, theory)), known)
         engine.grow(len(trace))
         maps = engine.improving_maps()
@@ -292,13 +292,13 @@ def test_known_map_with_refused_places_is_not_returned(
     named, plain = FramelessEngine(task, (0, 1, 2, 3, 4, 5, 0, 1, 2)), StepEngine(task, 9)
     named.grow(len(trace))
     assert [*named.improving_maps()][-1].cost[0] == 6
-    searched, calls = name_search.NameSearch._cheapest, [0]
+    searched, calls = names.NameSearch._cheapest, [0]
 
-    def late(self: name_search.NameSearch, conflicts: int) -> tuple[dict[int, int] | None, bool]:
+    def late(self: names.NameSearch, conflicts: int) -> tuple[dict[int, int] | None, bool]:
         calls[0] += 1
         return (None, False) if calls[0] == 1 else searched(self, conflicts)
 
-    monkeypatch.setattr(name_search.NameSearch, "_cheapest", late)
+    monkeypatch.setattr(names.NameSearch, "_cheapest", late)
     plain.grow(len(trace))
     for engine in (named, plain):
         engine.forbid([Equality(3, 8, "place")])

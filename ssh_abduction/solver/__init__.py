@@ -21,10 +21,9 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp.limits import check_limit as check_limit
     from ssh_abduction.solver.asp.limits import processor_clock as processor_clock
     from ssh_abduction.solver.asp.limits import resident_memory as resident_memory
-    from ssh_abduction.solver.asp.rule_checks import check_rules as check_rules
+    from ssh_abduction.solver.asp.own_rules import check_rules as check_rules
     from ssh_abduction.solver.asp.workers import end_all as end_all
     from ssh_abduction.solver.asp.workers import in_process as in_process
-    from ssh_abduction.solver.choosing import preload_engine as preload_engine
     from ssh_abduction.solver.costs.estimating import maps_apart as maps_apart
     from ssh_abduction.solver.costs.misfit import Misfit as Misfit
     from ssh_abduction.solver.derived_regions import find_regions as find_regions
@@ -65,6 +64,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.solution.writing import opening as opening
     from ssh_abduction.solver.solution.writing import summary_of as summary_of
     from ssh_abduction.solver.solution.writing import written_map as written_map
+    from ssh_abduction.solver.sources.exact.choosing import preload_engine as preload_engine
     from ssh_abduction.solver.start import Limits as Limits
     from ssh_abduction.solver.start import Start as Start
     from ssh_abduction.solver.steps.certificate import RESTS_ON as RESTS_ON

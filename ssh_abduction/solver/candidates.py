@@ -19,17 +19,18 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.loggers import log_of
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver.asp.facts import answer_maps
+from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, Watch, processor_clock
-from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond, sketches_of
 from ssh_abduction.solver.guesses.mended import first_contradiction, mended_sketch
 from ssh_abduction.solver.guesses.separate import has_no_frames, separate_map
 from ssh_abduction.solver.guesses.sketch import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
+from ssh_abduction.solver.sources.exact import choosing
+from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
+from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.speedups import Speedups, row
 from ssh_abduction.theory.theory import Theory
 
@@ -75,7 +76,7 @@ class Candidates:
     def merge(self) -> None:
         """Make a causal map by merging steps greedily, if the theory is causal. This is fast."""
         if self._task.speedups.greedy and self._task.theory.level == "causal":
-            self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
+            self.offer(facts.causal_map(self._task.log.merged(), self._task.trace))
 
     def beam(self, width: int) -> Beam | None:
         """Return the beam of this many hypotheses about dstates and places.
@@ -287,7 +288,7 @@ class Candidates:
 
     def frame(self, speedups: Speedups) -> None:
         """Offer maps in which places have frames, although the theory does not demand frames."""
-        from ssh_abduction.solver.engines.framed import maps_with_frames  # loads numpy
+        from ssh_abduction.solver.sources.exact.framed import maps_with_frames  # loads numpy
 
         watch = self._task.watch
         seconds = min(FRAMING, choosing.STEPWISE_SHARE * watch.left())
@@ -318,7 +319,7 @@ class Candidates:
         """Give each dstate of a map its view in the original trace, see `_with_all_views`."""
         if self._task.trace is self._given.trace:
             return ssh_map
-        views = answer_maps.views_of(dict(enumerate(ssh_map.dstate_at)), self._given.trace)
+        views = facts.views_of(dict(enumerate(ssh_map.dstate_at)), self._given.trace)
         dstates = tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
         return replace(ssh_map, dstates=dstates)
 

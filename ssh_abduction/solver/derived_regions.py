@@ -18,12 +18,14 @@ from collections.abc import Collection
 from dataclasses import replace
 from typing import TypeAlias
 
+from clingo import Control, Symbol
+
 from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_map
-from ssh_abduction.data.regions import Region, of_members
+from ssh_abduction.data.regions import Reason, Region, of_members
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.asp.control import new_control
-from ssh_abduction.solver.asp.facts.regions_lp import members_in, region_facts
+from ssh_abduction.solver.asp.facts import COURSE
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
@@ -102,3 +104,48 @@ class Deriving:
             self._left -= 0 if is_first else units
             self._known[key] = derived(ssh_map, self._trace, self._axioms)
         return replace(ssh_map, regions=self._known[key])
+
+
+_DIRECTION = {1: "pos", -1: "neg"}
+
+
+def region_facts(ssh_map: SSHMap, trace: Trace, axioms: Collection[str]) -> str:
+    """Return the facts for regions.lp about a map with places, with the axioms that hold."""
+    actions = {action.name: action for action in trace.actions}
+    facts = [f"axiom({name})." for name in sorted(axioms)]
+    for s in ssh_map.dstates:
+        if s.place is not None:
+            facts.append(f"at({s.id},{s.place}). floor({s.id},{s.floor or 0}).")
+        if s.path is not None and s.direction is not None:
+            facts.append(f"along({s.id},{s.path},{_DIRECTION[s.direction]}).")
+    for source, name, target in ssh_map.links:
+        action = actions.get(name)
+        if action is not None and action.kind == "travel":
+            facts.append(f"travelled({source},{target}).")
+        elif action is not None and action.kind in ("lift", "stairs"):
+            facts.append(f"lifted({source},{target}).")
+        elif action is not None and action.turn in ("right", "left"):
+            facts.append(f"turned({source},{action.turn},{target}).")
+    facts += [f"excused({h},{g})." for h, g in ssh_map.excused]
+    return "\n".join(facts)
+
+
+def members_in(control: Control) -> dict[Reason, set[int]]:
+    """Return a dict from the reason for a region to its places, from a control with regions.lp."""
+    members: dict[Reason, set[int]] = {}
+    reasons: dict[Symbol, Reason] = {}
+    for atom in control.symbolic_atoms.by_signature("member", 2):
+        assert atom.is_fact
+        term, place = atom.symbol.arguments
+        reason = reasons.setdefault(term, _reason(term, len(reasons)))
+        members.setdefault(reason, set()).add(place.number)
+    return members
+
+
+def _reason(term: Symbol, number: int) -> Reason:
+    """Return the reason for a region from its term. `number` tells terms apart."""
+    first, *rest = term.arguments
+    if term.name == "beside":
+        return term.name, first.number, COURSE[rest[0].name]
+    # Several regions may lie behind one place. The number tells them apart.
+    return (term.name, first.number, number) if rest else (term.name, first.number)

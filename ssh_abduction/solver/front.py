@@ -23,7 +23,8 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import each_heeding
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
-from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.solver.sources.exact.engine import Task
+from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -154,7 +155,7 @@ def fault_front(
 
 def _points(task: Task, most: int) -> Iterator[Point]:
     """Yield the points for 0 to `most` faults. The first point that is not proven ends them."""
-    from ssh_abduction.solver.engines.faulty import FaultyEngine  # loads numpy
+    from ssh_abduction.solver.sources.exact.faulty import FaultyEngine  # loads numpy
 
     before: SSHMap | None = None
     for faults in range(most + 1):

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import Stop
-from ssh_abduction.solver.engines.base import Found
-from ssh_abduction.solver.values import Bound, Cost, Status, cost_as_counted
+from ssh_abduction.solver.values import Bound, Cost, Found, Status, cost_as_counted
 from ssh_abduction.theory.theory import Theory
 
 

@@ -10,8 +10,8 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import StageTimeError
-from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.sources.exact.near import NearMinimal, counted_first
 from ssh_abduction.solver.values import Status
 
 # After the last map asked for, look for one more for this many seconds, or for this share of the

@@ -6,7 +6,7 @@ unknown action, and leave out a wrong displacement. So a map with faults is a ma
 a mended trace. All fast engines can solve a mended trace.
 
 Two methods guess which steps have faults. If places have frames, visits are merged robustly
-(`guesses/voting.py`). In any case, the causal theory with faults is solved (`engines/faulty.py`).
+(`guesses/voting.py`). In any case, the causal theory with faults is solved (`exact/faulty.py`).
 A map with places becomes a map of that theory when its places are dropped.
 
 *Displacements.* Labels that were found without displacements show which displacements may be wrong
@@ -29,13 +29,14 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solver.engines.base import Found, Task
-from ssh_abduction.solver.engines.faulty import FaultyEngine
 from ssh_abduction.solver.guesses.mended import mended_sketch
 from ssh_abduction.solver.guesses.outliers import wrong_displacements
 from ssh_abduction.solver.guesses.voting import Merging
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.sources.exact.engine import Task
+from ssh_abduction.solver.sources.exact.faulty import FaultyEngine
 from ssh_abduction.solver.steps.faults import with_faults
+from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 

@@ -7,17 +7,17 @@ import math
 from collections.abc import Callable
 
 from ssh_abduction.runtime.loggers import PROGRESS
-from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.asp.limits import Stop, Watch
-from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.candidates import Candidates
-from ssh_abduction.solver.choosing import may_name, new_engine
-from ssh_abduction.solver.engines.base import Engine, GrowingEngine, Task
-from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
-from ssh_abduction.solver.near import NearMinimal
-from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.solver.sources.exact import prefixes
+from ssh_abduction.solver.sources.exact.backbone import Rivals
+from ssh_abduction.solver.sources.exact.choosing import may_name, new_engine
+from ssh_abduction.solver.sources.exact.engine import Engine, GrowingEngine, Task
+from ssh_abduction.solver.sources.exact.near import NearMinimal
+from ssh_abduction.solver.sources.exact.prefixes import Prefixes
+from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.solver.start import Limits, Start
 from ssh_abduction.solver.values import Bound, Cost, Progress, Status
 from ssh_abduction.theory.settle import Problem

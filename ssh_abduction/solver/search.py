@@ -2,7 +2,8 @@
 
 A search makes a first map at once. Then it finds the minimal cost in stages (`stages.py`), and
 lists the maps of that cost (`map_list.py`). If it is stopped earlier, it makes some map of the
-whole trace (`fallback.py`). `prefixes.py` proves that it is enough to solve the first steps.
+whole trace (`fallback.py`). `exact/prefixes.py` proves that it is enough to solve the first
+steps.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import EARLY, LimitError, StageTimeError, Stop, Watch
-from ssh_abduction.solver.asp.rule_checks import check_rules
+from ssh_abduction.solver.asp.own_rules import check_rules
 from ssh_abduction.solver.fallback import (
     CLASHING,
     OVERTIME,

@@ -6,13 +6,13 @@ from contextlib import suppress
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.loggers import log_of
-from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
-from ssh_abduction.solver.choosing import may_name, takes_all
-from ssh_abduction.solver.engines.base import Found, LabellingEngine
-from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.parts import Parts
-from ssh_abduction.solver.values import Status
+from ssh_abduction.solver.sources.exact import choosing, prefixes
+from ssh_abduction.solver.sources.exact.choosing import may_name, takes_all
+from ssh_abduction.solver.sources.exact.engine import LabellingEngine
+from ssh_abduction.solver.sources.exact.readable import StepEngine
+from ssh_abduction.solver.values import Found, Status
 from ssh_abduction.theory.speedups import row
 
 TYPE_CHECKING = False
@@ -141,7 +141,7 @@ class Stages:
         labels = best.dstate_at if best else ()
         parts.candidates.sketch()
         if parts.known.best is not None:
-            from ssh_abduction.solver.engines.frameless import FramelessEngine
+            from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
 
             _log.info(
                 "finding dstates before places and paths, from a map of %d dstates",

@@ -79,6 +79,19 @@ class Cost:
         return {**counts, "faults": self.faults} if self.faults else counts
 
 
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A map of a prefix, with the counts that the theory minimises, the most important first."""
+
+    map: SSHMap
+    cost: tuple[int, ...]
+
+    @staticmethod
+    def of(ssh_map: SSHMap, theory: Theory) -> Found:
+        """Return a map with its cost: the counts that the theory minimises."""
+        return Found(ssh_map, Cost.of(ssh_map).preferred_by(theory))
+
+
 def nats_of(cost: Cost, theory: Theory) -> float:
     """Return the price of dstates, places, paths and faults in nats, without the misfit."""
     dstate, place, path = theory.prices

@@ -42,7 +42,6 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.costs import repeats
 from ssh_abduction.solver.costs.beams import Beams
 from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of, misfit_of
@@ -60,16 +59,17 @@ from ssh_abduction.solver.costs.forced import Forcing
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.scatter import is_for, least_cost
 from ssh_abduction.solver.costs.wrong_displacements import search_jumps
-from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.parts import Parts
-from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.solution.weighed import CHANCE, EQUAL, IMPROBABLE, Rival, Weighed
+from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine
+from ssh_abduction.solver.sources.exact.engine import Task
+from ssh_abduction.solver.sources.exact.prefixes import Prefixes
 from ssh_abduction.solver.steps.faults import with_more_faults
-from ssh_abduction.solver.values import Cost, Status
+from ssh_abduction.solver.values import Cost, Found, Status
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import Problem, displacement_of

@@ -35,7 +35,6 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.limits import EARLY, LimitError, Watch
-from ssh_abduction.solver.choosing import READABLE
 from ssh_abduction.solver.drives.digest import Digest
 from ssh_abduction.solver.drives.laying import can_lay, laid, unproven
 from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond
@@ -45,6 +44,7 @@ from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.weighed import Weighed
+from ssh_abduction.solver.sources.exact.choosing import READABLE
 from ssh_abduction.solver.values import Cost, Level, Status
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups

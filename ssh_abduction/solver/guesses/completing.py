@@ -31,7 +31,7 @@ from ssh_abduction.data.gateways import Facing
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp.facts.answer_maps import views_of
+from ssh_abduction.solver.asp.facts import views_of
 from ssh_abduction.solver.steps.faults import with_changes
 from ssh_abduction.theory.theory import Theory
 

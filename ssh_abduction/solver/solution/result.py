@@ -45,8 +45,7 @@ from ssh_abduction.solver.solution.writing import (
     written_map,
     written_trace,
 )
-from ssh_abduction.solver.steps.certificate import Certificate
-from ssh_abduction.solver.steps.noise import LEAST, Noise
+from ssh_abduction.solver.steps.certificate import LEAST, Certificate, Noise
 from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status, cost_as_counted
 from ssh_abduction.theory.joins import Join, joins_by_minimality, joins_in_words
 from ssh_abduction.theory.theory import Theory

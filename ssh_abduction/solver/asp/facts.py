@@ -1,0 +1,548 @@
+"""Turn a trace into facts for clingo, and an answer set of clingo into a map.
+
+This module knows the predicates of the readable encodings (`encodings/*.lp`). An engine with an
+encoding of its own (`encodings/fast/*.lp`) writes the facts for it.
+
+The fast encodings have a step as an argument of a fact. So one call grounds the rules for many
+steps. The readable encodings have a program part for each step. Grounding them takes about thirty
+times as long, but mostly they are grounded only for short prefixes of a trace.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache, lru_cache
+from itertools import product
+
+from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
+
+from ssh_abduction.data.drives import starts_of
+from ssh_abduction.data.floors import stretches_of
+from ssh_abduction.data.groups import numbered
+from ssh_abduction.data.maps import FAULTS, DState, MapPath, SSHMap
+from ssh_abduction.data.trace import Action, Trace, View
+from ssh_abduction.solver.steps import frames
+from ssh_abduction.solver.steps.faults import faults_of, links_of, with_changes
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.fields import EXCUSED, Count
+from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.speedups import TRAVELS_AND_TURNS
+from ssh_abduction.theory.theory import Theory
+
+
+def encoding_names(theory: Theory) -> tuple[str, ...]:
+    """Return the names of the encodings that a theory needs, in the order to load them."""
+    return (*encodings.needed_by(vars(theory)), "preference", "show")
+
+
+def theory_facts(theory: Theory, paths: int) -> str:
+    """Return the facts for a theory: axioms, preference, and this many names for paths."""
+    facts = [f"axiom({name})." for name in theory.axioms]
+    facts += [f"path(1..{paths})."] if theory.level == "topological" else []
+    facts += preferred(theory)
+    facts += ["defeasible."] if theory.boundary == "defeasible" else []
+    facts += [f"allowed({kind})." for kind in EXCUSED if getattr(theory, kind)]
+    return "\n".join(facts)
+
+
+def preferred(theory: Theory) -> list[str]:
+    """Return the clingo facts that say which counts to minimise.
+
+    The first count of `prefer` gets the highest priority.
+    """
+    return [
+        f"prefer({count},{len(theory.priorities) - i})."
+        for i, count in enumerate(theory.priorities)
+    ]
+
+
+def own_rules(theory: Theory) -> str:
+    """Return the text of all rules that the user added to the theory, in clingo's language."""
+    return "\n".join(rules.text for rules in theory.rules)
+
+
+def run_by_steps() -> Symbol:
+    """Return the external atom that allows answers. Set it when the parts of steps are ground."""
+    return Function("run_by_steps")
+
+
+def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
+    """Return the greatest number of paths that a map of the first steps can have.
+
+    A path can begin only at the first step of a drive, and where a turn right or left, a lift, or
+    an action that slipped ends. If the theory lacks some axioms, there may be a path for each step.
+    """
+    if TRAVELS_AND_TURNS & theory.given_up:
+        return steps
+    return 1 + sum(
+        action.turn in ("right", "left") or action.leaves_paths
+        for action in trace.actions[: steps - 1]
+    )
+
+
+def trace_facts(problem: Problem, start: int, stop: int, evidence: bool = True) -> str:
+    """Return the facts for steps `start` to `stop - 1`, and for the actions that lead to them.
+
+    Facts about pairs of steps are many. Without `evidence`, they are left out.
+    """
+    trace, theory = problem.trace, problem.theory
+    facts = []
+    for t in range(start, stop):
+        step = trace.steps[t]
+        facts.append(f"unknown({t})." if step.view is None else f"view({t},{constant(step.view)}).")
+        if theory.star in ("pattern", "frame"):
+            facts += [
+                f"open({t},{slot})." for slot, is_open in enumerate(step.openings or ()) if is_open
+            ]
+    led = {t: trace.actions[t] for t in range(max(start - 1, 0), stop - 1)}
+    facts += [f"starts({t + 1})." for t, action in led.items() if action.starts]
+    done = {t: action for t, action in led.items() if not action.starts}
+    facts += [f"act({t},{constant(action.name)})." for t, action in done.items()]
+    facts += [f"unlinked({t})." for t, action in done.items() if action.slipped]
+    facts += _fault_facts(problem, start, stop, done)
+    if theory.lifts or theory.several_drives:
+        stretches = stretches_of(trace)
+        facts += [f"stretch({t},{stretches[t]})." for t in range(start, stop)]
+        facts += [f"lifted({t + 1})." for t, action in done.items() if action.changes_floor]
+    if theory.level == "topological":
+        facts += [
+            _kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None
+        ]
+    if theory.star == "gateways":
+        facts += _gateway_facts(trace, start, stop, changes=bool(theory.changed))
+    if evidence:
+        facts += _evidence_facts(problem, start, stop)
+    return "\n".join(facts)
+
+
+def _fault_facts(problem: Problem, start: int, stop: int, done: Iterable[int]) -> Iterator[str]:
+    """Yield the prices of the faults that the theory allows. `done` has the steps with actions."""
+    trace, theory = problem.trace, problem.theory
+    at: dict[str, Iterable[int]] = {
+        "misread": range(start, stop),
+        "jumped": [
+            t for t in range(max(start, 1), stop) if trace.steps[t].displacement is not None
+        ],
+        "changed": range(start, stop),
+        "slipped": done,
+    }
+    for kind, steps in at.items():
+        for t in steps if getattr(theory, kind) else ():
+            yield f"price({kind},{t},{theory.fault_tenths(kind, trace.steps[t])})."
+    if theory.jumped:
+        yield from (f"moved({t})." for t in at["jumped"])
+    if theory.changed:
+        starts = starts_of(trace)
+        yield from (f"drive({t},{bisect_right(starts, t)})." for t in range(start, stop))
+
+
+def _gateway_facts(trace: Trace, start: int, stop: int, *, changes: bool) -> Iterator[str]:
+    """Yield facts for gateways.lp: the stars of steps, and how they fit those of earlier steps."""
+    found = frames.Frames(trace, stop, changes=changes)
+    known = len(frames.Frames(trace, start, changes=changes).frames)
+    yield from (f"star({t},{found.stars[t]})." for t in range(start, stop))
+    yield from (
+        f"looks({star},{x})."
+        for star in dict.fromkeys(found.stars[start:])
+        for x in found.looks[star]
+    )
+    for x, frame in enumerate(found.frames[known:], known):
+        yield f"slots({x},{max(frame.slots, 1)})."
+        yield from (f"closed({x},{k})." for k in range(frame.slots) if frame.is_closed(k))
+        yield from (f"ends({x},{way})." for way in frames.ends(frame))
+    # Pairs of two known frames were given with earlier steps.
+    for x, y in product(range(len(found.frames)), repeat=2):
+        for shift in found.fits(x, y) if max(x, y) >= known else ():
+            yield f"fits({x},{y},{shift})."
+            yield from (
+                f"may({x},{y},{shift},{way})."
+                for way in frames.may_face(found.frames[x], found.frames[y], shift)
+            )
+            yield from (
+                f"must({x},{y},{shift},{way})."
+                for way in frames.must_face(found.frames[x], found.frames[y], shift)
+            )
+    turns = {
+        (trace.actions[t - 1], found.stars[t - 1], found.stars[t]): None
+        for t in range(max(start, 1), stop)
+    }
+    for action, a, b in turns:
+        for x, y in product(found.looks[a], found.looks[b]) if action.turn else ():
+            fitting = (
+                c
+                for c in found.fits(x, y)
+                if frames.may_turn(action, found.frames[x], found.frames[y], c)
+            )
+            yield from (f"rotates({constant(action.name)},{x},{y},{shift})." for shift in fitting)
+
+
+def _evidence_facts(problem: Problem, start: int, stop: int) -> Iterator[str]:
+    """Yield facts for the evidence about steps, and about their pairs with earlier steps."""
+    trace, theory = problem.trace, problem.theory
+    for evidence in problem.evidence:
+        pairs = evidence.pairs(trace)
+        for t in range(start, stop) if pairs else ():
+            yield from (f"excluded({evidence.axiom},{i},{t})." for i in pairs.apart.get(t, ()))
+            if theory.level == "topological":
+                yield from (
+                    f"elsewhere({evidence.axiom},{i},{t})." for i in pairs.elsewhere.get(t, ())
+                )
+            yield from (f"one({i},{t})." for i in pairs.one.get(t, ()))
+        yield evidence.facts(trace, start, stop)
+
+
+def program(problem: Problem) -> str:
+    """Return a file that `encodings/run.py` solves: the facts of a trace and its theory."""
+    trace, theory = problem.trace, problem.theory
+    files = " ".join(f"{name}.lp" for name in encoding_names(theory))
+    return "\n".join(
+        [
+            f"% {len(trace)} steps{f' of {trace.name!r}' if trace.name else ''}. "
+            f"In {encodings.folder()}, run",
+            f"%   python run.py --project=project --opt-mode=optN -n 0 THIS_FILE {files}",
+            theory_facts(theory, most_paths(trace, theory, len(trace))),
+            trace_facts(problem, 0, len(trace)),
+            own_rules(theory),
+            "",
+        ]
+    )
+
+
+def query(t: int) -> Symbol:
+    """Return the external atom that says that step t is the last step."""
+    return Function("query", number_symbols(t))
+
+
+def _kind_fact(action: Action) -> str:
+    """Return the fact that says that an action is a lift, a travel or a turn."""
+    name = constant(action.name)
+    if action.changes_floor:
+        return f"kind({name},lift)."
+    return f"kind({name},travel)." if action.kind == "travel" else f"turns({name},{action.turn})."
+
+
+CAUSAL = Theory.causal()
+
+
+def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
+    """Make a map from an answer set of the readable encodings, perhaps of the first steps only."""
+    is_at: dict[int, int] = {}
+    place: dict[int, int] = {}
+    course: dict[int, tuple[int, int]] = {}
+    heading: dict[int, int] = {}
+    shape: dict[int, int] = {}
+    before: list[tuple[int, int, int]] = []
+    excused: list[tuple[int, int]] = []
+    faults: list[tuple[int, str]] = []
+    for name, args in map(read_atom, model.symbols(shown=True)):
+        if name == "is":
+            is_at[args[0]] = args[1]
+        elif name == "at":
+            place[args[0]] = args[1]
+        elif name == "along":
+            course[args[0]] = (args[1], args[2])
+        elif name == "before":
+            before.append((args[0], args[1], args[2]))
+        elif name == "heading":
+            heading[args[0]] = args[1]
+        elif name == "shape":
+            shape[args[0]] = args[1]
+        elif name == "excused":
+            excused.append((args[0], args[1]))
+        elif name in FAULTS:
+            faults.append((args[0], name))
+    if theory.star == "gateways":
+        found = frames.Frames(trace, len(is_at), changes=bool(theory.changed)).frames
+        heading = {
+            t: frames.heading(found[shape[p]], found[shape[t]], heading[t])
+            for t, p in place.items()
+        }
+    read = _map(trace, is_at, place, course, heading, before, excused, faults, theory)
+    return with_changes(read, trace, theory) or read
+
+
+def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
+    """Read the dstate and the place (or None) of each step from an answer that may break axioms."""
+    found: dict[str, dict[int, int]] = {"is": {}, "at": {}}
+    for name, args in map(read_atom, model.symbols(shown=True)):
+        if name in found:
+            found[name][args[0]] = args[1]
+    steps = range(len(found["is"]))
+    return tuple(found["is"][t] for t in steps), tuple(found["at"].get(t) for t in steps)
+
+
+def _map(
+    trace: Trace,
+    is_at: Mapping[int, int],
+    place: Mapping[int, int],
+    course: Mapping[int, tuple[int, int]],
+    heading: Mapping[int, int],
+    before: Iterable[tuple[int, int, int]],
+    excused: Iterable[tuple[int, int]],
+    faults: Sequence[tuple[int, str]],
+    theory: Theory,
+) -> SSHMap:
+    """Make a map from the atoms of an answer, which name a dstate or place by its first step.
+
+    `course` has the path and the direction of each step that is along a path. `heading` has the
+    heading of each step, if places have frames or gateways. `before` has triples of a path and two
+    places on it, the earlier one first. The theory has the costs of faults.
+    """
+    # Atoms name things by steps. A map numbers them from 0, in the order of these names.
+    views = views_of(is_at, trace, faults)
+    names = sorted(set(is_at.values()))
+    dstate_of = {name: i for i, name in enumerate(names)}
+    place_of = {name: i for i, name in enumerate(sorted({place[s] for s in names if s in place}))}
+    path_of = {
+        name: i for i, name in enumerate(sorted({course[s][0] for s in names if s in course}))
+    }
+    dstates = tuple(
+        DState(
+            id=dstate_of[s],
+            view=views[s],
+            place=place_of[place[s]] if s in place else None,
+            path=path_of[course[s][0]] if s in course else None,
+            direction=course[s][1] if s in course else None,
+            heading=heading.get(s),
+        )
+        for s in names
+    )
+    labels = tuple(dstate_of[is_at[t]] for t in range(len(is_at)))
+    pairs = [
+        (path_of[h], place_of[p], place_of[q])
+        for h, p, q in before
+        if h in path_of and p in place_of and q in place_of
+    ]
+    return SSHMap(
+        dstate_at=labels,
+        dstates=dstates,
+        links=links_of(labels, trace, faults),
+        places=tuple(place_of.values()),
+        paths=_paths(len(path_of), dstates, pairs),
+        excused=tuple(
+            sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)
+        ),
+        faults=faults_of(faults, is_at, views, trace, theory),
+    )
+
+
+def views_of(
+    labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
+) -> dict[int, View | None]:
+    """Return the view of each dstate: the first view there that is known and not treated as wrong.
+
+    `faults` are steps and kinds. The view is None if a dstate has no such view.
+    """
+    misread = {t for t, kind in faults if kind == "misread"}
+    views: dict[int, View | None] = dict.fromkeys(labels.values())
+    for t in sorted(labels):
+        if t not in misread and views[labels[t]] is None:
+            views[labels[t]] = trace.steps[t].view
+    return views
+
+
+def causal_map(
+    labels: Sequence[int],
+    trace: Trace,
+    faults: Sequence[tuple[int, str]] = (),
+    theory: Theory = CAUSAL,
+) -> SSHMap:
+    """Make a causal map (no places) from the dstates of steps, perhaps with faults.
+
+    The dstates are numbered by first visit. A fault is a step and a kind. The theory has its cost.
+    """
+    found = tuple(numbered(labels))
+    is_at = dict(enumerate(found))
+    views = views_of(is_at, trace, faults)
+    return SSHMap(
+        found,
+        tuple(DState(i, view) for i, view in views.items()),
+        links_of(found, trace, faults),
+        faults=faults_of(faults, is_at, views, trace, theory),
+    )
+
+
+def _paths(
+    count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]
+) -> tuple[MapPath, ...]:
+    """Make paths from triples of a path and two of its places, the earlier place first."""
+    on: list[set[int]] = [set() for _ in range(count)]
+    for s in dstates:
+        if s.path is not None and s.place is not None:
+            on[s.path].add(s.place)
+    pairs: list[list[tuple[int, int]]] = [[] for _ in range(count)]
+    for path, p, q in before:
+        if p in on[path] and q in on[path]:
+            pairs[path].append((p, q))
+    return tuple(
+        MapPath(path, tuple(places_in_order(found, pairs[path]))) for path, found in enumerate(on)
+    )
+
+
+def places_in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:
+    """Sort places by a strict order: `before` has all pairs of places, the earlier one first."""
+    behind = dict.fromkeys(places, 0)
+    for _, q in before:
+        behind[q] += 1
+    return sorted(behind, key=lambda p: (behind[p], p))
+
+
+def are_one(first: int, second: int) -> Symbol:
+    """Return the atom that says that two steps are one dstate. The first is the earlier step."""
+    return Function("same", number_symbols(first, second))
+
+
+def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = None) -> str:
+    """Return the rule that some equality of these does not hold. It may depend on atom `where`."""
+    atoms = [str(where)] if where else []
+    for e in equalities:
+        if e.of == "displacement":
+            atoms.append(f"not jumped({e.second})")
+            continue
+        sign, of = "" if e.holds else "not ", "same" if e.of == "dstate" else "same_place"
+        atoms.append(f"{sign}{of}({min(e.first, e.second)},{max(e.first, e.second)})")
+    return f":- {', '.join(atoms)}."
+
+
+def rests_on(axiom: str, t: int, other: str) -> str:
+    """Return the rule: if an axiom is active at step t, another axiom holds at every step."""
+    return f":- {active(axiom, t)}, violation({other},T)."
+
+
+def one_in_doubt(number: int, condition: str | None) -> str:
+    """Return the rule that two things are one if a condition holds; never if it is None."""
+    one = f"one_in_doubt({number})"
+    return f"{one} :- {condition}." if condition else f"#external {one}."
+
+
+def some_doubt(question: int, doubts: Iterable[tuple[int, bool]]) -> str:
+    """Return the rule that some doubt holds while `asked(question)` is true.
+
+    A doubt is the claim that two things, given by their numbers, are one (True) or are not.
+    """
+    none = ", ".join(f"{'not ' if one else ''}one_in_doubt({n})" for n, one in doubts)
+    return f"#external {asked(question)}.\n:- {asked(question)}, {none}."
+
+
+def asked(question: int) -> Symbol:
+    """Return the external atom that is true while this question about doubts is asked."""
+    return Function("asked", number_symbols(question))
+
+
+def steps_are_one(sort: str, i: int, j: int) -> str:
+    """Return the body of a rule that holds if two steps share a dstate, place, path or course.
+
+    `sort` is "dstates", "places", "paths" or "courses", and step `i` the earlier one. For "paths"
+    both may be one step: then the body holds if the step is along a path.
+    """
+    return {
+        "dstates": f"same({i},{j})",
+        "places": f"same_place({i},{j})",
+        "paths": f"along({i},H,_), along({j},H,_)",
+        "courses": f"same_course({i},{j})",
+    }[sort]
+
+
+def exactly(number: int, count: Count) -> str:
+    """Return the rule that a map has this many dstates, places or paths, if `of_number` is true."""
+    counted = {
+        "dstates": "T : is(T,T)",
+        "places": "T : at(T,T)",
+        "paths": "(T,H) : first_along(T,H)",
+    }[count]
+    atom = of_number(number, count)
+    return f"#external {atom}.\n:- {atom}, #count {{ {counted} }} != {number}."
+
+
+def of_number(number: int, count: Count) -> Symbol:
+    """Return the external atom that switches the rule of `exactly` on."""
+    return Function("of_number", [Function(count), *number_symbols(number)])
+
+
+def active(axiom: str, t: int) -> Symbol:
+    """Return the atom that says that an axiom must hold at step t (explain.lp)."""
+    return Function("active", [Function(axiom), *number_symbols(t)])
+
+
+def told_of(steps: Iterable[int]) -> str:
+    """Return the facts that name the steps that conclusions may be about."""
+    return " ".join(f"told_of({t})." for t in sorted(set(steps)))
+
+
+def conclusion(name: str, *steps: int) -> Symbol:
+    """Return the atom of a conclusion, such as `one_dstate`, about some steps."""
+    return Function("so", [Function(name, number_symbols(*steps))])
+
+
+def read_conclusion(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
+    """Return the name and the steps of a conclusion, from its atom."""
+    said = symbol.arguments[0]
+    return said.name, tuple(argument.number for argument in said.arguments)
+
+
+def conclusions_of(control: Control) -> list[Symbol]:
+    """Return the atoms of all conclusions that are possible in a ground control."""
+    return [atom.symbol for atom in control.symbolic_atoms.by_signature("so", 1)]
+
+
+def read_argument(model: Model) -> tuple[frozenset[Symbol], frozenset[Symbol], frozenset[Symbol]]:
+    """Read three sets of atoms from an answer in which axioms may be broken.
+
+    The sets are the conclusions that hold; `active(N,T)` for each axiom N that is broken at step T;
+    and `same(I,T)` for each pair of steps at one dstate.
+    """
+    conclusions, broken, one = set[Symbol](), set[Symbol](), set[Symbol]()
+    for symbol in model.symbols(atoms=True):
+        if symbol.name == "so":
+            conclusions.add(symbol)
+        elif symbol.name == "violation":
+            broken.add(Function("active", symbol.arguments))
+        elif symbol.name == "same":
+            one.add(symbol)
+    return frozenset(conclusions), frozenset(broken), frozenset(one)
+
+
+def picked(symbol: Symbol) -> Symbol:
+    """Return the external atom that picks a conclusion for `some_fail`."""
+    return Function("picked", [symbol])
+
+
+def some_fail() -> Symbol:
+    """Return the atom that holds if at least one of the picked conclusions does not hold."""
+    return Function("some_fail")
+
+
+def may_fail(conclusions: Iterable[Symbol]) -> str:
+    """Return the rules that define `some_fail` and `picked` for some conclusions."""
+    return "\n".join(
+        f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}. "
+        f"#heuristic {c} : {picked(c)}. [1,false]"
+        for c in conclusions
+    )
+
+
+COURSE = {"pos": 1, "neg": -1}
+
+
+def constant(value: str | int) -> str:
+    """Return a number or a text as a constant of clingo."""
+    return str(Number(value) if isinstance(value, int) else String(value))
+
+
+@lru_cache(maxsize=2**14)
+def read_atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
+    """Return the name of an atom and its arguments as numbers; pos is 1 and neg is -1."""
+    return symbol.name, tuple(
+        arg.number if arg.type is SymbolType.Number else COURSE[arg.name]
+        for arg in symbol.arguments
+    )
+
+
+_number = cache(Number)  # takes half the time of making a new number
+
+
+def number_symbols(*arguments: int) -> list[Symbol]:
+    """Return numbers as clingo's symbols, for the arguments of a program part or of an atom."""
+    return [_number(argument) for argument in arguments]

@@ -1,1 +1,0 @@
-"""Engines, which ask clingo for maps of a growing prefix of a trace."""

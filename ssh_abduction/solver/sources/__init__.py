@@ -1,0 +1,1 @@
+"""Sources of maps and of lower bounds on their cost."""

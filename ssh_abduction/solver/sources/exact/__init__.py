@@ -1,0 +1,1 @@
+"""Find minimal maps with clingo, and prove that they are minimal."""

@@ -1,0 +1,318 @@
+"""Solve a prefix of the trace, replay its maps to the end, and extend the prefix if a replay fails.
+
+Grounding the axioms for n steps takes more than n² time. But once the robot has seen everything,
+the rest of the trace only repeats links that the map has. So a search solves a *prefix*, the first
+steps of the trace. Then it replays each map that it finds: it follows the links of the map along
+the rest of the trace (`steps/log.py`). If a replay stops early, the prefix is extended in the same
+clingo control. The result is exact.
+
+*Claim.* Let c be the cost of the minimal maps of a prefix, and let all of these maps replay to the
+end of the trace. Then the replayed maps are exactly the minimal maps of the trace, and c is their
+cost.
+
+*Proof.* (1) A map of the trace that is cut down to the prefix is a map of the prefix. Every axiom
+forbids a pattern of links, observations and names, and a cut only removes patterns. Some axioms
+demand a course, an order, a side or a heading: the cut map has the same as the whole map. If only a
+later travel supports a course, the cut drops both. A cut adds no dstate, place, path or excuse, so
+no count grows. So the minimum of the prefix is a lower bound on the minimum of the trace.
+(2) A map that replays to the end has the same links and observations over the whole trace as over
+the prefix. The axioms read nothing else, so the replayed map satisfies them, and it costs c. By
+(1), c is the minimum.
+(3) Let F be a minimal map of the trace. By (2) it costs c. The cut of F costs at most c in every
+count, and by (1) no less than c in the order of preference. So the cut is one of the minimal maps
+of the prefix; call it R. Actions are deterministic, and the replay of R meets only links of R. So F
+has the same labels and links as the replayed R, and the same travels support its courses: F is the
+replayed R. Two different minimal maps of the prefix differ in the prefix, so they replay to
+different maps. ∎
+
+*Names for paths.* The size of the grounding grows with the square of the number of names for paths.
+Most traces have far more segments than their maps have paths, so a control begins with a few names.
+Its minimum is right if no map with more paths can be as good. If the theory minimises paths first,
+this holds as soon as there is a map. If it minimises dstates first, this holds if there are at
+least half as many names as the minimal map has dstates: each path has the two ends of a travel, and
+no dstate is along two paths. (Without the axiom course_needs_travel, a path may have a single
+dstate. Then there must be as many names as dstates.) Otherwise the search makes a new control with
+more names. One name for each segment of the prefix is enough for any map.
+
+A map whose replay stops early is no answer. A longer prefix shows how it continues. The claim needs
+determinism; one place, course and heading for each dstate; and axioms that a cut map still
+satisfies. `theory/speedups.py` lists the theories for which this is known. For any other theory,
+the prefix is the whole trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import replace
+
+from ssh_abduction.data.gateways import with_allowed_headings
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.loggers import log_of
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
+from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.known import Known
+from ssh_abduction.solver.sources.exact.engine import Engine, Task
+from ssh_abduction.solver.sources.exact.readable import StepEngine, paths_needed
+from ssh_abduction.solver.steps.log import Outcome, Replay
+from ssh_abduction.solver.values import Found, Status
+from ssh_abduction.theory.evidence import Equality
+
+_log = log_of(__name__)
+
+FIRST_PREFIX = 8  # steps of the first prefix; clingo solves it at once
+# Hold back at most this many maps until it is known that the prefix is long enough. If there are
+# more, yield them, and the others as they are found, so that memory stays constant.
+HELD_BACK = 1000
+# If all maps are wanted and evidence may reject some of them: until this many maps are remembered,
+# forbid each rejected set of equalities and list the maps again. After that, only skip rejected
+# maps.
+REMEMBERED = 10_000
+# The number of names for paths to begin with. Few traces need more.
+FIRST_PATHS = 8
+
+
+class Prefixes:
+    """Finds the minimal cost and lists the minimal maps by growing prefixes.
+
+    Attributes:
+        engine: The engine, which has the axioms for the prefix.
+        start: The number of steps of the first prefix.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        known: Known,
+        judging: Judging,
+        engine: Engine,
+        most: int,
+        report: Callable[[], None],
+    ) -> None:
+        """Prepare the search for `most` maps (0: all). `find_minimum` begins it."""
+        self.engine = engine
+        self._task, self._known, self._judging, self._most = task, known, judging, most
+        self._report = report
+        self._at_once = not task.speedups.prefixes
+        self._in_tolerance = task.theory.star == "gateways"
+        self.start = len(task.trace) if self._at_once else FIRST_PREFIX
+
+    def find_minimum(self) -> None:
+        """Extend the prefix until it has no map, or a minimal map that predicts all later steps."""
+        size, steps = min(len(self._task.trace), self.start), len(self._task.trace)
+        while True:
+            _log.debug("%s is given %d of %d steps", type(self.engine).__name__, size, steps)
+            self.engine.grow(size)
+            minimal = self.minimise()
+            if minimal is None:
+                self._known.status = Status.UNSATISFIABLE
+                return
+            self._known.raise_lower(minimal.cost)
+            replayed = self._replay(minimal.map)
+            _log.debug(
+                "its minimal cost is %s; its map explains %d steps",
+                minimal.cost,
+                len(replayed.labels),
+            )
+            if self._predicts_all(minimal, replayed):
+                self._known.keep(
+                    replace(minimal, map=self._whole(minimal.map, replayed)), replayed.labels
+                )
+            # If the best map of the whole trace is as cheap as this minimal map, it is minimal.
+            if self._known.best is not None and self._known.cost <= minimal.cost:
+                self._known.status = Status.OPTIMAL
+                return
+            size = self.engine.next_size(len(replayed.labels))
+
+    def minimise(self) -> Found | None:
+        """Find a minimal map of the prefix (first steps) that no evidence rejects, or None."""
+        while (found := self._minimise_known()) is not None:
+            if (refusal := self._judging.refusal(found.map)) is None:
+                return found
+            name, equalities = refusal
+            _log.debug("%s refuses a map, for %d equalities", name, len(equalities))
+            self._known.refused[name] = self._known.refused.get(name, 0) + 1
+            self._forbid(equalities)
+        return None
+
+    def _forbid(self, equalities: frozenset[Equality]) -> None:
+        """Forbid all maps with all these equalities, with a `StepEngine` if this engine cannot."""
+        if self._forbid_in_engine(equalities):
+            return
+        _log.debug(
+            "%s cannot forbid these maps, so the readable encodings go on",
+            type(self.engine).__name__,
+        )
+        size, theory = self.engine.size, self._task.theory
+        self.engine = StepEngine(
+            self._task, facts.most_paths(self._task.trace, theory, len(self._task.trace))
+        )
+        self.engine.grow(size)
+        self.engine.forbid(equalities)
+
+    def _forbid_in_engine(self, equalities: frozenset[Equality]) -> bool:
+        """Let the present engine forbid all maps with all of these equalities, if it can do so."""
+        can_forbid = isinstance(self.engine, StepEngine) or all(
+            equality.holds for equality in equalities
+        )
+        return can_forbid and self.engine.forbid(equalities)
+
+    def _minimise_known(self) -> Found | None:
+        """Find a minimal map under the rules that the engine has; None if there is none."""
+        while True:
+            minimal = None
+            for found in self.engine.improving_maps(
+                self._known.cost if self._known.best and not self._at_once else ()
+            ):
+                minimal = found
+                self._known.partial = found.map
+                replayed = self._replay(found.map)
+                if self._known.is_better(found) and self._predicts_all(found, replayed):
+                    self._known.keep(
+                        replace(found, map=self._whole(found.map, replayed)), replayed.labels
+                    )
+                self._report()
+                if (
+                    not self._at_once
+                    and self._known.lower is not None
+                    and found.cost <= self._known.lower
+                ):
+                    break
+            if not self._name_more_paths(minimal.cost if minimal else None):
+                return minimal
+
+    def _predicts_all(self, found: Found, replayed: Replay) -> bool:
+        """Whether a map of the prefix replays to the end, and no evidence rejects the whole map."""
+        whole = replayed.outcome is Outcome.PREDICTED
+        return whole and not self._judging.why_refused(self._whole(found.map, replayed))
+
+    def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
+        """Begin again with more names for paths, if the proof of this cost needs them."""
+        if not isinstance(self.engine, StepEngine):
+            return False  # other engines always have enough names for paths
+        needed = paths_needed(self._task, self.engine.size, cost)
+        if needed <= self.engine.paths:
+            return False
+        size = self.engine.size
+        _log.debug("%d names for paths are needed, not %d", needed, self.engine.paths)
+        self.engine = self.engine.with_paths(needed)
+        self.engine.grow(size)
+        return True
+
+    def minimal_maps(self) -> Iterator[SSHMap]:
+        """Yield every minimal map once, after `find_minimum` has proven the minimal cost."""
+        streamed: list[int] = []  # sizes of the prefixes whose maps were yielded
+        held: list[SSHMap] = []  # maps of this prefix that replay to the end, not yet yielded
+        try:
+            while True:
+                held.clear()
+                stuck = yield from self._maps_of_prefix(held, streamed)
+                if not stuck:
+                    break
+                self.engine.grow(self.engine.next_size(stuck))
+                self._name_more_paths(self._known.cost)
+        except (LimitError, StageTimeError):
+            yield from held  # these maps replay to the end at the minimal cost: they are minimal
+            raise
+        yield from held
+
+    def _maps_of_prefix(
+        self, held: list[SSHMap], streamed: list[int]
+    ) -> Generator[SSHMap, None, int]:
+        """Find the minimal maps of this prefix that replay to the end.
+
+        They are appended to `held`, or yielded if there are many, or if the prefix is the whole
+        trace. `streamed` has the sizes of earlier prefixes whose maps were yielded. Maps that
+        already replay from such a prefix are left out, as they were yielded, too. Returns the last
+        step at which a replay fails; 0 if all minimal maps replay to the end.
+        """
+        enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
+        asked = self._most and self._most + 1
+        streaming = self.engine.size == len(self._task.trace)
+        stuck, can_forbid = 0, True
+        given = set[SSHMap]()  # maps that were yielded or held, if evidence may reject others
+        while True:
+            came, refusal = 0, None
+            for found in self.engine.maps_of_cost(self._known.cost, asked):
+                came += 1
+                # 1. A map that does not replay to the end shows that the prefix has to grow.
+                replayed = self._replay(found.map)
+                if replayed.outcome is not Outcome.PREDICTED:
+                    stuck = max(stuck, len(replayed.labels))
+                    if not streaming:
+                        break
+                    continue
+                # 2. Leave out maps that were given before, of this prefix or of an earlier one.
+                whole = self._whole(found.map, replayed)
+                if whole in given or any(
+                    self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed
+                ):
+                    continue
+                # 3. Leave out maps that evidence rejects. If the engine can forbid them, list anew.
+                remembers = self._judging.may_refuse and (asked or len(given) < REMEMBERED)
+                if self._judging.why_refused(whole):
+                    refusal = (
+                        self._judging.why_refused(found.map) if can_forbid and remembers else None
+                    )
+                    if refusal:
+                        break
+                    continue
+                if remembers:
+                    given.add(whole)
+                # 4. Give the map, or hold it back until its prefix is known to be long enough.
+                if streaming:
+                    yield whole
+                    continue
+                held.append(whole)
+                if len(held) == enough:
+                    streaming = True
+                    yield from held
+                    held.clear()
+            if refusal:
+                can_forbid = self._forbid_in_engine(refusal)
+                continue
+            if stuck or not asked or came < asked:
+                break
+            # Clingo stopped at the number of maps asked for. But evidence rejected some of these,
+            # so ask for more.
+            asked *= 2
+        if stuck and streaming:
+            streamed.append(self.engine.size)
+        return stuck
+
+    def _replay(self, ssh_map: SSHMap, known: int | None = None) -> Replay:
+        """Replay the trace over a map of a prefix.
+
+        If stars (the openings seen at a step) need to agree only within their spread, also find out
+        at the end whether the stars of all steps fit the map. If `known` is given, use only the
+        links between the first `known` steps.
+        """
+        log = self._task.log
+        replayed = log.replay(
+            ssh_map.dstate_at, known, [s.place for s in ssh_map.dstates] if log.pairs else None
+        )
+        replays = replayed.outcome is Outcome.PREDICTED and len(ssh_map.dstate_at) < len(
+            replayed.labels
+        )
+        if (
+            self._in_tolerance
+            and replays
+            and with_allowed_headings(
+                self._task.trace,
+                replace(ssh_map, dstate_at=replayed.labels),
+                self._task.theory.axioms,
+            )
+            is None
+        ):
+            return Replay(replayed.labels[: len(ssh_map.dstate_at)], Outcome.CONTRADICTED)
+        return replayed
+
+    def _whole(self, ssh_map: SSHMap, replayed: Replay) -> SSHMap:
+        """Extend a map of a prefix to all steps that a replay explains.
+
+        If stars need to agree only within their spread, give the map headings that all stars allow.
+        """
+        whole = replace(ssh_map, dstate_at=replayed.labels)
+        if not self._in_tolerance or len(ssh_map.dstate_at) == len(replayed.labels):
+            return whole
+        return with_allowed_headings(self._task.trace, whole, self._task.theory.axioms) or whole
