@@ -244,6 +244,3 @@ def _deal(
     fold = np.full(len(labels), -1, np.intp)
     fold[cards] = np.arange(len(cards)) % folds
     return fold, tuple(classes[counts == 1].tolist())
-
-
-PlaceRecognizer = PlaceRecogniser  # Its name in version 0.1.0, which is in files of recognisers.

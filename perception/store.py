@@ -37,7 +37,6 @@ OURS = (
     ),
     "perception.clusterings.Predictor",
     "perception.clusterings.Tried",
-    "perception.recognition.PlaceRecognizer",  # The name in files of version 0.1.0.
 )
 
 

@@ -1,13 +1,10 @@
 """Find every minimal topological map that explains what a robot saw and did.
 
 Each exported name is loaded when it is first used. So the command line starts at once, and Ctrl-C
-works from its start. When this module is loaded, it imports `sys`, which is part of Python itself,
-and `lazy`, but not even `__future__`. At that time, Python may still search the current folder
-first, and a file there could replace a module of Python. `__main__` moves that folder to the end of
-the search path.
+works from its start. When this module is loaded, it imports `lazy` alone, not even `__future__`. At
+that time, Python may still search the current folder first, and a file there could replace a module
+of Python. `__main__` moves that folder to the end of the search path.
 """
-
-import sys
 
 from ssh_abduction.runtime.lazy import lazy_names
 
@@ -39,55 +36,6 @@ if TYPE_CHECKING:
 
     __version__: str
 
-# Names of version 0.1.0. Each still works in this version, with a warning that gives its new home.
-_MOVED = {"Path": "data.MapPath", "SSHError": "data.AbductionError"} | {
-    name: f"{home}.{name}"
-    for home, names in {
-        "data": "Action DState Fit LocaliserError MapError Odometry Pose RangeError SolverError "
-        "Step TheoryError TraceError",
-        "evaluation": "Evaluation MapEvaluation VisitsEvaluation evaluate_visits",
-        "evaluation.rungs": "Rung ladder",
-        "online": "Belief Chances Exploration Move Route",
-        "page": "Page",
-        "rivals": "Comparison Difference Experiment Listing difference",
-        "solver": "Backbone Bound Certificate Cost Level Progress Search Status",
-        "theory": "Speedups",
-    }.items()
-    for name in names.split()
-}
-
-# Modules whose names the documentation of version 0.1.0 imports, and the packages of these names.
-_MOVED_MODULES = {
-    "ssh_abduction.front": "ssh_abduction.solver",
-    "ssh_abduction.learner": "ssh_abduction.learning",
-    "ssh_abduction.rivals.explain": "ssh_abduction.explain",
-}
-
-
-class _MovedModules:
-    """Finds and loads the modules of version 0.1.0 that other packages have replaced."""
-
-    def find_spec(self, name: str, *_: object) -> "Any":
-        if name not in _MOVED_MODULES:
-            return None
-        from importlib.machinery import ModuleSpec
-
-        loader: Any = self
-        return ModuleSpec(name, loader)
-
-    def create_module(self, spec: "Any") -> None:
-        """Let Python make an empty module, which `exec_module` replaces."""
-
-    def exec_module(self, module: "Any") -> None:
-        import warnings
-        from importlib import import_module
-
-        old, now = module.__name__, _MOVED_MODULES[module.__name__]
-        warnings.warn(f"{old} is deprecated; use {now}", DeprecationWarning, stacklevel=2)
-        sys.modules[old] = import_module(now)
-
-
-sys.meta_path.append(_MovedModules())
 _load, __dir__ = lazy_names(__name__)
 
 
@@ -97,15 +45,4 @@ def __getattr__(name: str) -> "Any":
 
         globals()[name] = version("ssh-abduction")
         return globals()[name]
-    if name in _MOVED:
-        import warnings
-        from importlib import import_module
-
-        package, _, now = _MOVED[name].rpartition(".")
-        warnings.warn(
-            f"ssh_abduction.{name} is deprecated; use ssh_abduction.{package}.{now}",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return getattr(import_module(f"{__name__}.{package}"), now)
     return _load(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import json
@@ -24,7 +25,7 @@ from aces import ACES
 from worlds import ENDLESS, TOURS, drive, rectangle
 
 from ssh_abduction import SSHMap, Theory, Trace, solve
-from ssh_abduction.cli import main
+from ssh_abduction.cli import main, parser
 from ssh_abduction.theory import encodings
 
 
@@ -265,7 +266,7 @@ def test_count_of_one_has_a_singular_noun(
     assert main(["solve", path, "--json"]) == 0
     maps = tmp_path / "maps.json"
     maps.write_text(capsys.readouterr().out)
-    assert main(["check", "--bound", path, str(maps)]) == 0
+    assert main(["check", "--bound", str(maps), path]) == 0
     assert "at least 1 dstate: no two of 1 step" in capsys.readouterr().out
 
 
@@ -283,7 +284,7 @@ def test_check_bound_accepts_an_answer_without_maps(
         "backbone": None,
     }
     bare.write_text(json.dumps({**json.loads(solved.read_text()), **none}))
-    assert main(["check", "--bound", ACES, str(bare)]) == 0
+    assert main(["check", "--bound", str(bare), ACES]) == 0
     assert "at least 19 dstates, if clingo is right" in capsys.readouterr().out
 
 
@@ -301,15 +302,15 @@ def test_show_draws_and_exports_a_map(solved: Path, capsys: pytest.CaptureFixtur
     assert capsys.readouterr().out.count("path 0: places") == 4
     assert main(["show", str(solved), "--map", "2"]) == 0
     assert capsys.readouterr().out.count("path 0: places") == 1
-    assert main(["show", str(solved), "--dot"]) == 0
+    assert main(["export", str(solved), "--to", "dot"]) == 0
     dot = capsys.readouterr().out
     assert dot.startswith("digraph map {")
     assert dot.count("subgraph cluster_") == 10
     assert dot.count(" -> ") == len(json.loads(solved.read_text())["maps"][0]["links"])
-    assert main(["show", str(solved), "--graphml"]) == 0
+    assert main(["export", str(solved), "--to", "graphml"]) == 0
     graph = nx.parse_graphml(capsys.readouterr().out)
     assert len(graph) == 19
-    assert main(["show", str(solved), "--svg"]) == 0
+    assert main(["export", str(solved), "--to", "svg"]) == 0
     assert capsys.readouterr().out.startswith("<svg ")
     assert main(["show", str(solved), "--map", "9"]) == 1
     assert "--map: expected 1 to 4, got 9" in capsys.readouterr().err
@@ -425,9 +426,9 @@ def test_control_characters_in_names_are_escaped(
     assert "a\\nb\\x1b[31m" in capsys.readouterr().out
     assert main(["solve", trace, "--json"]) == 0
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)
-    for form in ("--svg", "--graphml", "--dot"):
-        assert main(["show", str(tmp_path / "maps.json"), form]) == 0
-        if form != "--dot":
+    for form in ("svg", "graphml", "dot"):
+        assert main(["export", str(tmp_path / "maps.json"), "--to", form]) == 0
+        if form != "dot":
             ET.fromstring(capsys.readouterr().out)
 
 
@@ -525,8 +526,8 @@ def test_machine_output_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
     maps = printed("solve", path, "--json")
     assert [s["view"] for s in json.loads(maps)["maps"][0]["dstates"]] == ["日本", "中国", "Küche"]
     assert 'view(1,"中国").' in printed("facts", path)
-    for form in ("--svg", "--graphml"):
-        drawn = ET.fromstring(printed("show", "-", form, given=maps.encode()))
+    for form in ("svg", "graphml"):
+        drawn = ET.fromstring(printed("export", "-", "--to", form, given=maps.encode()))
         assert "日本" in "".join(drawn.itertext())
 
 
@@ -650,3 +651,31 @@ def test_check_prints_violations_as_json(solved: Path, capsys: pytest.CaptureFix
     first = data["violations"][0]
     assert first["axiom"] in lines[0]
     assert first["message"] in lines[0]
+
+
+def test_shell_has_at_most_50_flags() -> None:
+    flags = {
+        name
+        for each in (parser(), *parser().verbs.values())
+        for action in each._actions
+        if action.help != argparse.SUPPRESS
+        for name in action.option_strings
+        if name.startswith("--")
+    }
+    assert len(flags) <= 50, sorted(flags)
+
+
+def test_a_theory_is_read_from_a_file(
+    tmp_path: Path, room: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toml = tmp_path / "mine.toml"
+    toml.write_text('preset = "topological"\nboundary = "none"\nprefer = ["dstates", "paths"]\n')
+    assert Theory.from_toml(toml) == Theory(boundary="none", prefer=("dstates", "paths"))
+    assert main(["solve", room, "--theory", str(toml)]) == 0
+    by_file = capsys.readouterr().out.splitlines()[1:]
+    flags = ["--set", "boundary=none", "--set", "prefer=dstates,paths"]
+    assert main(["solve", room, *flags]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == by_file
+    toml.write_text("boundary = 3\n")
+    assert main(["solve", room, "--theory", str(toml)]) == 1
+    assert "mine.toml: boundary: expected none, strict or defeasible" in capsys.readouterr().err

@@ -514,7 +514,8 @@ def test_maps_with_headings_in_degrees_survive_a_round_trip(
     assert main(["solve", str(tmp_path / "t.jsonl"), "--json"]) == 0
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)
     assert main(["check", str(tmp_path / "maps.json"), str(tmp_path / "t.jsonl")]) == 0
-    assert main(["show", str(tmp_path / "maps.json"), "--svg", str(tmp_path / "map.svg")]) == 0
+    drawn = ["export", str(tmp_path / "maps.json"), "--to", "svg", "-o", str(tmp_path / "map.svg")]
+    assert main(drawn) == 0
     (ssh_map,) = maps_of(read_json(tmp_path / "maps.json"), "maps.json")
     assert {s.heading for s in ssh_map.dstates} == {0, 120, 240}
 

@@ -500,19 +500,6 @@ def test_import_finds_all_visits_to_crossings_in_aces() -> None:
     assert {visit for visit in truth.matched(scans) if visit is not None} == {*range(15)}
 
 
-@pytest.mark.parametrize("command", [["import"], ["map", "--set", "ladder=false"]])
-def test_old_detector_options_warn_and_have_no_effect(
-    hall: Path, command: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    old = ["--places", "doors", "--gateway=0.8", "--set", "radius=5"]
-    missing = str(hall.with_name("missing.log"))
-    assert main([*command, missing, "-o", str(hall.with_name("none")), *old]) == 1
-    told = capsys.readouterr().err
-    for name in ("--places", "--gateway", "--radius"):
-        assert f"{name} has no effect any more: places are the junctions" in told
-    assert "--width METRES" in told
-
-
 @pytest.mark.slow
 def test_map_of_four_rooms_has_perfect_place_precision(tmp_path: Path) -> None:
     """A robot drives around four rooms in a ring, and the map has a place in each of them."""

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Any
 
 import networkx as nx
 import pytest
 from worlds import SQUARE, TEE, TOURS, Streets, drive, rectangle, streets, written
 
-from ssh_abduction import SSHMap, Theory, output, solve
+from ssh_abduction import SSHMap, Theory, solve
 from ssh_abduction.data import MapError
-from ssh_abduction.data.maps import MOVED
 from ssh_abduction.output import to_dot, to_graphml, to_networkx, to_svg
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -143,17 +139,3 @@ def test_strange_names_are_drawn_and_written_safely() -> None:
     assert '\\"' in to_dot(ssh_map)
     (causal,) = solve(written("<a> T <b>"), Theory.causal()).maps
     ET.fromstring(to_svg(causal))
-
-
-def test_old_drawing_methods_warn_and_call_the_functions() -> None:
-    (ssh_map,) = solve(written("a T b")).maps
-    old: Any = ssh_map
-    for name in MOVED:
-        with pytest.warns(DeprecationWarning, match=f"use ssh_abduction.output.{name}$"):
-            method = getattr(old, name)
-        assert method.func is getattr(output, name)
-    with pytest.warns(DeprecationWarning, match="SSHMap.to_svg is deprecated"):
-        assert old.to_svg({"T": 90}) == to_svg(ssh_map, {"T": 90})
-    with pytest.raises(AttributeError, match="'SSHMap' object has no attribute 'to_png'"):
-        _ = old.to_png
-    assert copy.deepcopy(ssh_map) == pickle.loads(pickle.dumps(ssh_map)) == ssh_map

@@ -416,9 +416,9 @@ def test_terminal_control_characters_are_escaped(
         ),
         *(
             ["show", str(maps)],
-            ["show", str(maps), "--dot"],
-            ["show", str(maps), "--svg"],
-            ["show", str(maps), "--graphml"],
+            ["export", str(maps), "--to", "dot"],
+            ["export", str(maps), "--to", "svg"],
+            ["export", str(maps), "--to", "graphml"],
         ),
         *(
             ["solve", str(missing)],
@@ -435,7 +435,7 @@ def test_terminal_control_characters_are_escaped(
         captured = capsys.readouterr()
         for text in (captured.out, captured.err):
             assert not set(strange[0] + strange[5] + strange[-1]) & set(
-                text.replace("\u202e", "") if words[0] == "show" else text
+                text.replace("\u202e", "") if words[0] in ("show", "export") else text
             ), words
     for words in (["solve", ACES, f"--{strange}"], [strange]):
         with pytest.raises(SystemExit):

@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 import zipfile
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -171,3 +172,16 @@ def test_import_linter_sees_all_imports_of_the_package() -> None:
         for name in re.findall(r"import_module\(\"(ssh_abduction\.[^\"]+)", path.read_text())
     ]
     assert found == [("words.py", "ssh_abduction.output")]
+
+
+def test_package_exports_15_to_20_names() -> None:
+    assert 15 <= len(ssh_abduction.__all__) <= 20
+
+
+@pytest.mark.parametrize("package", ["", "data", "evaluation", "explain", "online", "rivals"])
+def test_packages_load_each_name_that_they_export(package: str) -> None:
+    module = import_module(f"ssh_abduction.{package}".rstrip("."))
+    for name in module.__all__:
+        assert getattr(module, name).__name__ == name
+    with pytest.raises(AttributeError, match="has no attribute 'Sequence'"):
+        module.Sequence  # noqa: B018 - an import for type checkers only

@@ -12,7 +12,6 @@ from itertools import islice, product
 from pathlib import Path
 from unittest.mock import patch
 
-import aces
 import networkx as nx
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from strategies import traces
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.cli import main
 from ssh_abduction.data import SolverError
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.asp import facts
@@ -248,13 +246,6 @@ def test_unknown_speedups_are_an_error() -> None:
         SolverError, match=r"speedups: expected names out of prefixes, .*, got 'magic'"
     ):
         Speedups.without("magic")
-
-
-def test_removed_speedup_is_ignored_with_a_warning(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.warns(DeprecationWarning, match="threads is removed"):
-        assert Speedups.without("threads,lazy") == Speedups(lazy=False)
-    assert main(["solve", str(aces.PATH), "--set", "without_speedups=threads"]) == 0
-    assert "warning: speedups: threads is removed" in capsys.readouterr().err
 
 
 @settings(max_examples=8)

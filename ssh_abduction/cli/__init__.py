@@ -174,9 +174,7 @@ def _main(arguments: Sequence[str] | None) -> int:
                 "send it to a file"
             )
         with telling(options, for_programs), warnings.catch_warnings(record=True) as caught:
-            warnings.filterwarnings("default", category=DeprecationWarning, module="ssh_abduction")
             try:
-                warn(options.notes)
                 check_inputs_are_kept(options)
                 guard = Guard(lambda: None)
                 with contextlib.redirect_stdout(output), guard:

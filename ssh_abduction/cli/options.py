@@ -222,7 +222,7 @@ def trace_path(text: str) -> str:
 
 
 def trace_of(options: argparse.Namespace) -> str:
-    """Return the trace file of a verb with `add_maps` and `add_trace`. Warn if they are swapped.
+    """Return the trace file of a verb with `add_maps` and `add_trace`.
 
     Raises AbductionError if there is no trace, or the file of maps cannot be read.
     """
@@ -234,7 +234,6 @@ def trace_of(options: argparse.Namespace) -> str:
         raise AbductionError(
             f"trace: expected the trace of {named(options.maps)}, got none; name it after the maps"
         )
-    _in_order(options)
     return str(options.trace)
 
 
@@ -315,19 +314,6 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
             if maps
             else f"{where}: --map: expected a map, got none"
         )
-
-
-def _in_order(options: argparse.Namespace) -> None:
-    """Warn and swap `maps` and `trace` if the trace came first, as in version 0.1.0."""
-    is_trace = partial(_is_read, Trace.load)
-    if options.maps == "-" or not is_trace(options.maps) or is_trace(options.trace):
-        return
-    print(
-        "ssh-abduction: warning: a trace before its maps is deprecated; "
-        "name the maps first, and then the trace",
-        file=sys.stderr,
-    )
-    options.maps, options.trace = options.trace, options.maps
 
 
 def some_maps(data: Any, file: str, purpose: str, mend: str = "") -> list[SSHMap]:

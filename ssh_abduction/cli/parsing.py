@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -11,21 +10,7 @@ from typing import Any, NoReturn
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.words import meant
 
-# Options of version 0.1.0 that have another name now. They still work, with a warning.
-REPLACED = {"as": "format", "theory-of": "theory", "localize": "run"}
-# Options that have no successor, by the option that a verb has now instead. They have no effect.
-# The sentence says why.
-WITHDRAWN = dict.fromkeys(
-    ("places", "gateway", "radius"),
-    (
-        "--width",
-        "places are the junctions of the free space and the points where the robot turned around, "
-        "began or ended; the only length to set is the width of the robot, --width METRES",
-    ),
-)
-OTHER_VERBS = {"localize": "localise"}
 NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
-DRAWN = ("dot", "graphml", "svg")  # options of `show` in version 0.1.0, now `export --to`
 
 
 @dataclass(frozen=True)
@@ -208,84 +193,20 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, text) from error
 
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """Parse the words of a command line. The parser of the verb reports unknown options.
-
-        Options of version 0.1.0 are replaced by their new form. The attribute `notes` of
-        the result has a sentence for each replacement.
-        """
-        notes: list[str] = []
-        words = self._with_replacements(list(sys.argv[1:] if args is None else args), notes)
-        options, unknown = self.parse_known_args(words, namespace)
-        options.notes = tuple(notes)
+        """Parse the words of a command line. The parser of the verb reports unknown options."""
+        options, unknown = self.parse_known_args(args, namespace)
         if unknown:
             verb = self.verbs[options.verb] if getattr(options, "verb", None) else self
             wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
-            hint = meant(wrong.partition("=")[0], verb.names)
+            flag = wrong.partition("=")[0]
+            is_setting = (name := flag[2:].replace("-", "_")) in verb.settings
+            hint = f"; write --set {name}=VALUE" if is_setting else meant(flag, verb.names)
             # The values of an argument that takes many are one after the other.
             takes_many = any(a.nargs in ("*", "+") for a in verb._get_positional_actions())
             if not wrong.startswith("-") and takes_many:
                 hint = "; write them before the options"
             verb.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return options
-
-    def _with_replacements(self, words: list[str], notes: list[str]) -> list[str]:
-        """Replace options of version 0.1.0 by their new form."""
-        at = next((i for i, word in enumerate(words) if not word.startswith("-")), None)
-        if at is None:
-            return words
-        if (now := OTHER_VERBS.get(words[at])) is not None:
-            notes.append(_note(words[at], now))
-            words = [*words[:at], now, *words[at + 1 :]]
-        verb = self.verbs.get(words[at])
-        if verb is None:
-            return words
-        if words[at] == "show" and any(w[2:].partition("=")[0] in DRAWN for w in words[at:]):
-            return _exported(words, at, notes)
-        done, rest = words[: at + 1], words[at + 1 :]
-        while rest:
-            word = rest.pop(0)
-            if word == "--":
-                return [*done, word, *rest]
-            replaced = verb._replacement(word, rest, notes)
-            done += [word] if replaced is None else replaced
-        return done
-
-    def _replacement(self, word: str, rest: list[str], notes: list[str]) -> list[str] | None:
-        """The new form of an option of version 0.1.0, with a note; None for other words."""
-        if self._drops(word, rest, notes):
-            return []
-        flag, equals, value = word.partition("=")
-        name = flag[2:].replace("-", "_")
-        if not flag.startswith("--") or flag in self.names:
-            return None
-        negative = name.removeprefix("no_")
-        on = self.settings.get(name)
-        off = self.settings.get(negative) if negative != name else None
-        if (on is not None and on.is_flag) or (off is not None and off.is_flag):
-            setting = f"{name}=true" if on is not None else f"{negative}=false"
-            notes.append(_note(flag, f"--set {setting}"))
-            return ["--set", setting]
-        new = REPLACED.get(flag[2:])
-        if (on is None and (new is None or f"--{new}" not in self.names)) or not (equals or rest):
-            return None
-        value = value if equals else rest.pop(0)
-        if on is not None:
-            notes.append(_note(flag, f"--set {name}={value}"))
-            return ["--set", f"{name}={value}"]
-        notes.append(_note(flag, f"--{new}"))
-        return [f"--{new}={value}"]
-
-    def _drops(self, word: str, rest: list[str], notes: list[str]) -> bool:
-        """Drop an option that has no new form, with its value, and note it; False for others."""
-        is_set = word == "--set" and bool(rest)
-        flag, equals, _ = (f"--{rest[0]}" if is_set else word).partition("=")
-        now, why = WITHDRAWN.get(flag[2:].replace("-", "_"), ("", ""))
-        if not flag.startswith("--") or now not in self.names or flag in self.names:
-            return False
-        if is_set or (not equals and rest):
-            rest.pop(0)
-        notes.append(f"{printable(flag)} has no effect any more: {why}")
-        return True
 
     @property
     def verbs(self) -> Mapping[str, Parser]:
@@ -326,27 +247,3 @@ class Verbs(argparse._SubParsersAction):  # type: ignore[type-arg]
         parser: Parser = self.add_parser(name, help=said, description=description, epilog=epilog)
         parser.set_defaults(run=run)
         return parser
-
-
-def _exported(words: list[str], at: int, notes: list[str]) -> list[str]:
-    """Replace `show --dot`, `--graphml` or `--svg` of version 0.1.0 by an `export` command."""
-    kept, target = [], None
-    rest = words[at + 1 :]
-    while rest:
-        word = rest.pop(0)
-        flag, _, value = word.partition("=")
-        if not (flag.startswith("--") and flag[2:] in DRAWN):
-            kept.append(word)
-            continue
-        target = ["--to", flag[2:]]
-        if flag == "--svg" and not value and rest and rest[0].lower().endswith(".svg"):
-            value = rest.pop(0)
-        if value:
-            target += ["-o", value]
-    new = [*words[:at], "export", *kept, *(target or [])]
-    notes.append(_note(" ".join(words[at:]), " ".join(new[at:])))
-    return new
-
-
-def _note(old: str, new: str) -> str:
-    return f"{printable(old)} is deprecated; write {printable(new)}"

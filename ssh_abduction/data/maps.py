@@ -16,12 +16,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ssh_abduction.data.checks import a_list, a_whole_number, all_instances, an_instance, one_of
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
@@ -46,8 +44,6 @@ __all__ = ["FAULTS", "DState", "Fault", "Fit", "MapPath", "Name", "Pose", "SSHMa
 
 # Hexadecimal digits of a map's id. Among a million maps the chance of two equal ids is 1 in 500.
 ID_LENGTH = 12
-# Methods of version 0.1.0 that are functions of `ssh_abduction.output` now.
-MOVED = ("plot", "to_dot", "to_graphml", "to_networkx", "to_pandas", "to_svg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,19 +118,6 @@ class SSHMap:
         """Return the map as HTML for notebooks: picture, fit, faults and dstates."""
         card: str = in_output("map_card")(self)
         return card
-
-    if not TYPE_CHECKING:  # so that type checkers still reject unknown attributes
-
-        def __getattr__(self, name):
-            """Return a method of version 0.1.0, now a function of `ssh_abduction.output`."""
-            if name not in MOVED:
-                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            warnings.warn(
-                f"SSHMap.{name} is deprecated; use ssh_abduction.output.{name}",
-                DeprecationWarning,
-                stacklevel=2,
-            )
-            return partial(in_output(name), self)
 
     def place_of(self, step: int) -> int | None:
         """Return the id of the place of a step; None if the map has no places.

@@ -27,7 +27,6 @@ from ssh_abduction.data.checks import a_count_of_maps, a_flag, an_instance
 from ssh_abduction.data.errors import MapError, SolverError, TheoryError
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.evaluation import Evaluation, evaluate, tells_names
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Search, Solution, check_limit
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -130,7 +129,6 @@ def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[st
         yield "+ planarity", theory.replace(planar=True)
 
 
-@renamed_parameters("limit", "maps")
 def ladder(
     trace: Trace,
     theory: Theory | None = None,

@@ -28,9 +28,7 @@ from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace
 from ssh_abduction.data.words import PlainData, attributes_of, noun_of
 from ssh_abduction.explain.axioms import Axioms, Piece
 from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Status, Stop, check_rules
-from ssh_abduction.theory.old_choices import with_old_choices
 from ssh_abduction.theory.settle import displacement_of, settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -194,8 +192,6 @@ NEW_VIEW = "a view never seen"
 SHARE = 0.45
 
 
-@renamed_parameters("limit", "memory")
-@with_old_choices
 def explain_trace(
     trace: Trace,
     theory: Theory | None = None,

@@ -33,9 +33,7 @@ from ssh_abduction.explain.axioms import Axioms, Piece
 from ssh_abduction.explain.no_map import Explanation, check_two_steps, explain
 from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
 from ssh_abduction.explain.verdict import Derivation, PairExplanation, Side, Verdict
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import EQUAL, Cost, Judging, Status, Stop, facts
-from ssh_abduction.theory.old_choices import with_old_choices
 from ssh_abduction.theory.settle import displacement_of
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -56,8 +54,6 @@ SHARE = 0.45
 ESTIMATING = 0.5
 
 
-@renamed_parameters("limit", "maps", "memory")
-@with_old_choices
 def explain_pair(
     trace: Trace,
     first: int,

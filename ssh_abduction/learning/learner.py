@@ -32,7 +32,6 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.learning.runner_up import RunnerUpWarning, warn_of_second_map
 from ssh_abduction.learning.traces import Traces
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import Solution, Status, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -90,7 +89,6 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", Figure 1.
     """
 
-    @renamed_parameters("limit")
     def __init__(
         self,
         theory: Theory | None = None,

@@ -55,7 +55,6 @@ from ssh_abduction.online.mapper import OnlineMapper
 from ssh_abduction.rivals.explore import next_experiment
 from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.rivals.tour import next_tour
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Solution, Status, check_limit, find_backbone, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -179,7 +178,6 @@ class Explorer:
     and no return in it is in doubt
     """
 
-    @renamed_parameters("limit", "maps")
     def __init__(
         self,
         robot: Robot,

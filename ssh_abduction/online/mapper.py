@@ -73,7 +73,6 @@ from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
 from ssh_abduction.data.words import counted
 from ssh_abduction.online.keeper import MapKeeper, StepOptions
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Solution, check_limit, preload_engine
 from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.theory.fields import choice
@@ -110,7 +109,6 @@ class OnlineMapper:
         solution: The minimal maps of the steps so far, or the best map found in time.
     """
 
-    @renamed_parameters("limit", "maps")
     def __init__(
         self,
         view: View,

@@ -32,7 +32,6 @@ from ssh_abduction.page.content import Called, content_of
 from ssh_abduction.page.html import html_of
 from ssh_abduction.page.replays import Run
 from ssh_abduction.rivals.listing import Listing, PairInMap
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import LimitError, Watch, in_process
 from ssh_abduction.theory.theory import Theory
 
@@ -64,7 +63,6 @@ class PageServer(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = 128  # with Python's 5, many requests at once would wait for a minute
 
-    @renamed_parameters("limit", "maps")
     def __init__(
         self,
         listing: Listing,

@@ -76,13 +76,11 @@ from ssh_abduction.rivals.machines import (
     machine_of,
     with_ends,
 )
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import LimitError, Solution, Stop, Watch, check_limit
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 
-@renamed_parameters("limit", "memory")
 def next_experiment(
     maps: Solution | SSHMap | Iterable[SSHMap],
     trace: Trace | None = None,

@@ -37,7 +37,6 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation.rungs import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import may_misread, report
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import (
     Ranking,
@@ -278,7 +277,6 @@ class LogMapping(UnderWay):
         return self.latest()
 
 
-@renamed_parameters("limit", "maps")
 def map_log(
     log: RobotLog | Sequence[RobotLog],
     theory: Theory | None = None,

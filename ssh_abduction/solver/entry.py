@@ -20,7 +20,6 @@ from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import counting, heeding
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.drives.added_drives import Solving, solve_onto
@@ -35,7 +34,6 @@ from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.solver.start import Limits, Start
 from ssh_abduction.solver.values import Progress
-from ssh_abduction.theory.old_choices import with_old_choices
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import ALL, Speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -45,8 +43,6 @@ _log = log_of(__name__)
 LEAST_SECONDS = 1e-9
 
 
-@renamed_parameters("limit", "maps", "memory")
-@with_old_choices
 def solve(
     trace: Trace | Sequence[Trace] | Iterator[Trace],
     theory: Theory | None = None,

@@ -21,7 +21,6 @@ from ssh_abduction.data.errors import TheoryError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import each_heeding
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.values import Found
@@ -102,7 +101,6 @@ class Front:
         return {point.faults: point.dstates for point in self.points if point.proven}
 
 
-@renamed_parameters("limit")
 def fault_front(
     trace: Trace, theory: Theory | None = None, most: int = 5, time_limit: float | None = None
 ) -> Front:

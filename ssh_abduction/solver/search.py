@@ -24,7 +24,6 @@ from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.clock import counting, each_counting, each_heeding, heeding, now
-from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.answer import Answer
@@ -90,7 +89,6 @@ class Search:
         clash: Consecutive steps that have no map by themselves; None if none are known.
     """
 
-    @renamed_parameters("limit", "maps", "memory")
     def __init__(
         self,
         trace: Trace,

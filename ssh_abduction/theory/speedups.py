@@ -16,7 +16,6 @@ False
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Final
@@ -61,8 +60,7 @@ class Speedups:
         """Return Speedups that are all on except these.
 
         Args:
-            names: Names of fields, in a list or separated by commas. A name of a removed speed-up
-                changes nothing, and gives a DeprecationWarning.
+            names: Names of fields, in a list or separated by commas.
 
         Raises:
             SolverError: A name is unknown.
@@ -72,12 +70,9 @@ class Speedups:
             raise SolverError(f"{expected} {brief(names)}; take some of these")
         off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
         for name in off:
-            if name in REMOVED:
-                text = f"speedups: {name} is removed, as it gained too little; leave it out"
-                warnings.warn(text, DeprecationWarning, stacklevel=2)
-            elif name not in SPEEDUPS:
+            if name not in SPEEDUPS:
                 raise SolverError(f"{expected} {brief(name)}; take some of these")
-        return cls(**dict.fromkeys((name for name in off if name not in REMOVED), False))
+        return cls(**dict.fromkeys(off, False))
 
     def that_hold_for(self, theory: Theory) -> Speedups:
         """Return these speed-ups without those that might change an answer for a theory.
@@ -99,17 +94,6 @@ def checked_speedups(value: object) -> Speedups:
 SPEEDUPS = tuple(f.name for f in fields(Speedups))
 EVERY: Final = None
 NOTHING: frozenset[str] = frozenset()
-# Speed-ups that gained too little.
-REMOVED = (
-    "from_below",
-    "apart",
-    "small_cores",
-    "watched",
-    "one_by_one",
-    "threads",
-    "processes",
-    "annealed",
-)
 
 
 @dataclass(frozen=True)

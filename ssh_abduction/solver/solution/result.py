@@ -6,10 +6,9 @@ Importing this module does not load clingo.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ssh_abduction.checker.claims import contradictions
 from ssh_abduction.data.checks import a_whole_number, one_of
@@ -328,20 +327,6 @@ class Solution(MapSequence):
     def seconds(self) -> Seconds:
         """The wall-clock time of the search: `total`, `ground` and `solve`, in seconds."""
         return self.effort.seconds
-
-    if not TYPE_CHECKING:  # so that type checkers reject unknown attributes
-
-        def __getattr__(self, name):
-            """Return a field of `effort` or `support` by the name that it had in version 0.1.0."""
-            if name in ("prefix", "grounding", "evidence"):
-                value, now = getattr(self.effort, name), f"effort.{name}"
-            elif name == "odometry_warning":
-                value, now = self.support.odometry_warning, "warnings"
-            else:
-                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            text = f"Solution.{name} is deprecated; use Solution.{now}"
-            warnings.warn(text, DeprecationWarning, stacklevel=2)
-            return value
 
     def to_dict(self) -> dict[str, Any]:
         """Return the answer as plain data, as `solve --json` prints it (docs/reference/formats.md).
