@@ -312,7 +312,8 @@ def test_matplotlib_axes_hold_the_drawn_places_and_dstates() -> None:
     assert plot(ssh_map, ax) is ax
     assert {text.get_text() for text in ax.texts} == {
         *map(str, ssh_map.places),
-        *(f"x{s.id}" for s in ssh_map.dstates),
+        *(f"x{s.id}" if s.id else "x0 start" for s in ssh_map.dstates),
+        *(f"path {path.id}" for path in ssh_map.paths),
     }
     assert plot(solve(drive(*TOURS["square"]), Theory.causal()).maps[0]).texts
     pyplot.close("all")

@@ -90,12 +90,13 @@ def test_malformed_maps_are_refused(change: dict[str, object], message: str) -> 
 
 
 def positions(picture: str) -> dict[str, tuple[float, float]]:
-    """Where the places are drawn, by the number in the circle."""
+    """Where the places are drawn, by the number in the title."""
     found = {}
     for group in ET.fromstring(picture).iter(f"{SVG}g"):
-        circle, label = group.find(f"{SVG}circle"), group.find(f"{SVG}text")
-        if circle is not None and label is not None:
-            found[str(label.text)] = (float(circle.attrib["cx"]), float(circle.attrib["cy"]))
+        circle, title = group.find(f"{SVG}circle"), str(group.findtext(f"{SVG}title"))
+        if circle is not None and title.startswith("place "):
+            place = title.removeprefix("place ").partition(",")[0]
+            found[place] = (float(circle.attrib["cx"]), float(circle.attrib["cy"]))
     return found
 
 

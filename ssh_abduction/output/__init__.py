@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ssh_abduction.output.graphs import to_graphml as to_graphml
     from ssh_abduction.output.graphs import to_networkx as to_networkx
     from ssh_abduction.output.graphs import to_pandas as to_pandas
-    from ssh_abduction.output.picture import to_svg as to_svg
     from ssh_abduction.output.plotting import plot as plot
+    from ssh_abduction.output.svg import to_svg as to_svg
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -46,6 +46,8 @@ class Layout:
     dstates: tuple[tuple[float, float, float | None], ...] = field(repr=False)
     # Whether positions are metres. Otherwise the shortest street has about length 1.
     metric: bool = False
+    # The covariance (xx, xy, yy) of the position of each dstate in m², if positions are metres.
+    spreads: tuple[tuple[float, float, float], ...] = field(default=(), repr=False)
 
 
 def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
@@ -59,7 +61,8 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
         return _floor_by_floor(ssh_map, _Drawing(ssh_map, degrees).layout())
     at = [(pose.x, pose.y, pose.heading) for pose in poses]
     first = {s.place: s.id for s in reversed(ssh_map.dstates)}  # the first dstate of each place
-    return Layout({p: at[first[p]][:2] for p in ssh_map.places}, tuple(at), True)
+    spreads = tuple(pose.spread for pose in poses)
+    return Layout({p: at[first[p]][:2] for p in ssh_map.places}, tuple(at), True, spreads)
 
 
 def drawable_poses(ssh_map: SSHMap) -> tuple[Pose, ...] | None:

@@ -20,8 +20,8 @@ from typing import Any
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import attributes_of, counted
-from ssh_abduction.output.layout import Layout, drawable_poses, layout
-from ssh_abduction.output.metric_picture import axes
+from ssh_abduction.output.layout import Layout, layout
+from ssh_abduction.output.map_scene import axes
 from ssh_abduction.page.overview import Spot, overview
 from ssh_abduction.page.replays import Run, replays
 from ssh_abduction.rivals.comparison import Choice, compare
@@ -298,8 +298,6 @@ def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
     Each has the dstate, two standard deviations, and the angle of the first axis in radians
     counterclockwise.
     """
-    poses = drawable_poses(ssh_map)
-    assert poses is not None
     extent = max(
         max(numbers) - min(numbers)
         for numbers in zip(*((x, y) for x, y, _ in found.dstates), strict=True)
@@ -310,7 +308,7 @@ def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
         if s.place is not None and s.place in seen:
             continue
         seen.add(s.place)
-        (major, minor), angle = axes(poses[s.id].spread)
+        (major, minor), angle = axes(found.spreads[s.id])
         if 0 < major <= CUT * extent and math.isfinite(angle):
             ellipses.append([s.id, round(major / unit, 3), round(minor / unit, 3), round(angle, 3)])
     return ellipses

@@ -32,15 +32,26 @@ from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Pose, moved
 from ssh_abduction.data.star import Star
-from ssh_abduction.output.drawing import ALARM, colour_of, escaped, page, svg_text, titled
 from ssh_abduction.output.layout import fitted_motion
-from ssh_abduction.output.region_marks import band, banded
+from ssh_abduction.output.map_scene import band, banded
+from ssh_abduction.output.scene import (
+    ALARM,
+    Disc,
+    Label,
+    Line,
+    Mark,
+    Point,
+    Scene,
+    Titled,
+    colour_of,
+    escaped,
+)
+from ssh_abduction.output.svg import svg_of
 from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.robot_logs.edges import STEP, edges_of, resampled
 from ssh_abduction.solver import Solution
 
 Array = NDArray[np.float64]
-Point = tuple[float, float]
 
 # The picture has at most one point of a wall in each square with sides of this many metres.
 GRAIN = 0.1
@@ -71,8 +82,8 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
     if solution.maps:
         marks += _map_marks(sheet, imported, solution)
     else:
-        marks += [_dot(sheet.on_page(p), 4, "#d55e00") for p in sheet.spots]
-    picture = page(marks, sheet.points or [(0.0, 0.0)], margin=60)
+        marks += [Titled("visit", (Disc(p, (4, 4), "#d55e00"),)) for p in sheet.spots]
+    picture = svg_of(Scene(tuple(marks), sheet.unit))
     poses = (
         "corrected poses of the log, which were not read for the map"
         if sheet.is_corrected
@@ -152,29 +163,17 @@ class _Sheet:
         """The index of the drive of a scan."""
         return bisect(self.bounds, scan) - 1
 
-    def on_page(self, point: Sequence[float]) -> Point:
-        return point[0] * self.unit, -point[1] * self.unit
-
-    @property
-    def points(self) -> list[Point]:
-        """All points on the page, for its size."""
-        return [self.on_page(p) for p in (*self.walls.tolist(), *self.poses)]
-
-    def walls_and_way(self) -> Iterator[str]:
+    def walls_and_way(self) -> Iterator[Mark]:
         """Draw the walls as dots, and the way of the robot as lines, one for each drive."""
-        dots = "".join(f"M{x:.0f} {y:.0f}h0" for x, y in map(self.on_page, self.walls))
-        width = max(GRAIN * self.unit, 1.0)
-        yield (
-            f'<path d="{dots}" stroke="{WALL}" stroke-width="{width:.1f}" stroke-linecap="square" '
-            'fill="none"/>'
-        )
+        dots = tuple(((x, y),) for x, y in self.walls.tolist())
+        yield Line(dots, WALL, max(GRAIN * self.unit, 1.0))
         for k, (begin, stop) in enumerate(pairwise(self.bounds)):
-            way = _line(map(self.on_page, self.poses[begin:stop]))
             colour = WAY if len(self.bounds) == 2 else colour_of(k)
-            yield f'<path d="{way}" stroke="{colour}" stroke-opacity=".6" fill="none"/>'
+            way = tuple((x, y) for x, y, _ in self.poses[begin:stop])
+            yield Line((way,), colour, 1.0, 0.6)
 
 
-def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterator[str]:
+def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterator[Mark]:
     """Draw the edges and places of the first map."""
     ssh_map = solution.maps[0]
     places = place_of_steps(ssh_map)
@@ -203,24 +202,21 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
         lines[colour].append(course)
     for colour, courses in lines.items():
         for part in drawn_once(courses):
-            yield (
-                f'<path d="{_line(map(sheet.on_page, part.tolist()))}" stroke="{colour}" '
-                'stroke-width="4" stroke-opacity=".8" stroke-linejoin="round" fill="none"/>'
-            )
-    at = {place: sheet.on_page(middle) for place, middle in middles.items()}
+            yield Line((_points(part),), colour, 4.0, 0.8)
+    at: dict[int, Point] = {p: (float(x), float(y)) for p, (x, y) in middles.items()}
     for place in visits:
         if place in hidden:
-            yield _dot(at[place], 4, EDGE, ssh_map.called("place", place))
+            yield Titled(ssh_map.called("place", place), (Disc(at[place], (4, 4), EDGE),))
     for place in shown:
         step = visit_of.index(visits[place][-1])
         yield from _place(sheet, imported, at[place], step)
     # Numbers and names come last, so that nothing covers them.
     for place in shown:
-        yield from _number(at[place], str(place), doubts.get(place))
+        yield from _number(at[place], str(place), doubts.get(place), 1 / sheet.unit)
     for place in visits:
         if name := ssh_map.name_of("place", place):
             x, y = at[place]
-            yield svg_text(x, y + 18, name, "#222", 11, "bold", halo=True)
+            yield Label((x, y - 18 / sheet.unit), name, size=11, is_bold=True)
 
 
 def _bands(
@@ -228,15 +224,12 @@ def _bands(
     ssh_map: SSHMap,
     middles: Mapping[int, Array],
     edges: Sequence[tuple[int | None, int | None, Array]],
-) -> Iterator[str]:
+) -> Iterator[Mark]:
     """Draw a band for each region behind one place, along the courses between its places."""
     for region, width in banded(ssh_map, BROAD * sheet.unit):
-        here = [middles[p].tolist() for p in region.places if p in middles]
-        ways = [_line([sheet.on_page(middle)] * 2) for middle in here]
+        ways = [_points(middles[p][None]) for p in region.places if p in middles]
         ways += [
-            _line(map(sheet.on_page, course))
-            for first, last, course in edges
-            if {first, last} <= {*region.places}
+            _points(course) for first, last, course in edges if {first, last} <= {*region.places}
         ]
         yield band(region, ways, width)
 
@@ -289,47 +282,36 @@ def drawn_once(courses: Sequence[Array]) -> Iterator[Array]:
         drawn = np.concatenate([drawn, *parts])
 
 
-def _place(sheet: _Sheet, imported: Imported, at: Point, step: int) -> Iterator[str]:
+def _place(sheet: _Sheet, imported: Imported, at: Point, step: int) -> Iterator[Mark]:
     """Draw the disc of a place, and a tick for each open gateway, both by the visit of a step."""
     seen = imported.trace.steps[step]
     radius = max(imported.visits[int(seen.extra["visit"])].radius * sheet.unit, 11.0)
-    x, y = at
-    yield (
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{EDGE}" fill-opacity=".12" '
-        f'stroke="{EDGE}" stroke-opacity=".5"/>'
-    )
+    yield Disc(at, (radius, radius), EDGE, EDGE, 1.0, fill_opacity=0.12)
     for way in Star.of(seen.star or ()).gateways:
         if way.open:
             angle = sheet.headings[step] - math.radians(way.bearing)
-            cos, sin = math.cos(angle), -math.sin(angle)
-            ends = [(x + r * cos, y + r * sin) for r in (radius - 3, radius + 4)]
-            yield f'<path d="{_line(ends)}" stroke="#222" stroke-width="2.5" fill="none"/>'
+            far = [(radius + more) / sheet.unit for more in (-3, 4)]
+            ends = [(at[0] + r * math.cos(angle), at[1] + r * math.sin(angle)) for r in far]
+            yield Line((tuple(ends),), "#222", 2.5)
 
 
-def _number(at: Point, name: str, doubt: float | None) -> Iterator[str]:
-    """Draw the number of a place, and the probability of its most doubtful join."""
-    x, y = at
-    yield (
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="8" fill="white" stroke="#222"/>'
-        + svg_text(x, y, name, "#222", 10, "bold")
-    )
+def _number(at: Point, name: str, doubt: float | None, unit: float) -> Iterator[Mark]:
+    """Draw the number of a place, and the probability of its most doubtful join.
+
+    `unit` is a unit of the page in metres.
+    """
+    yield Disc(at, (8, 8), "white", "#222", 1.0)
+    yield Label(at, name, size=10, is_bold=True)
     if doubt is not None:
-        yield titled(
-            f"a join at place {name} has probability {doubt:.2f}",
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="13" fill="none" stroke="{ALARM}" '
-            'stroke-width="2" stroke-dasharray="4 3"/>',
-            svg_text(x + 26, y - 12, f"{doubt:.2f}", ALARM, 11, "bold"),
-        )
+        ring = Disc(at, (13, 13), "none", ALARM, 2.0, dashes="4 3")
+        beside = at[0] + 26 * unit, at[1] + 12 * unit
+        told = Label(beside, f"{doubt:.2f}", ALARM, 11, is_bold=True)
+        yield Titled(f"a join at place {name} has probability {doubt:.2f}", (ring, told))
 
 
-def _dot(at: Point, radius: float, colour: str, title: str = "visit") -> str:
-    x, y = at
-    return titled(title, f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{colour}"/>')
-
-
-def _line(points: Sequence[Point] | map[Point]) -> str:
-    """Write a polyline as the data of an SVG path."""
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
+def _points(course: Array) -> tuple[Point, ...]:
+    """Convert an array (n, 2) to points."""
+    return tuple((float(x), float(y)) for x, y in course)
 
 
 def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:

@@ -29,7 +29,7 @@ from ssh_abduction.output.export.roads import DIGITS, Road, Roads, Stop
 from ssh_abduction.output.export.tmap2 import tmap2
 from ssh_abduction.output.graphs import in_text, to_graphml, to_networkx
 from ssh_abduction.output.headings import Turns, degrees_of
-from ssh_abduction.output.picture import to_svg
+from ssh_abduction.output.svg import to_svg
 from ssh_abduction.output.undecided import undecided_places
 
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
