@@ -6,7 +6,7 @@ that time, Python may still search the current folder first, and a file there co
 of Python. `__main__` moves that folder to the end of the search path.
 """
 
-from ssh_abduction.runtime.lazy import lazy_names
+from ssh_abduction.runtime.lazy import CARDS, lazy_names
 
 TYPE_CHECKING = False  # as in typing, which takes longer to load than this whole module
 
@@ -37,6 +37,11 @@ if TYPE_CHECKING:
     __version__: str
 
 _load, __dir__ = lazy_names(__name__)
+# Values are below the drawing of their cards. So they find it here, and import nothing above them.
+CARDS.update(
+    SSHMap=("ssh_abduction.output.cards", "map_card"),
+    Trace=("ssh_abduction.output.cards", "trace_card"),
+)
 
 
 def __getattr__(name: str) -> "Any":

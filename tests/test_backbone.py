@@ -36,8 +36,8 @@ from ssh_abduction.solver import (
     map_list,
     prefixes,
 )
+from ssh_abduction.solver.solution.result import summary_of
 from ssh_abduction.solver.solution.sharing import Backbone, Shared
-from ssh_abduction.solver.solution.writing import summary_of
 from ssh_abduction.solver.sources.exact.framed import FramedEngine
 from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
 from ssh_abduction.solver.sources.exact.readable import StepEngine

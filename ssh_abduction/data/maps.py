@@ -37,7 +37,8 @@ from ssh_abduction.data.map_file import (
 from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
 from ssh_abduction.data.regions import Region, renumbered, right_of
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import counted, in_output
+from ssh_abduction.data.words import counted
+from ssh_abduction.runtime.lazy import card_of
 
 # Other modules import the parts of maps from here, too.
 __all__ = ["FAULTS", "DState", "Fault", "Fit", "MapPath", "Name", "Pose", "SSHMap"]
@@ -116,8 +117,7 @@ class SSHMap:
 
     def _repr_html_(self) -> str:
         """Return the map as HTML for notebooks: picture, fit, faults and dstates."""
-        card: str = in_output("map_card")(self)
-        return card
+        return card_of(self)
 
     def place_of(self, step: int) -> int | None:
         """Return the id of the place of a step; None if the map has no places.

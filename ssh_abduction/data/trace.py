@@ -31,7 +31,8 @@ from ssh_abduction.data.odometry import Covariance, Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.step import Step, as_list, of_actions
 from ssh_abduction.data.trace_file import FORMAT, VERSION, read_trace
-from ssh_abduction.data.words import counted, in_output
+from ssh_abduction.data.words import counted
+from ssh_abduction.runtime.lazy import card_of
 
 # Other modules import the parts of traces from here, too.
 __all__ = ["STANDARD_ACTIONS", "Action", "Kind", "Step", "Trace", "TurnDirection", "View"]
@@ -191,8 +192,7 @@ class Trace:
 
     def _repr_html_(self) -> str:
         """Return the first steps as HTML for notebooks."""
-        card: str = in_output("trace_card")(self)
-        return card
+        return card_of(self)
 
     @property
     def views(self) -> tuple[View | None, ...]:

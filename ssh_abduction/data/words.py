@@ -7,9 +7,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import MISSING, fields
-from importlib import import_module
 from typing import Any
 
 from ssh_abduction.data.errors import brief
@@ -92,13 +91,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _plain(part) for key, part in value.items()}
     return [_plain(part) for part in value] if isinstance(value, tuple | list) else value
-
-
-def in_output(name: str) -> Callable[..., Any]:
-    """Load and return the function with this name in `ssh_abduction.output`.
-
-    Maps and traces use this to make HTML for notebooks. It is not imported at the top, because
-    `ssh_abduction.output` imports this package.
-    """
-    function: Callable[..., Any] = getattr(import_module("ssh_abduction.output"), name)
-    return function

@@ -1,4 +1,4 @@
-"""Load each name that a package exports when it is first used.
+"""Load each name that a package exports, and each maker of notebook cards, at its first use.
 
 When this module is loaded, it imports only `sys`, as `ssh_abduction/__init__.py` does.
 """
@@ -48,6 +48,20 @@ def lazy_names(package: str) -> "tuple[Callable[[str], Any], Callable[[], list[s
         return sorted({*vars(sys.modules[package]), *exported()})
 
     return load, names
+
+
+# The function that makes the notebook card of each class of values: its module and its name.
+CARDS: "dict[str, tuple[str, str]]" = {}
+
+
+def card_of(value: "Any") -> str:
+    """Make the HTML of a value for notebooks, with the function that CARDS names for its class."""
+    from importlib import import_module
+
+    kind = next(kind.__name__ for kind in type(value).__mro__ if kind.__name__ in CARDS)
+    module, name = CARDS[kind]
+    html: str = getattr(import_module(module), name)(value)
+    return html
 
 
 def _exports_of(package: str) -> "dict[str, tuple[str, str]]":

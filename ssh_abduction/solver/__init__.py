@@ -50,6 +50,10 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.solution.recorded import trace_in as trace_in
     from ssh_abduction.solver.solution.recorded import warnings_in as warnings_in
     from ssh_abduction.solver.solution.result import Solution as Solution
+    from ssh_abduction.solver.solution.result import ending as ending
+    from ssh_abduction.solver.solution.result import opening as opening
+    from ssh_abduction.solver.solution.result import summary_of as summary_of
+    from ssh_abduction.solver.solution.result import written_map as written_map
     from ssh_abduction.solver.solution.sharing import SORTS as SORTS
     from ssh_abduction.solver.solution.sharing import Backbone as Backbone
     from ssh_abduction.solver.solution.sharing import Shared as Shared
@@ -60,10 +64,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.solution.weighed import EQUAL as EQUAL
     from ssh_abduction.solver.solution.weighed import Weighed as Weighed
     from ssh_abduction.solver.solution.weighed import probability_in_words as probability_in_words
-    from ssh_abduction.solver.solution.writing import ending as ending
-    from ssh_abduction.solver.solution.writing import opening as opening
-    from ssh_abduction.solver.solution.writing import summary_of as summary_of
-    from ssh_abduction.solver.solution.writing import written_map as written_map
     from ssh_abduction.solver.sources.exact.choosing import preload_engine as preload_engine
     from ssh_abduction.solver.start import Limits as Limits
     from ssh_abduction.solver.start import Start as Start
