@@ -26,6 +26,7 @@ from itertools import combinations, pairwise, permutations, product
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from axiom_files import predicates
 from brute_geometry import Geometry
 from scipy.special import chdtri
 
@@ -170,6 +171,7 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
     defeasible = theory.boundary == "defeasible"
     stars = tuple(step.openings if theory.star in ("pattern", "frame") else None for step in trace)
     geometry = Geometry(trace, theory) if "one_pose" in on else None
+    further = [allows for name, allows in predicates().items() if name in on]
     for labels in _labellings(trace, on):
         if "asserted" in on and not _as_asserted(labels, None, theory):
             continue
@@ -183,7 +185,9 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
             continue
         dstates = max(labels) + 1
         if theory.level == "causal":
-            yield (labels, (None,) * dstates, (None,) * dstates), Counts(dstates, 0, 0, 0)
+            found: Key = (labels, (None,) * dstates, (None,) * dstates)
+            if all(allows(trace, theory, found) for allows in further):
+                yield found, Counts(dstates, 0, 0, 0)
             continue
         links = frozenset(
             (s, action, x)
@@ -213,6 +217,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
                 continue
             for courses in _courses(places, links, on):
                 if "path_in_one_piece" in on and not _paths_stay(trace, labels, places, courses):
+                    continue
+                if not all(allows(trace, theory, (labels, places, courses)) for allows in further):
                     continue
                 if headings and not any(
                     _goes_straight(labels, places, courses, h, on) for h in headings

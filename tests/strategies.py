@@ -14,7 +14,7 @@ from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.odometry import Covariance, Odometry, displacement_between
 from ssh_abduction.data.odometry import moved as moved_pose
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
-from ssh_abduction.theory.encodings import axioms
+from ssh_abduction.theory import encodings
 from ssh_abduction.theory.fields import COUNTS, PRICES, Count
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
@@ -37,7 +37,7 @@ PAIRS = ("same", "different", "elsewhere", "same_place")
 # Axioms that may be left out. The others give each dstate one place and one course, and a map
 # cannot show more.
 LEFT_OUT = sorted(
-    {axiom.name for axiom in axioms()}
+    {axiom.name for axiom in encodings.axioms()}
     - {"one_place", "one_course", "one_heading", "turn_rotates", "star_frame", "asserted"}
 )
 
@@ -188,6 +188,11 @@ def _seldom(values: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
     return st.integers(0, 3).flatmap(lambda n: values if n == 3 else st.just(()))
 
 
+def _mostly_default(default: int) -> st.SearchStrategy[int]:
+    """The default of a field that an encoding declares in half of the cases, or 1 to 4."""
+    return st.just(default) | st.integers(1, 4)
+
+
 def step_pairs(steps: int) -> st.SearchStrategy[list[tuple[int, int]]]:
     """Few pairs of steps, mostly none."""
     pairs = [(i, j) for j in range(steps) for i in range(j)]
@@ -197,9 +202,14 @@ def step_pairs(steps: int) -> st.SearchStrategy[list[tuple[int, int]]]:
 def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
     """Values of a field of Theory that suit a topological theory of this trace.
 
-    A field that is missing here fails every test that draws theories.
+    A field of the class that is missing here fails every test that draws theories. Fields that
+    encodings declare are drawn without an entry.
     """
-    return {
+    declared: dict[str, st.SearchStrategy[Any]] = {
+        f.name: st.booleans() if isinstance(f.default, bool) else _mostly_default(f.default)
+        for f in encodings.declared()
+    }
+    choices = {
         "level": st.just("topological"),
         "boundary": st.sampled_from(["none", "strict", "defeasible"]),
         "symmetric_sides": st.booleans(),
@@ -234,7 +244,8 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "different": step_pairs(len(trace)),
         "elsewhere": step_pairs(len(trace)),
         "same_place": _seldom(step_pairs(len(trace))),
-    }[field]
+    }
+    return (choices | declared)[field]
 
 
 @st.composite

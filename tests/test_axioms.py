@@ -7,13 +7,16 @@ import re
 from dataclasses import replace
 from typing import Any
 
+import axiom_table
 import pytest
+from axiom_files import of_each
 from worlds import ACTIONS
 
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.data import Closure
+from ssh_abduction.data import Closure, TheoryError
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.speedups import TABLE
 
 PLAIN = Theory.topological()
 NO_SIDES = PLAIN.replace(boundary="none")
@@ -106,6 +109,7 @@ CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
         ((4, 3, 1), 1),
         ((4, 2, 1), 1),
     ),
+    **of_each("CASE"),
 }
 
 MOVED = {"one_pose": [(0.0, 0.0, -math.pi / 2)]}  # displacements for axioms about them
@@ -178,6 +182,32 @@ def test_a_long_axiom_comment_goes_on_in_indented_lines() -> None:
     assert axiom.sentence == "A sentence that goes on."
     assert axiom.source == "a source; X"
     assert axiom.conditions == ("star=frame",)
+
+
+def test_page_of_the_theory_lists_the_axioms() -> None:
+    text = axiom_table.PAGE.read_text(encoding="utf-8")
+    assert axiom_table.page(text) == text, "run python website/axiom_table.py"
+
+
+def test_an_encoding_declares_fields_of_a_theory() -> None:
+    assert Theory().declared["path_places"] == 0
+    theory = PLAIN.replace(path_places=2)
+    assert Theory.from_dict(theory.to_dict()) == theory
+    assert "path_places" not in PLAIN.to_dict()
+    with pytest.raises(TheoryError, match="path_places: expected a whole number from 0"):
+        PLAIN.replace(path_places=-1)
+
+
+def test_speedups_that_do_not_know_a_declared_field_are_off() -> None:
+    for field in encodings.declared():
+        choices = {field.name: True if isinstance(field.default, bool) else field.default + 1}
+        for base in (PLAIN.replace(star="none"), FRAME, GATEWAYS):
+            theory = base.replace(**choices)
+            new = theory.demands - base.demands
+            assert new
+            for speedup in TABLE:
+                if speedup.keeps is not None and not new <= speedup.keeps():
+                    assert not speedup.holds_for(theory), (field.name, speedup.name)
 
 
 def test_lines_of_encodings_have_at_most_100_characters() -> None:

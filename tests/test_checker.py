@@ -8,6 +8,7 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
+from axiom_files import of_each
 from brute_force import partitions
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -314,6 +315,10 @@ BROKEN = {
         "0:0+^0 1:0+^0 2:0+^0",
         "012",
     ),
+    **{
+        name: case(theory, written(text), *spec)
+        for name, (theory, text, *spec) in of_each("BROKEN").items()
+    },
 }
 HIDDEN = (
     "branch_side",

@@ -43,17 +43,19 @@ from ssh_abduction.checker.reading import Check, Reading
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 COHERENCE = "map_explains_trace"
 
+# The check of an axiom is the function with the name of the axiom in one of these modules.
+_MODULES = (topological, side_axioms, stars, clashes, evidence)
 AXIOMS: dict[str, Check] = {
-    **topological.AXIOMS,
-    **side_axioms.AXIOMS,
-    **stars.AXIOMS,
-    **clashes.AXIOMS,
-    **evidence.AXIOMS,
+    axiom.name: getattr(module, axiom.name)
+    for axiom in encodings.axioms()
+    for module in _MODULES
+    if hasattr(module, axiom.name)
 }
 
 

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.checker.reading import Found, Reading
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.gateways import (
     Sight,
@@ -116,4 +116,9 @@ def _gateways(name: str, m: Reading) -> Found:
             )
 
 
-AXIOMS: dict[str, Check] = {name: partial(_gateways, name) for name in NAMES}
+gateway_frame = partial(_gateways, "gateway_frame")
+gateway_heading = partial(_gateways, "gateway_heading")
+gateway_turn = partial(_gateways, "gateway_turn")
+gateway_dstate = partial(_gateways, "gateway_dstate")
+gateway_path = partial(_gateways, "gateway_path")
+gateway_end = partial(_gateways, "gateway_end")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from ssh_abduction.checker.crossings import Edges
 from ssh_abduction.checker.moves import MapLink, heading_of
-from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.checker.reading import Found, Reading
 from ssh_abduction.checker.stars import stars_of
 from ssh_abduction.data.closure import Closure, match_in_words
 from ssh_abduction.data.groups import minimal_part, parts
@@ -279,18 +279,3 @@ def _may_show_the_same(one: Star, other: Star) -> bool:
         taken_in[linear_sum_assignment(taken_in, maximize=True)].sum()
         == sum(row.sum() for row in seen)
     )
-
-
-AXIOMS: dict[str, Check] = {
-    check.__name__: check
-    for check in (
-        one_star,
-        asserted,
-        closure,
-        one_pose,
-        other_floor,
-        path_in_one_piece,
-        one_landing,
-        planar,
-    )
-}

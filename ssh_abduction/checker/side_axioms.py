@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from ssh_abduction.checker.moves import Course, MapLink, course_of, opposite
-from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.checker.reading import Found, Reading
 from ssh_abduction.data.regions import course_named
 
 
@@ -157,11 +157,8 @@ def _sides(name: str, m: Reading) -> Found:
             yield conflict.steps, conflict.message
 
 
-_NAMES = (
-    "branch_side",
-    "symmetric_sides",
-    "side_of_branch",
-    "sides_disjoint",
-    "path_between_sides",
-)
-AXIOMS: dict[str, Check] = {name: partial(_sides, name) for name in _NAMES}
+branch_side = partial(_sides, "branch_side")
+symmetric_sides = partial(_sides, "symmetric_sides")
+side_of_branch = partial(_sides, "side_of_branch")
+sides_disjoint = partial(_sides, "sides_disjoint")
+path_between_sides = partial(_sides, "path_between_sides")

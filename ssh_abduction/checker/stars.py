@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from ssh_abduction.checker.moves import Course, course_of, heading_of, opposite
-from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.checker.reading import Found, Reading
 from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.drives import ALONE
 from ssh_abduction.data.maps import DState
@@ -169,16 +169,3 @@ def path_goes_straight(m: Reading) -> Found:
                     f"By dstates {b} and {s.id}, {course_named(way)} leaves place {p} through "
                     f"both slots {through} and {slot}.",
                 )
-
-
-AXIOMS: dict[str, Check] = {
-    check.__name__: check
-    for check in (
-        star_pattern,
-        star_frame,
-        one_heading,
-        turn_rotates,
-        one_dstate_per_heading,
-        path_goes_straight,
-    )
-}

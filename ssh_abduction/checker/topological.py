@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 
 from ssh_abduction.checker.moves import Course, course_of, going, opposite
-from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.checker.reading import Found, Reading
 from ssh_abduction.data.groups import reached
 from ssh_abduction.data.regions import course_named
 from ssh_abduction.data.trace import View
@@ -223,26 +223,10 @@ def course_needs_travel(m: Reading) -> Found:
             )
 
 
-AXIOMS: dict[str, Check] = {
-    check.__name__: check
-    for check in (
-        functional_view,
-        deterministic,
-        one_place,
-        turn_stays,
-        travel_leaves,
-        travel_follows_path,
-        one_course,
-        turn_around_reverses,
-        turn_changes_path,
-        one_dstate_per_course,
-        on_path,
-        travel_orders,
-        order_asymmetric,
-        order_transitive,
-        path_order_total,
-        next_place,
-        all_on_paths,
-        course_needs_travel,
-    )
-}
+def path_places(m: Reading) -> Found:
+    """Check that no path has more places than the field path_places allows."""
+    most = m.theory.declared["path_places"]
+    for h in m.orders:
+        if len(places := m.on(h)) > most:
+            steps = [step for p in places for step in m.steps_at(p)]
+            yield steps, f"Path {h} has {len(places)} places, but {most} are allowed."

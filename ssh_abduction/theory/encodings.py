@@ -1,6 +1,7 @@
 """Find the encodings (`.lp` files), and read in their comments what each axiom says.
 
-The comments also say for which theories an axiom holds.
+The comments also say for which theories an axiom holds, and declare the fields of `Theory` that
+switch it on.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 from ssh_abduction.data.files import shipped
 
@@ -19,9 +21,11 @@ _AXIOM = re.compile(
     r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if "
     r"(?P<when>.+))?|(?P<alone>.+))$"
 )
+_FIELD = re.compile(r"^% @field\((?P<name>\w+), (?P<default>false|true|\d+), (?P<help>.+\.)\)$")
 _WHEN = re.compile(r"^% @when (?P<when>.+)$")
 _KEEPS = re.compile(r"^% @keeps (?P<names>.+)$")
 _WITH = re.compile(r"^% @with (?P<names>.+)$")
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,21 @@ class Axiom:
     def has_subject_in(self, choices: Mapping[str, object]) -> bool:
         """Whether a theory with these values of fields has what the axiom is about."""
         return all(_holds(condition, choices) for condition in self.subject)
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of `Theory` that an encoding declares, as `% @field(NAME, DEFAULT, Help.)`.
+
+    Attributes:
+        name: The name.
+        default: True or False for a choice, or a whole number, 0 or more.
+        help: A sentence that says what the value means.
+    """
+
+    name: str
+    default: bool | int
+    help: str
 
 
 def _holds(condition: str, choices: Mapping[str, object]) -> bool:
@@ -105,6 +124,32 @@ def axioms() -> tuple[Axiom, ...]:
 
 
 @cache
+def declared() -> tuple[Field, ...]:
+    """Return the fields of `Theory` that encodings declare, in the order of the files."""
+    found = []
+    for level in levels():
+        for line in _unwrapped((folder() / f"{level}.lp").read_text(encoding="utf-8")):
+            if match := _FIELD.match(line):
+                text = match["default"]
+                default = text == "true" if text in ("true", "false") else int(text)
+                found.append(Field(match["name"], default, match["help"]))
+    return tuple(found)
+
+
+def with_declared_fields(cls: type[_T]) -> type[_T]:
+    """Add the fields that encodings declare to a class, with their help, before it is a dataclass.
+
+    The class keeps the fields of its own text, which type checkers and editors know.
+    """
+    for field in declared():
+        cls.__annotations__[field.name] = type(field.default).__name__
+        setattr(cls, field.name, field.default)
+        if cls.__doc__:
+            cls.__doc__ = f"{cls.__doc__.rstrip()}\n        {field.name}: {field.help}\n    "
+    return cls
+
+
+@cache
 def region_axioms() -> tuple[Axiom, ...]:
     """Return the axioms by which regions follow from a map. Searches for maps do not use them."""
     return tuple(axioms_in(Path(path("regions")).read_text(encoding="utf-8"), "regions"))
@@ -133,10 +178,10 @@ def axioms_in(text: str, level: str) -> list[Axiom]:
 
 
 def _unwrapped(text: str) -> list[str]:
-    """Return the lines of an encoding, with each `% @axiom` comment on one line."""
+    """Return the lines of an encoding, with each `% @axiom` or `% @field` on one line."""
     lines: list[str] = []
     for line in text.splitlines():
-        if lines and lines[-1].startswith("% @axiom(") and line.startswith("%   "):
+        if lines and lines[-1].startswith(("% @axiom(", "% @field(")) and line.startswith("%   "):
             lines[-1] += f" {line.removeprefix('%').strip()}"
         else:
             lines.append(line)

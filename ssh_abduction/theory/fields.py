@@ -229,7 +229,12 @@ def _check_numbers(theory: Theory) -> None:
             f"reject: expected a probability above 0 and below 1, got {brief(theory.reject)}; "
             "take 0.001, or another small one"
         )
-    for name, least, most in (("joint", 1, MOST_JOINT), ("returns", 0, MOST_STEPS)):
+    declared = [field.name for field in encodings.declared() if not isinstance(field.default, bool)]
+    for name, least, most in (
+        ("joint", 1, MOST_JOINT),
+        ("returns", 0, MOST_STEPS),
+        *((name, 0, MOST_STEPS - 1) for name in declared),
+    ):
         value, mend = getattr(theory, name), "take one in this range"
         value = a_whole_number(name, value, TheoryError, least, most, mend=mend)
         object.__setattr__(theory, name, value)

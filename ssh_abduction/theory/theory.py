@@ -52,12 +52,13 @@ SETTLED = ("returns", "unknown_views", "several_drives", "lifts")
 
 
 @dataclass(frozen=True)
+@encodings.with_declared_fields
 class Theory:
     """An immutable choice of axioms and of what to minimise.
 
     Take a preset such as `causal`, change it with `replace`, or set the fields by name.
     docs/explanation/theory.md explains the axioms and their sources. `ssh-abduction theory` prints
-    them.
+    them. Encodings may declare further fields for their axioms (`declared`).
 
     Attributes:
         level: The maps to find: causal ones (dstates only), or topological ones (dstates, places
@@ -248,6 +249,11 @@ class Theory:
         return max(1, round(price * min(max(odds, LEAST_SURE), MOST_SURE)))
 
     @cached_property
+    def declared(self) -> Mapping[str, int]:
+        """The values of the fields that encodings declare, by name."""
+        return {field.name: getattr(self, field.name) for field in encodings.declared()}
+
+    @cached_property
     def axioms(self) -> tuple[str, ...]:
         """The names of the axioms of this theory. Those of the user's own rules come last.
 
@@ -290,10 +296,13 @@ class Theory:
         excusable = {f"{name}, excusable" for name in set(self.axioms) - self.hard}
         asserted = {"asserted same"} if self.same else set()
         rules = {f"the rules of {rules.name}" for rules in self.rules}
+        # A declared field that decides whether an axiom holds is covered by this axiom.
+        decide = {condition for axiom in encodings.axioms() for condition in axiom.conditions}
+        spoken_for = SPOKEN_FOR | (decide & self.declared.keys())
         others = {
             f"the field {f.name}"
             for f in fields(self)
-            if f.name not in SPOKEN_FOR and getattr(self, f.name) != f.default
+            if f.name not in spoken_for and getattr(self, f.name) != f.default
         }
         return self.hard | excusable | asserted | rules | others
 
@@ -401,10 +410,16 @@ class Theory:
         return replace(self, **kept)  # type: ignore[arg-type]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dict of plain data."""
+        """Return the fields as a dict of plain data.
+
+        Fields that encodings declare are left out if they have their defaults. So files do not
+        change when an axiom is added.
+        """
+        unused = {f.name for f in encodings.declared() if getattr(self, f.name) == f.default}
         return {
             k: [list(e) if isinstance(e, tuple) else e for e in v] if isinstance(v, tuple) else v
             for k, v in asdict(self).items()
+            if k not in unused
         }
 
     @classmethod

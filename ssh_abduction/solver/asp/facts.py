@@ -44,6 +44,7 @@ def theory_facts(theory: Theory, paths: int) -> str:
     facts += preferred(theory)
     facts += ["defeasible."] if theory.boundary == "defeasible" else []
     facts += [f"allowed({kind})." for kind in EXCUSED if getattr(theory, kind)]
+    facts += [f"field({name},{int(value)})." for name, value in theory.declared.items() if value]
     return "\n".join(facts)
 
 
