@@ -22,13 +22,13 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.no_map import explain
-from ssh_abduction.robot_logs.log_maps import PATHS
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.fields import PATHS
 from ssh_abduction.theory.settle import settle
 
 DRIFTING = truth.Noise(Odometry(**{**truth.NOISE, "scale": 0.05, "bend": 0.0035}))

@@ -47,6 +47,7 @@ from ssh_abduction.solver import (
     with_correction_warnings,
     with_names,
 )
+from ssh_abduction.theory.fields import PATHS
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
@@ -84,19 +85,6 @@ BACK = 0.01
 # Nothing tells which travels go straight on, so the maps have edges and no paths.
 # The errors of odometry and of matches have heavy tails: two true returns can fit badly together.
 # Their misfit has a price, and does not forbid them (joint=1).
-PATHS = (
-    "one_dstate_per_course",
-    "travel_follows_path",
-    "one_course",
-    "turn_around_reverses",
-    "turn_changes_path",
-    "on_path",
-    "travel_orders",
-    "order_asymmetric",
-    "order_transitive",
-    "path_order_total",
-    "course_needs_travel",
-)
 BARE = Theory.topological().replace(star="none", boundary="none", without=PATHS, joint=1)
 
 

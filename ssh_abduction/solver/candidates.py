@@ -27,6 +27,7 @@ from ssh_abduction.solver.guesses.separate import has_no_frames, separate_map
 from ssh_abduction.solver.guesses.sketch import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
+from ssh_abduction.solver.projecting import projected
 from ssh_abduction.solver.sources.exact import choosing
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
@@ -102,7 +103,8 @@ class Candidates:
 
     def maps_of(self, search: Beam | Joining) -> Iterator[SSHMap]:
         """Yield the maps that a search finds and the checker accepts, in its order."""
-        yield from filter(self._judging.accepts, search.maps())
+        maps = (projected(ssh_map, self._task.theory) for ssh_map in search.maps())
+        yield from filter(self._judging.accepts, maps)
 
     def map_without(self, wrong: Collection[int], most: float = math.inf) -> SSHMap | None:
         """Find a map by a narrow beam if only the displacements to `wrong` steps are wrong.
@@ -304,7 +306,7 @@ class Candidates:
 
     def offer(self, ssh_map: SSHMap) -> None:
         """Keep a map of the whole trace if it is the best so far and the checker accepts it."""
-        ssh_map = self._with_unknown_views(ssh_map)
+        ssh_map = projected(self._with_unknown_views(ssh_map), self._task.theory)
         found = Found.of(ssh_map, self._task.theory)
         if self._known.is_better(found) and self._judging.accepts(ssh_map):
             _log.info(

@@ -11,8 +11,10 @@ from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.projecting import projected
 from ssh_abduction.solver.sources.exact.near import NearMinimal, counted_first
 from ssh_abduction.solver.values import Status
+from ssh_abduction.theory.theory import Theory
 
 # After the last map asked for, look for one more for this many seconds, or for this share of the
 # time so far if that is more. If clingo proves that there is none, the list is complete.
@@ -38,7 +40,7 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
         ends = (1 - PROVING) * (watch.elapsed() + watch.left()) if keeps_time else math.inf
         ends = ends if ends > watch.elapsed() else math.inf
         watch.stage_ends = ends
-        for ssh_map, cost in found:
+        for ssh_map, cost in _without_repeats(found, parts.task.theory):
             if most and known.count == most:
                 known.stopped = "maps limit"
                 return
@@ -56,6 +58,17 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
                 spent = watch.elapsed()
                 watch.stage_ends = min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent))
     known.complete = True
+
+
+def _without_repeats(found: Iterator[Priced], theory: Theory) -> Iterator[Priced]:
+    """Yield each map once, reduced to what the theory speaks of."""
+    given: set[SSHMap] = set()
+    for ssh_map, cost in found:
+        if theory.has_paths:
+            yield ssh_map, cost
+        elif (shown := projected(ssh_map, theory)) not in given:
+            given.add(shown)
+            yield shown, cost
 
 
 def note(parts: Parts, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:

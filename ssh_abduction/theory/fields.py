@@ -87,6 +87,21 @@ SPOKEN_FOR = {
     "different",
     "elsewhere",
 }
+# The axioms that say which paths there are. Without them nothing tells which travels go straight
+# on, so maps have no paths. Other axioms only restrict paths.
+PATHS = (
+    "one_dstate_per_course",
+    "travel_follows_path",
+    "one_course",
+    "turn_around_reverses",
+    "turn_changes_path",
+    "on_path",
+    "travel_orders",
+    "order_asymmetric",
+    "order_transitive",
+    "path_order_total",
+    "course_needs_travel",
+)
 MOST_JOINT = 2  # the most returns that may be tested together
 MOST_STEPS = 2**31  # the numbers of steps are below this: clingo's numbers have 32 bits
 CAUSAL = "Theory.causal() (--theory causal)"  # for error messages

@@ -31,6 +31,7 @@ from ssh_abduction.theory.fields import (
     CAUSAL,
     EXCUSED,
     LAID,
+    PATHS,
     PREFERRED,
     PRICES,
     SPOKEN_FOR,
@@ -273,6 +274,12 @@ class Theory:
             - ({"side_of_branch"} if self.boundary == "defeasible" else set())
             - excused
         )
+
+    @cached_property
+    def has_paths(self) -> bool:
+        """Whether maps have paths: some axiom, or a rule of the user, says which there are."""
+        says = {*PATHS, "next_place", "all_on_paths"}
+        return self.level == "topological" and bool(self.rules or says & {*self.axioms})
 
     @cached_property
     def given_up(self) -> frozenset[str]:

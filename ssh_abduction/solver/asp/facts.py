@@ -75,6 +75,8 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     A path can begin only at the first step of a drive, and where a turn right or left, a lift, or
     an action that slipped ends. If the theory lacks some axioms, there may be a path for each step.
     """
+    if not theory.has_paths:
+        return 0
     if TRAVELS_AND_TURNS & theory.given_up:
         return steps
     return 1 + sum(

@@ -64,6 +64,7 @@ from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.projecting import projected
 from ssh_abduction.solver.solution.weighed import CHANCE, EQUAL, IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.sources.exact.engine import Task
@@ -293,6 +294,7 @@ class Weighing:
 
     def add(self, ssh_map: SSHMap) -> float:
         """Return the cost of a map in nats. Keep the map if it costs little more than the best."""
+        ssh_map = projected(ssh_map, self._parts.task.theory)
         nats = self._misfit.nats_of(ssh_map)
         if self.candidates and nats < self.candidates[0].nats - EQUAL:
             self._improved = self._parts.watch.elapsed()
