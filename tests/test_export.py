@@ -21,10 +21,10 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import DState
+from ssh_abduction.output import export as formats
 from ssh_abduction.output import to_networkx, to_svg
-from ssh_abduction.output.export import formats
-from ssh_abduction.output.export.roads import TURN, Road, Roads, Stop
-from ssh_abduction.output.export.tmap2 import tmap2
+from ssh_abduction.output.export import tmap2
+from ssh_abduction.output.roads import TURN, Road, Roads, Stop
 
 
 def nav2_graph(

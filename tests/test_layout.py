@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
@@ -20,6 +21,7 @@ from ssh_abduction.data import DState, MapError, MapPath
 from ssh_abduction.data.maps import Fault, Fit, Pose
 from ssh_abduction.output import plot, to_networkx, to_pandas, to_svg
 from ssh_abduction.output.layout import Layout, layout
+from ssh_abduction.output.roads import Roads
 
 SIX = streets(
     *((f"{x}{y}", "E", f"{x + 1}{y}") for x in range(5) for y in range(6)),
@@ -342,3 +344,26 @@ def test_table_has_a_row_for_each_step() -> None:
     assert list(table["dstate"]) == list(ssh_map.labels)
     assert list(table["view"]) == list(trace.views)
     assert table["heading"].isna().all()
+
+
+def without_paths(ssh_map: SSHMap) -> SSHMap:
+    """The map as by a theory that gives up all axioms on paths."""
+    dstates = tuple(replace(s, path=None, direction=None) for s in ssh_map.dstates)
+    return replace(ssh_map, paths=(), dstates=dstates, regions=None)
+
+
+def test_map_without_paths_is_laid_out_along_its_travels() -> None:
+    (ssh_map,) = solve(
+        Trace.load(Path(__file__).parent.parent / "examples/notched-rectangle.jsonl")
+    )
+    at = layout(without_paths(ssh_map)).places
+    sides = [math.dist(at[p], at[(p + 1) % 4]) for p in range(4)]
+    assert sides == pytest.approx([1.0] * 4)
+    assert math.dist(at[0], at[2]) == pytest.approx(math.sqrt(2))
+    assert "path" not in re.sub("<path.*?>", "", to_svg(without_paths(ssh_map)))
+    # Both directions of a street are roads, as of a map with paths.
+    roads = [
+        {(road.start, road.end) for road in Roads.of(m, "places").roads}
+        for m in (ssh_map, without_paths(ssh_map))
+    ]
+    assert roads[0] == roads[1]

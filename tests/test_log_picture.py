@@ -19,8 +19,8 @@ from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.output.roads import place_of_steps, undecided_places
 from ssh_abduction.output.scene import ALARM
-from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.robot_logs import log_picture
 from ssh_abduction.robot_logs.edges import STEP, resampled
 from ssh_abduction.robot_logs.log_maps import LogMap, map_log

@@ -59,7 +59,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.data.map_file import write_map
-    from ssh_abduction.output.export.formats import export_doubts, export_map  # loads networkx
+    from ssh_abduction.output.export import export_doubts, export_map  # loads networkx
     from ssh_abduction.rivals.listing import Listing
 
     listing = Listing.load(options.maps)

@@ -293,11 +293,16 @@ class _Drawing:
         course = (s.path,) if whole else (s.path, *self.segments[s.path, self.spot[s.id]])
         return course, 0.0 if s.direction == 1 else math.pi
 
+    def is_walked(self, source: int, target: int) -> bool:
+        """Whether a link between two dstates leads to another spot on the same floor."""
+        same = self.map.dstates[source].floor == self.map.dstates[target].floor
+        return same and self.spot[source] != self.spot[target]
+
     def _streets(self, headings: Mapping[int, float], whole: bool) -> Streets:
         """Find the streets to draw, each with its heading and its share of the costs.
 
         They join neighbours on paths. If only segments are straight, the robot's travels along
-        paths are streets, too.
+        paths are streets, too. In a map without paths, all travels are streets.
         """
         # The heading of direction +1 of each path at each of its spots.
         facing = {
@@ -316,6 +321,10 @@ class _Drawing:
                 way = facing.get((path.id, p), facing.get((path.id, q), 0.0))
                 if is_travelled or (p, q) not in streets:
                     streets[p, q] = way, 1.0 if is_travelled else LOOSE
+        if not self.map.paths:
+            for s, _, x in self.map.links:
+                if self.is_walked(s, x):
+                    streets.setdefault((self.spot[s], self.spot[x]), (headings[s], 1.0))
         # Of two streets between the same spots keep the one with the larger share, else the first.
         kept: dict[tuple[int, int], tuple[float, float]] = {}
         for (p, q), street in sorted(streets.items(), key=lambda street: -street[1][1]):
@@ -328,6 +337,9 @@ class _Drawing:
         graph: nx.Graph[Any] = nx.Graph()
         graph.add_nodes_from(self.spots)
         graph.add_edges_from(pair for path in self.map.paths for pair in pairwise(path.order))
+        if not self.map.paths:
+            links = ((s, x) for s, _, x in self.map.links if self.is_walked(s, x))
+            graph.add_edges_from((self.spot[s], self.spot[x]) for s, x in links)
         packed: dict[int, Point] = {}
         right = 0.0
         for part in nx.connected_components(graph):

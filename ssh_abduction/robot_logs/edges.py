@@ -23,7 +23,7 @@ from scipy.spatial.distance import cdist
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.output.undecided import place_of_steps
+from ssh_abduction.output.roads import place_of_steps
 
 Array = NDArray[np.float64]
 

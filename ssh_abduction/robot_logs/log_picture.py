@@ -34,6 +34,7 @@ from ssh_abduction.data.odometry import Pose, moved
 from ssh_abduction.data.star import Star
 from ssh_abduction.output.layout import fitted_motion
 from ssh_abduction.output.map_scene import band, banded
+from ssh_abduction.output.roads import place_of_steps, undecided_places
 from ssh_abduction.output.scene import (
     ALARM,
     Disc,
@@ -47,7 +48,6 @@ from ssh_abduction.output.scene import (
     escaped,
 )
 from ssh_abduction.output.svg import svg_of
-from ssh_abduction.output.undecided import place_of_steps, undecided_places
 from ssh_abduction.robot_logs.edges import STEP, edges_of, resampled
 from ssh_abduction.solver import Solution
 

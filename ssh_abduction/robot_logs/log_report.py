@@ -19,8 +19,8 @@ from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.files import filled
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.rungs import Rung
+from ssh_abduction.output.roads import place_of_steps
 from ssh_abduction.output.scene import escaped
-from ssh_abduction.output.undecided import place_of_steps
 from ssh_abduction.rivals.drive_joins import joins_of_drives
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.robot_logs.log_picture import SURE, doubtful_joins, figure, paths_mean_something

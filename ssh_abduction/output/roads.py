@@ -1,15 +1,19 @@
-"""Turn a map into stops with positions and directed roads, for navigation programs."""
+"""Turn a map into stops with positions and directed roads, for navigation programs.
+
+Places that the robot only passed, such as corners of a corridor, can be left out.
+"""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Collection
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import groupby, pairwise, product
 from typing import TypeAlias
 
 from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import ids_at
 from ssh_abduction.data.trace import Trace, View
@@ -20,6 +24,7 @@ from ssh_abduction.output.layout import Layout, layout, travelled
 # 0.5 m/s turns by 90 degrees in about a second.
 LEAST, TURN = 0.01, 0.5
 DIGITS = 4  # of coordinates in files, in metres
+NO_PLACES = "level: expected dstates, got places: the map has no places; export its dstates"
 # The action of a road, the path that the road is along, and the direction along this path.
 Way: TypeAlias = tuple[str | None, int | None, int | None]
 
@@ -121,14 +126,10 @@ class Roads:
             MapError: `level` is "places" and the map has none, or there are no roads.
         """
         drawn = layout(ssh_map, turns)
-        if level == "places":
-            if not ssh_map.places:
-                raise MapError(
-                    "level: expected dstates, got places: the map has no places; export its dstates"
-                )
-            stops, ends = _places(ssh_map, drawn), _streets(ssh_map)
-        else:
-            stops, ends = _dstates(ssh_map, drawn), _links(ssh_map)
+        if level == "places" and not ssh_map.places:
+            raise MapError(NO_PLACES)
+        stops = tuple(_stops(ssh_map, drawn, level))
+        ends = _streets(ssh_map) if level == "places" else _links(ssh_map)
         at = {stop.id: (stop.x, stop.y) for stop in stops}
         floor = {stop.id: stop.floor for stop in stops}
         dstates = ssh_map.dstates if level == "dstates" else ()
@@ -194,34 +195,27 @@ def _joined(before: Road, after: Road) -> Road:
     )
 
 
-def _dstates(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
-    """Make a stop for each dstate."""
-    stops = []
-    for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True):
-        views = () if s.view is None else (s.view,)
-        where = ssh_map.name_of("place", s.place), *_regions_at(ssh_map, s.place)
-        stops.append(Stop(s.id, x, y, heading or 0.0, views, s.floor, *where))
-    return tuple(stops)
-
-
-def _places(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
-    """Make a stop for each place."""
-    stops = []
-    for p in ssh_map.places:
-        members = [s for s in ssh_map.dstates if s.place == p]
-        headings = (drawn.dstates[s.id][2] for s in members)
-        heading = next((h for h in headings if h is not None), 0.0)
-        views = tuple(s.view for s in members if s.view is not None)
-        floor = members[0].floor if members else None
-        name, regions = ssh_map.name_of("place", p), _regions_at(ssh_map, p)
-        stops.append(Stop(p, *drawn.places[p], heading, views, floor, name, *regions))
-    return tuple(stops)
-
-
-def _regions_at(ssh_map: SSHMap, place: int | None) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """The ids of the regions that contain a place, and the names of those that have one."""
-    ids = ids_at(ssh_map.regions, place)
-    return ids, tuple(name for r in ids if (name := ssh_map.name_of("region", r)) is not None)
+def _stops(ssh_map: SSHMap, drawn: Layout, level: str) -> Iterator[Stop]:
+    """Make a stop for each place, or for each dstate."""
+    members = gathered((s.place if level == "places" else s.id, s) for s in ssh_map.dstates)
+    for number in ssh_map.places if level == "places" else range(len(ssh_map.dstates)):
+        here = members.get(number, [])
+        x, y = drawn.places[number] if level == "places" else drawn.dstates[number][:2]
+        headings = (drawn.dstates[s.id][2] for s in here)
+        place = here[0].place if here else number
+        regions = ids_at(ssh_map.regions, place)
+        names = (ssh_map.name_of("region", region) for region in regions)
+        yield Stop(
+            number,
+            x,
+            y,
+            next((heading for heading in headings if heading is not None), 0.0),
+            tuple(s.view for s in here if s.view is not None),
+            here[0].floor if here else None,
+            ssh_map.name_of("place", place),
+            regions,
+            tuple(name for name in names if name is not None),
+        )
 
 
 def _links(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
@@ -249,9 +243,12 @@ def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
             ends.setdefault((p, q), (None, path.id, direction))
             ends.setdefault((q, p), (None, path.id, -direction))
     for s, action, x in sorted(ssh_map.links, reverse=True):
-        here, there = ssh_map.dstates[s].place, ssh_map.dstates[x].place
+        one, other = ssh_map.dstates[s], ssh_map.dstates[x]
+        here, there = one.place, other.place
         if here is not None and there is not None and here != there:
             ends[here, there] = _way(ssh_map, s, action, x)
+            if not ssh_map.paths and one.floor == other.floor:
+                ends.setdefault((there, here), (None, None, None))
     return ends
 
 
@@ -259,3 +256,33 @@ def _way(ssh_map: SSHMap, source: int, action: str, target: int) -> Way:
     """The action, path and direction of a link. Path and direction are None if the path changes."""
     here, there = ssh_map.dstates[source], ssh_map.dstates[target]
     return (action, here.path, here.direction) if here.path == there.path else (action, None, None)
+
+
+def place_of_steps(ssh_map: SSHMap) -> list[int | None]:
+    """Return the place of each step of a map."""
+    return [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
+
+
+def undecided_places(ssh_map: SSHMap) -> frozenset[int]:
+    """Find the places that the robot only passed.
+
+    At every visit, the robot came from one of two neighbours and went on to the other. It never
+    turned around at such a place, and never began or ended a drive there.
+    """
+    places, labels = place_of_steps(ssh_map), ssh_map.dstate_at
+    # A drive starts where no action leads from the step before.
+    linked = {(s, x) for s, _, x in ssh_map.links}
+    starts = [t for t, pair in enumerate(pairwise(labels), 1) if pair not in linked]
+    through = defaultdict[int, set[frozenset[int]]](set)
+    ends: set[int] = set()
+    for first, stop in pairwise([0, *starts, len(places)]):
+        drive = [place for place in places[first:stop] if place is not None]
+        stays = [place for place, _ in groupby(drive)]
+        for before, place, after in zip(stays, stays[1:], stays[2:], strict=False):
+            through[place].add(frozenset((before, after)))
+        ends.update(stays[:1], stays[-1:])
+    return frozenset(
+        place
+        for place, pairs in through.items()
+        if place not in ends and len(pairs) == 1 and len(next(iter(pairs))) == 2
+    )

@@ -10,13 +10,23 @@
 Route graphs of Nav2 are GeoJSON (docs.nav2.org, "Navigation2 Route Graph File Formats"). Nodes are
 points, and directed edges are lines. Ids are not negative. Metadata are numbers, texts, truth
 values, or objects of these. Nav2 reads no null and no list of objects in metadata.
+
+Topological maps for LCAS's topological_navigation are tmap2, in YAML. Two versions of that program
+read them. The one for ROS 2 Humble imports the `action` of an edge from nav2_msgs.action and sends
+the `goal` of the edge. In the goal, "$node.pose" is replaced by the pose of the node where the edge
+ends. The later version looks the action up in the `actions` of the map, and takes
+`properties.weight` as the cost of an edge.
 """
 
 from __future__ import annotations
 
+import math
+from datetime import UTC, datetime
 from typing import Any
 
 import networkx as nx
+import numpy as np
+import yaml
 
 from ssh_abduction.data.checks import a_flag, one_of
 from ssh_abduction.data.errors import MapError, brief, is_writable
@@ -24,17 +34,20 @@ from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import only_known
-from ssh_abduction.output.dot import to_dot
-from ssh_abduction.output.export.roads import DIGITS, Road, Roads, Stop
-from ssh_abduction.output.export.tmap2 import tmap2
-from ssh_abduction.output.graphs import in_text, to_graphml, to_networkx
+from ssh_abduction.output.graphs import in_text, to_dot, to_graphml, to_networkx
 from ssh_abduction.output.headings import Turns, degrees_of
+from ssh_abduction.output.roads import DIGITS, NO_PLACES, Road, Roads, Stop, undecided_places
 from ssh_abduction.output.svg import to_svg
-from ssh_abduction.output.undecided import undecided_places
 
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
 FOR_NAVIGATION = ("nav2", "tmap2")  # these need positions
 LEVELS = ("places", "dstates")
+ACTION = "NavigateToPose"
+# Tolerances of goals in metres and radians, from the program's own examples. The robot has to reach
+# the heading of a dstate; at a place, any heading will do.
+NEAR, FACING = 0.3, {"dstates": 0.1, "places": 6.28}
+# The radius in metres of the octagon in which a robot is at a node.
+RADIUS = 0.75
 
 
 def export_map(
@@ -110,9 +123,7 @@ def _roads(ssh_map: SSHMap, level: str, turns: Trace | Turns | None, hide_undeci
 def _graph_of_places(ssh_map: SSHMap, to: str, turns: Trace | Turns | None) -> nx.Graph[Any]:
     """Make the graph of places with numbers or texts. Raises MapError without places."""
     if not ssh_map.places:
-        raise MapError(
-            "level: expected dstates, got places: the map has no places; export its dstates"
-        )
+        raise MapError(NO_PLACES)
     if to == "dot":
         raise MapError(
             "level: expected dstates, got places: DOT has a node for each dstate, and a cluster "
@@ -177,9 +188,9 @@ def nav2(roads: Roads, name: str, frame: str) -> str:
     # All ids must differ, so the ids of edges follow those of nodes.
     first = max(stop.id for stop in roads.stops) + 1
     at = {stop.id: [round(stop.x, DIGITS), round(stop.y, DIGITS)] for stop in roads.stops}
-    nodes = [_feature("Point", at[stop.id], _node(stop, roads, frame)) for stop in roads.stops]
+    nodes = [_feature("Point", at[stop.id], _point(stop, roads, frame)) for stop in roads.stops]
     edges = [
-        _feature("LineString", [at[r.start], at[r.end]], _edge(r, first + i))
+        _feature("LineString", [at[r.start], at[r.end]], _way(r, first + i))
         for i, r in enumerate(roads.roads)
     ]
     return json_line({"type": "FeatureCollection", "name": name, "features": nodes + edges})
@@ -193,7 +204,7 @@ def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> d
     }
 
 
-def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
+def _point(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
     metadata = {
         "level": roads.level,
         "metric": roads.metric,
@@ -204,7 +215,7 @@ def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
     return {"id": stop.id, "frame": frame, "metadata": metadata}
 
 
-def _edge(road: Road, number: int) -> dict[str, Any]:
+def _way(road: Road, number: int) -> dict[str, Any]:
     """Make an edge. Its metadata leave out what is unknown, as Nav2 reads no null."""
     way = {"action": road.action, "path": road.path, "direction": road.direction}
     metadata = {"travelled": road.action is not None, **only_known(**way, path_name=road.name)}
@@ -215,3 +226,138 @@ def _edge(road: Road, number: int) -> dict[str, Any]:
         "cost": round(road.cost, DIGITS),
         "metadata": metadata,
     }
+
+
+def tmap2(roads: Roads, name: str, frame: str) -> str:
+    """Write a map as the YAML text of a topological map.
+
+    `name` names the map and its pointset, `frame` the coordinate frame of the positions.
+    """
+    title = {"places": "place", "dstates": "dstate"}[roads.level]
+    names = {stop.id: f"{title}-{stop.id}" for stop in roads.stops}
+    if roads.level == "places":  # programs go to a place by its name
+        own = {stop.id: stop.name for stop in roads.stops if stop.name is not None}
+        names |= {number: name for number, name in own.items() if name not in names.values()}
+    leaving: dict[int, list[Road]] = {stop.id: [] for stop in roads.stops}
+    for road in roads.roads:
+        leaving[road.start].append(road)
+    # Edges name their action, which the map describes once.
+    data = {
+        "meta": {
+            "last_updated": datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S"),
+            "positions": "metres" if roads.metric else "layout",
+        },
+        "metric_map": name,
+        "name": name,
+        "pointset": name,
+        "transformation": {
+            "rotation": _rotation(0.0),
+            "translation": {"x": 0.0, "y": 0.0, "z": 0.0},
+            "child": "topo_map",
+            "parent": frame,
+        },
+        "actions": {ACTION: _action()},
+        "nodes": [
+            _node(stop, leaving[stop.id], names, name, frame, FACING[roads.level])
+            for stop in roads.stops
+        ],
+    }
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=2**16)
+    return text
+
+
+def _action() -> dict[str, Any]:
+    """Describe the action of all edges, for the later version, which looks it up in the map."""
+    return {
+        "action_type": f"nav2_msgs.action.{ACTION}",
+        "action_server": "/navigate_to_pose",
+        "composable": False,
+        "action_goal_template": {
+            "pose": {"header": {"frame_id": "${node.nav_frame}"}, "pose": "${node.pose}"}
+        },
+    }
+
+
+def _node(
+    stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str, frame: str, facing: float
+) -> dict[str, Any]:
+    """Make a node with its goal tolerances, the octagon around it, and the edges from it."""
+    corners = [math.tau * (i + 0.5) / 8 for i in range(8)]
+    return {
+        "meta": {"map": pointset, "node": names[stop.id], "pointset": pointset},
+        "node": {
+            "name": names[stop.id],
+            "parent_frame": frame,
+            "localise_by_topic": "",
+            "pose": {
+                "position": {"x": _rounded(stop.x), "y": _rounded(stop.y), "z": 0.0},
+                "orientation": _rotation(stop.heading),
+            },
+            "properties": {
+                "xy_goal_tolerance": NEAR,
+                "yaw_goal_tolerance": facing,
+                **stop.properties,
+                **only_known(place_name=stop.name, floor=stop.floor),
+            },
+            "restrictions_planning": "True",
+            "restrictions_runtime": "True",
+            "verts": [
+                {"x": _rounded(RADIUS * math.cos(a)), "y": _rounded(RADIUS * math.sin(a))}
+                for a in corners
+            ],
+            "edges": [_edge(road, names) for road in leaving],
+        },
+    }
+
+
+def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
+    """Make an edge that both versions of the program read."""
+    return {
+        "edge_id": f"{names[road.start]}_{names[road.end]}",
+        "node": names[road.end],
+        "action": ACTION,
+        "action_type": f"nav2_msgs/action/{ACTION}",
+        "config": [],
+        "fail_policy": "fail",
+        "fluid_navigation": True,
+        "goal": {
+            "target_pose": {"header": {"frame_id": "$node.parent_frame"}, "pose": "$node.pose"}
+        },
+        "recovery_behaviours_config": "",
+        "restrictions_planning": "True",
+        "restrictions_runtime": "True",
+        "properties": {
+            "weight": _rounded(road.length),
+            "length": _rounded(road.length),
+            "travelled": road.action is not None,
+            **only_known(robot_action=road.action, path_name=road.name),
+        },
+    }
+
+
+def _rotation(heading: float) -> dict[str, float]:
+    """Convert a heading in radians to a quaternion."""
+    return {
+        "w": _rounded(math.cos(heading / 2), 6),
+        "x": 0.0,
+        "y": 0.0,
+        "z": _rounded(math.sin(heading / 2), 6),
+    }
+
+
+def _rounded(number: float, digits: int = DIGITS) -> float:
+    """Round a number, and turn -0.0 into 0.0."""
+    return round(number, digits) + 0.0
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes numbers with a decimal point and no exponent, because PyYAML reads 4e-06 as text."""
+
+
+_Dumper.add_multi_representer(str, _Dumper.represent_str)  # also texts of numpy
+_Dumper.add_representer(
+    float,
+    lambda dumper, number: dumper.represent_scalar(
+        "tag:yaml.org,2002:float", np.format_float_positional(number, trim="0")
+    ),
+)
