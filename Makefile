@@ -2,15 +2,20 @@
 # make bench  time and memory on this machine, ours and those of peers from PyPI, as a table; the better part of an hour
 # make bench-faults  the same of faults: are they found, by ours and by peers; some hours, or ARGS="--seeds 2 --limit 10"
 # make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
-# make parts  times of single parts: images, exploring step by step, and small traces
+# make parts  times of single parts: images, and exploring step by step
 # make docs   the pages of docs/ and a page for each public name as a site, with its links checked; open site/index.html
 # make test   lint, types, layers and tests, with the development tools in .venv; make test-all also runs slow tests
+# make quick  the tests of axioms, brute force, properties, tables, checker and speed-ups, in less than a minute
+# make lines  lines of code and modules of each package, without docstrings and comments
 PYTHON ?= python3
 BIN := .venv/bin
 export PIP_CONSTRAINT := $(CURDIR)/requirements.lock
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test test-all lint style types unit docs bench bench-faults bench-grid parts lock clean
+# The tests that tell most about a change of an axiom or of the solver.
+QUICK := $(addprefix tests/test_,axioms.py brute_force.py property.py tables.py checker.py speedups.py)
+
+.PHONY: demo test test-all quick lint style types unit docs bench bench-faults bench-grid parts lines lock clean
 
 demo: .venv/base
 	$(BIN)/python examples/demo.py out
@@ -23,6 +28,9 @@ test: style
 # Also the tests that take several seconds each.
 test-all: style
 	@$(MAKE) --no-print-directory -j2 types unit
+
+quick: .venv/dev
+	$(BIN)/pytest -n auto --dist worksteal -m "not slow" $(QUICK)
 
 lint: style types
 
@@ -53,7 +61,9 @@ bench-grid: .venv/base
 parts: .venv/dev
 	$(BIN)/python benchmarks/images.py
 	$(BIN)/python benchmarks/online.py
-	$(BIN)/python benchmarks/conformance.py
+
+lines:
+	@$(PYTHON) benchmarks/lines.py
 
 lock: .venv/dev
 	$(BIN)/python -m uv pip compile --upgrade --universal --no-header --no-annotate --extra dev --extra bench --python-version 3.11 -o requirements.lock pyproject.toml

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import bench
-import conformance
 import pruning
 import pytest
 import readme
@@ -80,13 +79,6 @@ def test_peer_words_ask_for_a_view_bit_by_bit() -> None:
         [([], False), (["2"], False)],
         [(["0", "1"], False), (["0", "1", "2"], True)],
     ]
-
-
-def test_conformance_cases_hold_the_table_traces() -> None:
-    found = conformance.cases()
-    assert len(found) > 150
-    assert {theory.level for _, theory in found} == {"causal", "topological"}
-    assert 0 < conformance.milliseconds(*found[0]) < 1000
 
 
 def test_benchmark_cell_has_all_fields() -> None:
