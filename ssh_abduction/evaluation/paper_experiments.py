@@ -12,10 +12,10 @@ work.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -343,149 +343,108 @@ def _driven(notch: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDA
     return means, poses - means, truth
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A claim about an experiment."""
+class Claim(NamedTuple):
+    """A claim about an experiment, and what came out in one run."""
 
     text: str  # the claim
     paper: str  # the value in the paper
-    here: Callable[[SeedRun], str]  # a function that writes the value of a run as text
-    holds: Callable[[SeedRun], bool]  # a function that tells whether the claim holds in a run
+    here: str  # the value of the run
+    holds: bool  # whether the claim holds in the run
     # Whether the claim is not in the paper. Then it follows from the argument of the paper, or it
     # is about this robot alone.
     ours: bool = False
 
 
-def claims(name: str) -> list[Claim]:
+def claims(name: str, run: SeedRun) -> list[Claim]:
     """List the claims of the paper about "notched-rectangle" or "taylor-hall", and our own."""
-    e = EXPERIMENTS[name]
-    triple = f"{e.dstates}, {e.places}, {e.paths}"
-    counts = {"dstates": e.dstates, "places": e.places, "paths": e.paths}
-    right = FoundMaps(counts, maps=1)
+    e, views, labels, without = EXPERIMENTS[name], run.clustering, run.labelling, run.contrast
+    quality, uncertainty = views.quality[views.k], views.uncertainty[views.k]
+    is_determined = uncertainty > 1 - 1e-9
+    counts = f"{e.dstates}, {e.places}, {e.paths}"
+    right = FoundMaps({"dstates": e.dstates, "places": e.places, "paths": e.paths}, maps=1)
     if name == "notched-rectangle":
-        largest = Claim(
-            "largest k with U = 1",
-            "the same k",
-            lambda r: str(r.clustering.largest_k),
-            lambda r: r.clustering.largest_k == r.clustering.k,
-        )
+        largest = "largest k with U = 1", "the same k"
+        is_largest = views.largest_k == views.k
     else:
         higher = "higher k would still have been free of variability: largest k with U = 1"
-        largest = Claim(
-            higher,
-            f"above {e.views}",
-            lambda r: str(r.clustering.largest_k),
-            lambda r: r.clustering.largest_k > r.clustering.k,
-        )
+        largest = higher, f"above {e.views}"
+        is_largest = views.largest_k > views.k
+    alone, even = without.alone_uncertainty, without.even_uncertainty
+    rates = [run.rates[kind] for kind in ("clustering alone", "map", "truth")]
+    first, last = (1000 * max(run.spread[tour][:2]) for tour in (0, -1))
     return [
         Claim(
             f"k chosen by M, {'400' if e.views == 4 else '240'} images",
             str(e.views),
-            lambda r: str(r.clustering.k),
-            lambda r: r.clustering.k == e.views,
+            str(views.k),
+            views.k == e.views,
         ),
-        Claim(
-            "U at that k",
-            "1",
-            lambda r: f"{_uncertainty(r):.3f}",
-            lambda r: _uncertainty(r) > 1 - 1e-9,
-        ),
-        largest,
+        Claim("U at that k", "1", f"{uncertainty:.3f}", is_determined),
+        Claim(*largest, str(views.largest_k), is_largest),
         Claim(
             "dstates, places, paths, from the views alone",
-            triple,
-            lambda r: _triple(r.by_views),
-            lambda r: r.by_views == right,
+            counts,
+            _counts(run.by_views),
+            run.by_views == right,
         ),
         Claim(
             "the same, with the openings seen at each place",
-            triple,
-            lambda r: _triple(r.by_stars),
-            lambda r: r.by_stars == right,
+            counts,
+            _counts(run.by_stars),
+            run.by_stars == right,
             ours=True,
         ),
         Claim(
             "labels from the views alone are the true dstates",
             "yes",
-            lambda r: "yes" if r.labelling.right else "no",
-            lambda r: r.labelling.right,
+            "yes" if labels.right else "no",
+            labels.right,
         ),
         Claim(
             "dstates that share a view are told apart",
             "yes",
-            lambda r: f"{r.labelling.told_apart} of {r.labelling.aliased} pairs",
-            lambda r: r.labelling.told_apart == r.labelling.aliased > 0,
+            f"{labels.told_apart} of {labels.aliased} pairs",
+            labels.told_apart == labels.aliased > 0,
         ),
         Claim(
             "nearest neighbour on abduced labels, all images",
             "100 %",
-            lambda r: f"{100 * r.curve.mean[-1]:.1f} %",
-            lambda r: r.curve.mean[-1] > 0.9999,
+            f"{100 * run.curve.mean[-1]:.1f} %",
+            run.curve.mean[-1] > 0.9999,
         ),
         Claim(
             "clustering alone, k = number of dstates: U < 1 or dstates share views",
             "yes",
-            lambda r: (
-                f"U {r.contrast.alone_uncertainty:.3f}, {r.contrast.alone_distinct} of {e.dstates} "
-                f"distinct; M {r.clustering.quality[e.dstates]:.1f} against {_quality(r):.1f}"
-            ),
-            lambda r: (
-                r.contrast.alone_uncertainty < 1 - 1e-9 or r.contrast.alone_distinct < e.dstates
-            ),
+            f"U {alone:.3f}, {without.alone_distinct} of {e.dstates} distinct; "
+            f"M {views.quality[e.dstates]:.1f} against {quality:.1f}",
+            alone < 1 - 1e-9 or without.alone_distinct < e.dstates,
             ours=True,
         ),
         Claim(
             "images at even distances, same k: M and U drop",
             "yes",
-            lambda r: (
-                f"M {_quality(r):.1f} to {r.contrast.even_quality:.2f}, "
-                f"U to {r.contrast.even_uncertainty:.2f}"
-            ),
-            lambda r: (
-                r.contrast.even_quality < _quality(r)
-                and r.contrast.even_uncertainty < _uncertainty(r) - 1e-9
-            ),
+            f"M {quality:.1f} to {without.even_quality:.2f}, U to {even:.2f}",
+            without.even_quality < quality and even < uncertainty - 1e-9,
             ours=True,
         ),
         Claim(
             "recognition by clusters, by map, by truth: first below, the others equal",
             "yes",
-            lambda r: (
-                ", ".join(
-                    f"{100 * r.rates[kind]:.1f}" for kind in ("clustering alone", "map", "truth")
-                )
-                + " %"
-            ),
-            lambda r: (
-                r.rates["clustering alone"] < r.rates["map"] - 0.02
-                and abs(r.rates["map"] - r.rates["truth"]) < 0.01
-            ),
+            ", ".join(f"{100 * rate:.1f}" for rate in rates) + " %",
+            rates[0] < rates[1] - 0.02 and abs(rates[1] - rates[2]) < 0.01,
             ours=True,
         ),
         Claim(
             "errors do not add up: largest offset from a dstate, last tour against first",
             "no growth",
-            lambda r: (
-                f"{1000 * max(r.spread[-1][:2]):.0f} mm "
-                f"against {1000 * max(r.spread[0][:2]):.0f} mm"
-            ),
-            lambda r: _trend(r) < 0.5,
+            f"{last:.0f} mm against {first:.0f} mm",
+            _trend(run) < 0.5,
             ours=True,
         ),
     ]
 
 
-def _quality(run: SeedRun) -> float:
-    """Return M at the chosen number of views."""
-    return run.clustering.quality[run.clustering.k]
-
-
-def _uncertainty(run: SeedRun) -> float:
-    """Return U at the chosen number of views."""
-    return run.clustering.uncertainty[run.clustering.k]
-
-
-def _triple(found: FoundMaps) -> str:
+def _counts(found: FoundMaps) -> str:
     """Write the numbers of dstates, places and paths, and the number of maps if it is not 1."""
     cost = found.cost
     if cost is None:
@@ -507,14 +466,15 @@ def summary(name: str, runs: Sequence[SeedRun]) -> list[dict[str, Any]]:
     A row has the value in the paper, the value for each seed, and the number of runs in which
     the claim holds.
     """
+    seeds = [str(run.seed) for run in runs]
     return [
         {
-            "claim": claim.text,
-            "ours": claim.ours,
-            "paper": claim.paper,
-            "here": {str(run.seed): claim.here(run) for run in runs},
-            "holds": sum(claim.holds(run) for run in runs),
+            "claim": same[0].text,
+            "ours": same[0].ours,
+            "paper": same[0].paper,
+            "here": dict(zip(seeds, (claim.here for claim in same), strict=True)),
+            "holds": sum(claim.holds for claim in same),
             "seeds": len(runs),
         }
-        for claim in claims(name)
+        for same in zip(*(claims(name, run) for run in runs), strict=True)
     ]

@@ -12,7 +12,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from joblib import effective_n_jobs
+from joblib import Parallel, delayed
+from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from perception.images import images_of
 from simulator.driver import STILL, Tolerance
@@ -37,7 +38,6 @@ from ssh_abduction.evaluation.paper_experiments import (
 )
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output import to_svg
-from ssh_abduction.solver import workers
 
 # Depths of the notch in metres.
 NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)
@@ -104,33 +104,13 @@ def reproduce(
 
 def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
     """Yield the results of `work` for these tasks, in their order, from `jobs` processes."""
-    processes = min(effective_n_jobs(jobs), len(tasks))
-    ready: dict[int, Any] = {}  # results that wait for earlier ones
-    turn = 0
-    numbered = [(number, work, task) for number, task in enumerate(tasks)]
-    for answer in workers.answers(_done, numbered, processes, lambda: False, None, 0.0):
-        if isinstance(answer, workers.Lost):
-            raise AbductionError(
-                "process: expected an answer, got a killed process (when memory runs out); "
-                "take fewer --jobs"
-            )
-        number, ready[number] = answer
-        while turn in ready:
-            result = ready.pop(turn)
-            if isinstance(result, Exception):
-                raise result
-            yield result
-            turn += 1
-
-
-def _done(
-    number: int, work: Callable[..., Any], task: tuple[Any, ...], _: Callable[[], bool]
-) -> tuple[int, Any]:
-    """Do a task in a worker process. Return its number, and the result or the exception."""
     try:
-        return number, work(*task)
-    except Exception as error:
-        return number, error
+        yield from Parallel(jobs, return_as="generator")(delayed(work)(*task) for task in tasks)
+    except TerminatedWorkerError:
+        raise AbductionError(
+            "process: expected an answer, got a killed process (when memory runs out); "
+            "take fewer --jobs"
+        ) from None
 
 
 def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:
