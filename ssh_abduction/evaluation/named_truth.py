@@ -39,6 +39,8 @@ from ssh_abduction.data.maps import SSHMap, check_labels, checked_map, checked_m
 from ssh_abduction.data.trace import Trace, View, checked_trace
 from ssh_abduction.data.words import attributes_of, counted
 
+_SORTS = ("dstate", "place", "path", "course")
+
 
 @dataclass(frozen=True, slots=True)
 class MapEvaluation:
@@ -218,9 +220,6 @@ class _Truth:
                     )
 
 
-_SORTS = ("dstate", "place", "path", "course")
-
-
 def _names_in(value: Any, where: str) -> dict[str, Hashable]:
     """Return the true names of a step by sort (dstate, place, path, course). Raises TraceError.
 
@@ -278,29 +277,19 @@ def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
     courses = _Sort([None if s.path is None else (s.path, s.direction) for s in at], truth.courses)
     actions = truth.trace.actions
     # An edge joins two places either way; a link has an action and a direction.
-    place_precision, place_recall = places.pairs()
-    edge_precision, edge_recall = places.edges(
-        [t for t in _hops(truth.places) if actions[t].kind == "travel"],
-        lambda _, here, there: frozenset((here, there)),
-    )
-    link_precision, link_recall = dstates.edges(
-        [t for t in _hops(truth.dstates) if not actions[t].starts],
-        lambda t, here, there: (here, actions[t].name, there),
-    )
+    travels = [t for t in _hops(truth.places) if actions[t].kind == "travel"]
+    moves = [t for t in _hops(truth.dstates) if not actions[t].starts]
     return MapEvaluation(
-        dstates_right=dstates.right,
-        places_right=places.right,
-        paths_right=False if courses.right is False else paths.right,
-        accuracy=dstates.accuracy,
-        place_precision=place_precision,
-        place_recall=place_recall,
-        edge_precision=edge_precision,
-        edge_recall=edge_recall,
-        link_precision=link_precision,
-        link_recall=link_recall,
-        dstates=dstates.count,
-        places=places.count,
-        paths=paths.count,
+        dstates.right,
+        places.right,
+        False if courses.right is False else paths.right,
+        dstates.accuracy,
+        *places.pairs(),
+        *places.edges(travels, lambda _, here, there: frozenset((here, there))),
+        *dstates.edges(moves, lambda t, here, there: (here, actions[t].name, there)),
+        dstates.count,
+        places.count,
+        paths.count,
     )
 
 

@@ -37,6 +37,10 @@ from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.solver import Solution, solve
 from ssh_abduction.theory.theory import Theory
 
+# The paper's robot has no odometry that would distinguish places.
+VIEWS_ALONE = Theory.topological().replace(star="none", displacement="none")
+WITH_STARS = Theory.topological().replace(displacement="none")
+
 
 @dataclass(frozen=True)
 class PaperExperiment:
@@ -59,9 +63,6 @@ EXPERIMENTS = {
         "taylor-hall", tours=10, k_max=24, views=10, dstates=20, places=7, paths=4
     ),
 }
-# The paper's robot has no odometry that would distinguish places.
-VIEWS_ALONE = Theory.topological().replace(star="none", displacement="none")
-WITH_STARS = Theory.topological().replace(displacement="none")
 
 
 @dataclass(frozen=True)

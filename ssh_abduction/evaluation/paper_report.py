@@ -45,6 +45,79 @@ NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
 
+# How the experiments differ from the paper's. Only its text was at hand, not its pages.
+DIFFERENCES = {
+    "notched-rectangle": (
+        "The notch: the paper's room has its notch at a corner; here it is a recess in a wall, "
+        "1.2 m wide and 3 cm deep. Notches at a corner are in docs/measurements/reproduction.md.",
+        "The room: 4 m by 2 m, with the robot 0.6 m from the walls, is a choice of ours. In a room "
+        "a tenth longer and wider M chooses another k.",
+        "The images: each is the median of nine scans, beam by beam. With single scans, lost beams "
+        "among them, M chooses another k.",
+        "As in the paper: 50 circuits of 8 dstates, 400 images.",
+    ),
+    "taylor-hall": (
+        "The hallway: the paper draws its shape, and gives no lengths. Here a main street of four "
+        "places has three dead ends to one side; counts of dstates, places and paths are the "
+        "paper's.",
+        "The clutter, and all lengths, are choices of ours.",
+        "The images: each is the median of nine scans, beam by beam.",
+        "As in the paper: 10 tours of 24 images at 20 dstates, 240 images.",
+    ),
+}
+VIEWS = (
+    "views.png",
+    "Ours: the views. Images of each cluster on top of each other, the robot at the triangle, "
+    "facing up.",
+)
+SPREAD = (
+    "spread.png",
+    "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by tour.",
+)
+FIGURES = {
+    "notched-rectangle": [
+        (
+            "world.png",
+            "Figure 2: the notched rectangle. Walls, true dstates (arrows) and where images were "
+            "taken.",
+        ),
+        VIEWS,
+        ("quality.png", "Figure 3: M and U against the number of clusters."),
+        ("map.svg", "Ours: the minimal map, from the views alone."),
+        (
+            "learning.png",
+            "Figure 4: recognition rate on the map's labels, mean and range over ten folds.",
+        ),
+        SPREAD,
+        (
+            "outcomes.png",
+            "Ours: where the method works. Frames: all as in the paper (4 views, U = 1, right map, "
+            "full recognition). Cross: this robot.",
+        ),
+    ],
+    "taylor-hall": [
+        (
+            "world.png",
+            "Figure 5: the hallway. Walls, clutter (orange), true dstates (arrows) and where "
+            "images were taken.",
+        ),
+        VIEWS,
+        ("quality.png", "Figure 6, left: M and U against the number of clusters."),
+        ("map.svg", "Ours: the minimal map, from the views alone."),
+        (
+            "map-with-openings.svg",
+            "Ours: the minimal map when the openings that the robot saw at each place are used "
+            "too.",
+        ),
+        (
+            "learning.png",
+            "Figure 6, right: recognition rate on the map's labels, mean and range over ten folds.",
+        ),
+        SPREAD,
+    ],
+}
+
+
 def reproduce(
     name: str,
     seeds: Sequence[int],
@@ -160,80 +233,6 @@ def _configuration(name: str, seeds: Sequence[int], outcomes: bool) -> dict[str,
 
 def _dump(path: Path, value: Any) -> None:
     write_file(path, f"{json.dumps(value, indent=1, ensure_ascii=False)}\n".encode())
-
-
-# How the experiments differ from the paper's. Only its text was at hand, not its pages.
-DIFFERENCES = {
-    "notched-rectangle": (
-        "The notch: the paper's room has its notch at a corner; here it is a recess in a wall, "
-        "1.2 m wide and 3 cm deep. Notches at a corner are in docs/measurements/reproduction.md.",
-        "The room: 4 m by 2 m, with the robot 0.6 m from the walls, is a choice of ours. In a room "
-        "a tenth longer and wider M chooses another k.",
-        "The images: each is the median of nine scans, beam by beam. With single scans, lost beams "
-        "among them, M chooses another k.",
-        "As in the paper: 50 circuits of 8 dstates, 400 images.",
-    ),
-    "taylor-hall": (
-        "The hallway: the paper draws its shape, and gives no lengths. Here a main street of four "
-        "places has three dead ends to one side; counts of dstates, places and paths are the "
-        "paper's.",
-        "The clutter, and all lengths, are choices of ours.",
-        "The images: each is the median of nine scans, beam by beam.",
-        "As in the paper: 10 tours of 24 images at 20 dstates, 240 images.",
-    ),
-}
-
-VIEWS = (
-    "views.png",
-    "Ours: the views. Images of each cluster on top of each other, the robot at the triangle, "
-    "facing up.",
-)
-SPREAD = (
-    "spread.png",
-    "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by tour.",
-)
-FIGURES = {
-    "notched-rectangle": [
-        (
-            "world.png",
-            "Figure 2: the notched rectangle. Walls, true dstates (arrows) and where images were "
-            "taken.",
-        ),
-        VIEWS,
-        ("quality.png", "Figure 3: M and U against the number of clusters."),
-        ("map.svg", "Ours: the minimal map, from the views alone."),
-        (
-            "learning.png",
-            "Figure 4: recognition rate on the map's labels, mean and range over ten folds.",
-        ),
-        SPREAD,
-        (
-            "outcomes.png",
-            "Ours: where the method works. Frames: all as in the paper (4 views, U = 1, right map, "
-            "full recognition). Cross: this robot.",
-        ),
-    ],
-    "taylor-hall": [
-        (
-            "world.png",
-            "Figure 5: the hallway. Walls, clutter (orange), true dstates (arrows) and where "
-            "images were taken.",
-        ),
-        VIEWS,
-        ("quality.png", "Figure 6, left: M and U against the number of clusters."),
-        ("map.svg", "Ours: the minimal map, from the views alone."),
-        (
-            "map-with-openings.svg",
-            "Ours: the minimal map when the openings that the robot saw at each place are used "
-            "too.",
-        ),
-        (
-            "learning.png",
-            "Figure 6, right: recognition rate on the map's labels, mean and range over ten folds.",
-        ),
-        SPREAD,
-    ],
-}
 
 
 def _page(name: str, runs: Sequence[SeedRun], table: Sequence[dict[str, Any]], folder: Path) -> str:

@@ -51,6 +51,39 @@ _PREFERRED = (
 )
 
 
+# Axioms about actions. Their violation at a step is caused by the action before the step.
+OF_ACTIONS = EXCUSED["slipped"] | {"branch_side"}
+_WORDS = {
+    "one_dstate": "steps {0} and {1} {are} one dstate",
+    "two_dstates": "steps {0} and {1} {are} different dstates",
+    "one_place": "steps {0} and {1} {are} at one place",
+    "two_places": "steps {0} and {1} {are} at different places",
+    "along": "step {0} {is} along a path",
+    "along_none": "step {0} {is} along no path",
+    "one_course": "steps {0} and {1} {are} along one path in the same direction",
+    "opposite": "steps {0} and {1} {are} along one path in opposite directions",
+    "two_paths": "steps {0} and {1} {are} along different paths",
+    "on": "step {0} {is} at a place on {path1}",
+    "ahead": "the place of step {1} {is} ahead of the place of step {0} on {path2}",
+    "branch_right": "{path1} {leaves} to the right of {path0}",
+    "branch_left": "{path1} {leaves} to the left of {path0}",
+    "right": "step {0} {is} at a place to the right of {path1}",
+    "left": "step {0} {is} at a place to the left of {path1}",
+    "turned": "steps {0} and {1} {are} at one place, and step {1} {faces} {turn} step {0}",
+}
+# Conclusions about two steps that read the same in either order.
+_SYMMETRIC = frozenset(
+    ("one_dstate", "two_dstates", "one_place", "two_places", "one_course", "opposite", "two_paths")
+)
+# How a step faces relative to another step, if it is turned 0, 1, 2 or 3 quarters clockwise.
+_TURNED = (
+    "the same way as",
+    "a quarter to the right of",
+    "the opposite way of",
+    "a quarter to the left of",
+)
+
+
 @dataclass(frozen=True)
 class _Line:
     """A line of an argument: the conclusions that follow from its links and the lines before it.
@@ -374,40 +407,6 @@ class Argument:
 def _active(links: Iterable[tuple[str, int]]) -> list[clingo.Symbol]:
     """Return the atoms that switch on these links."""
     return [facts.active(axiom, t) for axiom, t in links]
-
-
-# Axioms about actions. Their violation at a step is caused by the action before the step.
-OF_ACTIONS = EXCUSED["slipped"] | {"branch_side"}
-
-_WORDS = {
-    "one_dstate": "steps {0} and {1} {are} one dstate",
-    "two_dstates": "steps {0} and {1} {are} different dstates",
-    "one_place": "steps {0} and {1} {are} at one place",
-    "two_places": "steps {0} and {1} {are} at different places",
-    "along": "step {0} {is} along a path",
-    "along_none": "step {0} {is} along no path",
-    "one_course": "steps {0} and {1} {are} along one path in the same direction",
-    "opposite": "steps {0} and {1} {are} along one path in opposite directions",
-    "two_paths": "steps {0} and {1} {are} along different paths",
-    "on": "step {0} {is} at a place on {path1}",
-    "ahead": "the place of step {1} {is} ahead of the place of step {0} on {path2}",
-    "branch_right": "{path1} {leaves} to the right of {path0}",
-    "branch_left": "{path1} {leaves} to the left of {path0}",
-    "right": "step {0} {is} at a place to the right of {path1}",
-    "left": "step {0} {is} at a place to the left of {path1}",
-    "turned": "steps {0} and {1} {are} at one place, and step {1} {faces} {turn} step {0}",
-}
-# Conclusions about two steps that read the same in either order.
-_SYMMETRIC = frozenset(
-    ("one_dstate", "two_dstates", "one_place", "two_places", "one_course", "opposite", "two_paths")
-)
-# How a step faces relative to another step, if it is turned 0, 1, 2 or 3 quarters clockwise.
-_TURNED = (
-    "the same way as",
-    "a quarter to the right of",
-    "the opposite way of",
-    "a quarter to the left of",
-)
 
 
 class Words:

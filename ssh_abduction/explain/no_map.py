@@ -37,6 +37,11 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 STRETCH = 8
 
 
+NEW_VIEW = "a view never seen"
+# Share of the remaining time that each search of the whole trace may take.
+SHARE = 0.45
+
+
 @dataclass(frozen=True, slots=True)
 class ClashingAxiom(PlainData):
     """An axiom that cannot hold at all these steps together with the other axioms of a clash."""
@@ -185,11 +190,6 @@ def shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
         middle = (short + long) // 2
         short, long = (short, middle) if has_no_map(middle) else (middle, long)
     return long
-
-
-NEW_VIEW = "a view never seen"
-# Share of the remaining time that each search of the whole trace may take.
-SHARE = 0.45
 
 
 def explain_trace(

@@ -29,15 +29,15 @@ from ssh_abduction.theory.theory import Theory
 _Answer = TypeVar("_Answer")
 
 
+SHORTEST = 0.05  # the least time limit of a search in seconds
+
+
 class QuestionLimits(TypedDict, total=False):
     """The limits of a question, and known maps of its trace, as in `LimitedQuestion`."""
 
     time_limit: float | None
     memory_limit: int | None
     known: Iterable[SSHMap]
-
-
-SHORTEST = 0.05  # the least time limit of a search in seconds
 
 
 class LimitedQuestion(ABC, Generic[_Answer]):

@@ -14,6 +14,11 @@ from ssh_abduction.explain.no_map import ClashingAxiom, Explanation, clashes_of,
 from ssh_abduction.solver import Cost, Stop
 from ssh_abduction.theory.theory import Theory
 
+# If an inference has more reasons than IN_A_LINE, each gets a line of its own.
+IN_A_LINE, INDENT = 2, " " * 7
+# A summary with more parts than this is not printed.
+BRIEF = 3
+
 
 class Verdict(Enum):
     """The relation of two steps in the maps of a trace: one dstate, or different dstates."""
@@ -277,12 +282,6 @@ def _difference(lost: Cost, won: Cost, theory: Theory) -> str:
             return f"{said}, not {other:g}" + (f", with {' and '.join(same)}" if same else "")
         same.append(said)
     return f"{_in_words(lost, theory.priorities)}, as many as the minimal maps"
-
-
-# If an inference has more reasons than IN_A_LINE, each gets a line of its own.
-IN_A_LINE, INDENT = 2, " " * 7
-# A summary with more parts than this is not printed.
-BRIEF = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
-from ssh_abduction.learning.runner_up import RunnerUpWarning, warn_of_second_map
+from ssh_abduction.learning.runner_up import RunnerUpWarning, second_map
 from ssh_abduction.learning.traces import Traces
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import Solution, Status, solve
@@ -116,9 +116,15 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         traces, theory = Traces.of(X), checked_theory(self.theory)
 
         # 1. Views: cluster the images.
-        self.features_ = self._new_features(traces).fit(traces.images)
+        features = traces.features
+        if self.features is not None:
+            features = cloned("features", self.features, "transform")
+        self.features_ = features.fit(traces.images)
         vectors = self.features_.transform(traces.images)
-        self.clusterer_ = self._new_clusterer(theory).fit(vectors)
+        clusterer = ViewClusterer(random_state=0, isolated=ISOLATED if theory.misread else None)
+        if self.clusterer is not None:
+            clusterer = as_view_clusterer(cloned("clusterer", self.clusterer))
+        self.clusterer_ = clusterer.fit(vectors)
         self.views_, self.confidence_ = self.clusterer_.labels_, self.clusterer_.confidence_
         warn_of_doubts(self.views_, self.confidence_, self.clusterer_.quality_[self.clusterer_.k_])
         _log.info("%d images, %d views", len(traces.images), self.clusterer_.k_)
@@ -129,7 +135,9 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         self.solution_ = solve(seen, theory, time_limit=self.time_limit)
         self.map_, labels = map_of(self.solution_, vectors, self.choose)
         warn_of_pieces(seen, self.map_)
-        self.second_map_ = warn_of_second_map(seen, self.solution_.maps, theory, self.time_limit)
+        self.second_map_ = second_map(seen, self.solution_.maps, theory, self.time_limit)
+        if self.second_map_:
+            warnings.warn(self.second_map_.sentence, RunnerUpWarning, stacklevel=2)
         _log.info("a map of %d dstates", len(self.map_.dstates))
 
         # 3. Labels: the map gives the dstate of each image that has a view.
@@ -180,7 +188,11 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
                 "y: expected the dstates of the images, got none; "
                 "give them, or traces, which are followed on the map"
             )
-        true = np.asarray(self._followed(Traces.of(X), found) if y is None else y)
+        if y is None:
+            traces = Traces.of(X)
+            views = self.clusterer_.predict(self.features_.transform(traces.images))
+            y = labels_on(self.map_, traces, views, found)
+        true = np.asarray(y)
         if true.shape != found.shape:
             raise LearnerError(
                 f"y: expected {len(found)} dstates, one per image, "
@@ -192,23 +204,6 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
                 "give traces of the building that was mapped"
             )
         return float(np.mean(found[true >= 0] == true[true >= 0]))
-
-    def _new_features(self, traces: Traces) -> Any:
-        """Make the transformer of images to vectors, which is not fitted yet."""
-        if self.features is None:
-            return traces.features
-        return cloned("features", self.features, "transform")
-
-    def _new_clusterer(self, theory: Theory) -> ViewClusterer:
-        """Make the clusterer, which is not fitted yet."""
-        if self.clusterer is not None:
-            return as_view_clusterer(cloned("clusterer", self.clusterer))
-        return ViewClusterer(random_state=0, isolated=ISOLATED if theory.misread else None)
-
-    def _followed(self, traces: Traces, looks: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Give each image of the traces the dstate that it looks like, (m,); -1 if unknown."""
-        views = self.clusterer_.predict(self.features_.transform(traces.images))
-        return labels_on(self.map_, traces, views, looks)
 
 
 class LearnerError(AbductionError, ValueError):

@@ -8,7 +8,6 @@ holds the step's view by that second number. The maps of both are then compared.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -113,16 +112,6 @@ def second_map(
         return None
     dstates = len(maps[0].dstates) if maps else None
     return SecondMap(len(set(trace.views)), len(set(other.views)), dstates, solution)
-
-
-def warn_of_second_map(
-    trace: Trace, maps: Sequence[SSHMap], theory: Theory | None, limit: float | None
-) -> SecondMap | None:
-    """Issue a RunnerUpWarning if the second best number of views gives another map."""
-    found = second_map(trace, maps, theory, limit)
-    if found:
-        warnings.warn(found.sentence, RunnerUpWarning, stacklevel=3)
-    return found
 
 
 def partition(ssh_map: SSHMap) -> tuple[tuple[int, ...], tuple[int | None, ...]]:

@@ -75,6 +75,11 @@ _ENDINGS: dict[Ending, str] = {
 }
 
 
+# Two steps that the map has at one place, or by the causal theory at one dstate (distinctive
+# state: a place and a heading).
+Doubt: TypeAlias = tuple[int, int]
+
+
 class Robot(Protocol):
     """The robot that an explorer drives. Implement these three methods."""
 
@@ -436,11 +441,6 @@ class Abilities:
         """
         names = self._names.get((seen.view, seen.star))
         return names or self._names.get((seen.view, None), set())
-
-
-# Two steps that the map has at one place, or by the causal theory at one dstate (distinctive
-# state: a place and a heading).
-Doubt: TypeAlias = tuple[int, int]
 
 
 class ReturnDoubts:

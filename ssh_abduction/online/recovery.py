@@ -68,6 +68,19 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
 
+# A map can be certain only if it has at least this probability among its rivals.
+CERTAIN = 0.99
+# At most this many hypotheses are reported. If there are more, the last one is for all others.
+LISTED = 10
+# Localisation begins at most this many steps before the last one.
+REPLAYED = 200
+# Probability of a fault of the cheapest kind, at each step.
+RARE = Chances().misread
+# At most this many rivals cost more than the minimal maps.
+RIVALS = 50
+# Rivals that are less probable than this share of the most probable one are dropped.
+LEAST_SHARE = 1e-3
+
 
 class Recovery(Keeper):
     """Keeps the maps up to date for a theory that allows faults, and says how sure they are."""
@@ -147,14 +160,6 @@ class Recovery(Keeper):
         if self._maps.rivals:
             return Status.FEASIBLE
         return Status.UNSATISFIABLE if self._maps.is_impossible else Status.UNKNOWN
-
-
-# A map can be certain only if it has at least this probability among its rivals.
-CERTAIN = 0.99
-# At most this many hypotheses are reported. If there are more, the last one is for all others.
-LISTED = 10
-# Localisation begins at most this many steps before the last one.
-REPLAYED = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,19 +336,9 @@ def _is_decided(maps: RivalMaps, rivals: Sequence[ExtendedMap], shares: Sequence
     if any(rival.future() != future for rival in maps.minimal[1:]):
         return False
     agreeing = sum(
-        share
-        for rival, share in zip(rivals, shares, strict=True)
-        if maps.is_minimal(rival) or rival.future() == future
+        share for rival, share in zip(rivals, shares, strict=True) if rival.future() == future
     )
     return agreeing >= CERTAIN
-
-
-# Probability of a fault of the cheapest kind, at each step.
-RARE = Chances().misread
-# At most this many rivals cost more than the minimal maps.
-RIVALS = 50
-# Rivals that are less probable than this share of the most probable one are dropped.
-LEAST_SHARE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -410,10 +405,6 @@ class RivalMaps:
         return self.is_impossible or (
             self.is_proven and (self.is_complete or len(self.minimal) == self._max_maps)
         )
-
-    def is_minimal(self, rival: ExtendedMap) -> bool:
-        """Whether a rival has the cost that was last proven minimal."""
-        return rival.cost == self._least
 
     def follow(self, problem: Problem) -> StepEffect:
         """Extend the rivals by the last step of `problem`, which has all steps and the theory."""
