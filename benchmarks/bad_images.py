@@ -22,9 +22,9 @@ from arguments import seeds_from
 from doubts import DOUBTS, spoilt, with_images
 from numpy.typing import NDArray
 
-from perception.confidence import NOISE
 from perception.errors import PerceptionError
 from perception.images import images_of
+from perception.quality import NOISE
 from perception.views import ViewClusterer
 from simulator.tours import simulate
 from simulator.world import World

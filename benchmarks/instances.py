@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from simulator.odometer import reported
+from simulator.robot import reported
 from ssh_abduction import Trace
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.odometry import Pose, displacement_between

@@ -33,8 +33,7 @@ from numpy.typing import NDArray
 
 from perception.errors import ImageWarning
 from perception.images import images_of
-from perception.likelihood import ImageLikelihood
-from perception.recognition import recogniser
+from perception.recognition import ImageLikelihood, recogniser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Localiser, SSHMap, Trace

@@ -30,7 +30,7 @@ from perception.readers.logs import read_log
 from perception.readers.scans import LaserScanner, Scan
 from perception.readers.writers import write_carmen
 from simulator.laser import BEARINGS, meetings
-from simulator.odometer import Odometer
+from simulator.robot import Odometer
 
 Array = NDArray[np.float64]
 

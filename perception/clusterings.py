@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.neighbors import NearestNeighbors
 
-from perception.confidence import NOISE
-from perception.quality import cluster_quality, trimmed_quality
+from perception.quality import NOISE, cluster_quality, trimmed_quality
 
 # There is a runner-up if trimmed M of the chosen k is below this multiple of the largest trimmed M
 # of the others. docs/measurements/reproduction.md has measurements.

@@ -22,9 +22,8 @@ from sklearn.pipeline import Pipeline
 from perception.appearance import PanoramaTransformer
 from perception.errors import PerceptionError
 from perception.images import refuse_huge
-from perception.likelihood import ImageLikelihood
 from perception.reciprocal import ReciprocalTransformer
-from perception.recognition import PlaceRecogniser
+from perception.recognition import ImageLikelihood, PlaceRecogniser
 from perception.views import ViewClusterer
 from ssh_abduction.data.errors import brief, is_whole
 from ssh_abduction.data.files import save_file

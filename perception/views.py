@@ -32,9 +32,15 @@ from perception.clusterings import (
     smallest_good,
     to_neighbour,
 )
-from perception.confidence import NOISE, confidence
 from perception.errors import ImageWarning, PerceptionError, equal_length
-from perception.quality import cluster_quality, sample_indices, spanning_tree, trimmed_quality
+from perception.quality import (
+    NOISE,
+    cluster_quality,
+    confidence,
+    sample_indices,
+    spanning_tree,
+    trimmed_quality,
+)
 from ssh_abduction.data.checks import a_number, a_whole_number, one_of
 from ssh_abduction.data.errors import brief
 from ssh_abduction.runtime.threads import one_thread
@@ -84,7 +90,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         labels_: (n,) view of each fitted image; -1 for noise, which is an isolated image or one
             that the clusterer calls noise.
         confidence_: (n,) how surely each image belongs to its view, in [0, 1]; 0 for noise
-            (`perception.confidence`).
+            (`perception.quality`).
         clusterer_: The fitted clusterer.
         tried_: The clusterings that were tried, which the properties below read.
         predictor_: Gives views to new images.

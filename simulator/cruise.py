@@ -1,24 +1,51 @@
-"""Drives along a planned route and around unknown obstacles.
+"""Plans routes through free space, and drives along them and around unknown obstacles.
 
-The walls of the building are known. The robot aims at a point AIM metres ahead on its route. If the
-laser shows an obstacle on the route that is no known wall, the robot plans a route around it.
+>>> from simulator.cruise import FreeSpace
+>>> walls = np.array([[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0.0]])
+>>> room = FreeSpace.of(walls, radius=0.2)
+>>> way = room.way((0.5, 1.5), (3.5, 1.5))
+>>> [(round(float(x), 1), round(float(y), 1)) for x, y in way[[0, -1]]]
+[(0.5, 1.5), (3.5, 1.5)]
+
+Free space is a grid, and routes stay away from walls and seen obstacles. The walls of the building
+are known. The robot aims at a point AIM metres ahead on its route. If the laser shows an obstacle
+on the route that is no known wall, the robot plans a route around it.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
+from skimage.graph import MCP_Geometric
 
 from simulator.driver import Driver
 from simulator.errors import SimulatorError
-from simulator.freespace import CELL, Cells, FreeSpace
 from simulator.laser import BEARINGS
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Cells = NDArray[np.intp]
+Point = tuple[float, float]
+# Side of a cell in metres.
+CELL = 0.1
+# Largest area to plan on, in square metres.
+LARGEST = 200_000
+# The grid reaches this many metres beyond the walls. A part of it reaches this far beyond the
+# points around which it is cut out.
+MARGIN = 2.0
+# A route prefers to stay ROOM metres from walls; more is not better. A metre at a wall costs as
+# much as NARROW metres in the open.
+ROOM, NARROW = 1.0, 4.0
+# Cells around start and goal in which a route may be nearer to walls than elsewhere.
+LEEWAY = 2
+# Width in metres of the Gaussian filter that rounds corners.
+SMOOTH = 0.3
 # Metres between two images.
 STRIDE = 0.1
 # Distance in metres along the route to the aim: CLOSE if something is nearer than WIDE, so that the
@@ -131,3 +158,173 @@ def _error(driver: Driver, expected: str, got: str) -> SimulatorError:
         f"{driver.world.name}: drive at ({x:.2f}, {y:.2f}): expected {expected}, got {got}; "
         "make room there"
     )
+
+
+@dataclass
+class FreeSpace:
+    """A grid of cells with walls and obstacles. Row 0 is at the bottom."""
+
+    corner: Point  # (x, y) of the lower left corner in metres
+    occupied: Mask = field(repr=False)  # (rows, columns) mask of the cells with walls or obstacles
+    radius: float  # radius of the robot in metres
+    # (rows, columns) distance in metres to the nearest wall. Obstacles that are marked later do not
+    # count.
+    off: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self.off = _clearance(self.occupied)
+
+    @classmethod
+    def of(cls, segments: Array, radius: float) -> FreeSpace:
+        """Make the free space between walls, (n, 4), for a robot of this radius, in metres.
+
+        Raises SimulatorError if the area is too large.
+        """
+        ends = segments.reshape(-1, 2)
+        corner = ends.min(0) - MARGIN
+        width, height = ends.max(0) + MARGIN - corner
+        if width * height > LARGEST:
+            raise SimulatorError(
+                f"walls: expected an area of at most {LARGEST:,} square metres, in which ways "
+                f"can be planned, got {width:,.0f} x {height:,.0f} m; check the scale"
+            )
+        columns, rows = math.ceil(width / CELL), math.ceil(height / CELL)
+        space = cls((float(corner[0]), float(corner[1])), np.zeros((rows, columns), bool), radius)
+        return cls(space.corner, space.drawn(segments), radius)
+
+    @property
+    def least(self) -> float:
+        """Smallest distance of the robot's middle from occupied cells, in metres."""
+        return self.radius + CELL
+
+    def drawn(self, segments: Array) -> Mask:
+        """Make the mask, (rows, columns), of the cells that segments, (n, 4), cross."""
+        cells = np.zeros_like(self.occupied)
+        for x1, y1, x2, y2 in segments:
+            count = 2 + math.ceil(math.hypot(x2 - x1, y2 - y1) / (CELL / 2))
+            rows, columns = self.cells(
+                np.column_stack([np.linspace(x1, x2, count), np.linspace(y1, y2, count)])
+            )
+            cells[rows, columns] = True
+        return cells
+
+    def cells(self, points: Array) -> tuple[Cells, Cells]:
+        """Find the rows, (n,), and columns, (n,), of points, (n, 2) metres.
+
+        A point outside the grid has the nearest cell.
+        """
+        columns, rows = np.floor((points - np.array(self.corner)) / CELL).astype(np.intp).T
+        return rows.clip(0, self.occupied.shape[0] - 1), columns.clip(0, self.occupied.shape[1] - 1)
+
+    def middles(self, points: Array) -> Array:
+        """Move points, (n, 2) in metres, to the centres of their cells."""
+        return _middles(np.column_stack(self.cells(points)), self.corner)
+
+    def part(self, points: Array, closed: Mask | None = None) -> FreeRectangle:
+        """Make a `FreeRectangle`: a rectangle of the grid around some points, (n, 2) metres.
+
+        `closed` is a mask, (rows, columns), of further cells that count as occupied.
+        """
+        rows, columns = self.cells(np.vstack([points.min(0) - MARGIN, points.max(0) + MARGIN]))
+        window = slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1)
+        occupied = (
+            self.occupied[window] if closed is None else self.occupied[window] | closed[window]
+        )
+        corner = self.corner[0] + CELL * int(columns[0]), self.corner[1] + CELL * int(rows[0])
+        return FreeRectangle(corner, _clearance(occupied), self.least)
+
+    def way(self, start: Point, goal: Point, closed: Mask | None = None) -> Array | None:
+        """Find the best route, (n, 2) metres, within the part of the grid around both ends.
+
+        `closed` is as in `part`. None if there is no route. `FreeRectangle.way` says which route is
+        best.
+        """
+        return self.part(np.array([start, goal]), closed).way(start, goal)
+
+
+@dataclass(frozen=True)
+class FreeRectangle:
+    """A rectangular part of free space."""
+
+    corner: Point  # (x, y) of the lower left corner in metres
+    # (rows, columns) distance in metres to the nearest occupied cell.
+    clearance: Array = field(repr=False)
+    least: float  # smallest distance of the robot's middle from occupied cells, in metres
+
+    def way(self, start: Point, goal: Point) -> Array | None:
+        """Find a route between points (x, y): short, and ROOM metres from walls if possible.
+
+        It is (n, 2) metres, with a point in each cell; None if there is no route.
+        """
+        ends = np.column_stack(self._cells(np.array([start, goal])))
+        cells = _shortest(self.clearance, self.least, *map(tuple, ends.tolist()))
+        if cells is None:
+            return None
+        way = _middles(cells, self.corner)
+        way[0], way[-1] = start, goal
+        # Use a smoothed point only if it is far enough from obstacles.
+        smooth = gaussian_filter1d(way, SMOOTH / CELL, axis=0, mode="nearest")
+        smooth[0], smooth[-1] = start, goal
+        safe = self.clearance[self._cells(smooth)] >= self.least
+        return np.where(safe[:, None], smooth, way)
+
+    def off(self, points: Array) -> Array:
+        """Measure how far points, (n, 2), are from occupied cells: (n,), metres."""
+        return np.asarray(self.clearance[self._cells(points)])
+
+    @cached_property
+    def regions(self) -> Cells:
+        """The number of the connected region of each cell; 0 if the robot cannot be there."""
+        return np.asarray(label(self.clearance >= self.least, structure=np.ones((3, 3)))[0])
+
+    def region(self, points: Array) -> Cells:
+        """Look up the number of the region of each point, (n, 2) metres; see `regions`."""
+        return np.asarray(self.regions[self._cells(points)])
+
+    def nearest(self, region: int, goal: Point, room: float) -> Point:
+        """Find the point (x, y) of a region, by its number, that is nearest to a goal.
+
+        It is at least `room` metres from walls, if the region has such points. Otherwise, it is
+        as far from walls as possible.
+        """
+        cells = np.argwhere(self.regions == region)
+        clearance = self.clearance[tuple(cells.T)]
+        cells = cells[clearance >= min(room, float(clearance.max()))]
+        middles = _middles(cells, self.corner)
+        x, y = middles[int(np.hypot(*(middles - np.array(goal)).T).argmin())]
+        return float(x), float(y)
+
+    def _cells(self, points: Array) -> tuple[Cells, Cells]:
+        columns, rows = np.floor((points - np.array(self.corner)) / CELL + 1e-6).astype(np.intp).T
+        height, width = self.clearance.shape
+        return rows.clip(0, height - 1), columns.clip(0, width - 1)
+
+
+def _clearance(occupied: Mask) -> Array:
+    """The distance from each cell to the nearest cell that is occupied or outside, in metres."""
+    return np.asarray(distance_transform_edt(np.pad(~occupied, 1))[1:-1, 1:-1] * CELL)
+
+
+def _middles(cells: Cells, corner: Point) -> Array:
+    """The centres, (n, 2) metres, of cells, (n, 2) rows and columns, of a grid with this corner."""
+    return np.asarray((cells[:, ::-1] + 0.5) * CELL + np.array(corner))
+
+
+def _shortest(
+    clearance: Array, least: float, start: tuple[int, int], goal: tuple[int, int]
+) -> Cells | None:
+    """The cells, (n, 2) rows and columns, of the cheapest route between two cells, or None.
+
+    `clearance` is the distance to the nearest occupied cell in metres, (rows, columns). A route
+    needs at least `least`. Near start and goal, where the robot may be closer to obstacles than
+    planned, it need only not touch an occupied cell.
+    """
+    free = clearance >= least
+    for cell in (start, goal):
+        beside = tuple(slice(max(k - LEEWAY, 0), k + LEEWAY + 1) for k in cell)
+        free[beside] |= clearance[beside] > 1.5 * CELL
+        free[cell] = True
+    price = 1 + (NARROW - 1) * (1 - np.minimum(clearance / ROOM, 1.0)) ** 2
+    ways = MCP_Geometric(np.where(free, price, -1.0))  # -1 is closed
+    costs, _ = ways.find_costs([start], [goal])
+    return np.array(ways.traceback(goal)) if np.isfinite(costs[goal]) else None

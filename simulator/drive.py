@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.laser import Laser
-from simulator.odometer import Odometer
+from simulator.robot import Odometer
 from simulator.world import World
 from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.odometry import Pose, displacement_between, moved

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulator.errors import SimulatorError
-from simulator.odometer import reported
 from simulator.plans import APART, Plan
+from simulator.robot import reported
 from ssh_abduction.data.checks import a_number, a_whole_number, an_instance
 from ssh_abduction.data.odometry import Odometry, Pose, displacement_between
 from ssh_abduction.data.star import Gateway as Sighted

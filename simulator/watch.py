@@ -18,8 +18,7 @@ import numpy as np
 from simulator.driver import TURNS, Driver
 from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.laser import meetings
-from simulator.world import World
-from simulator.world_files import ACTIONS, are_square
+from simulator.world import ACTIONS, World, are_square
 from ssh_abduction.data.odometry import Pose, displacement_between
 
 # Largest distance from the expected place in metres (`reach` if that is larger), and largest

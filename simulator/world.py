@@ -3,7 +3,7 @@
 A world may also state its true dstates (distinctive states: places, each with a heading).
 
 A world is a JSON file that a user can write (docs/reference/worlds.md), or an occupancy map of ROS
-(YAML file and image).
+(YAML file and image). `WorldReader` reads the fields of world files.
 
 >>> from simulator.world import World
 >>> World.named("notched-rectangle").segments.shape[1]
@@ -16,25 +16,16 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.occupancy import FARTHEST, read_occupancy
-from simulator.world_files import (
-    ACTIONS,
-    NEAREST,
-    Angles,
-    Array,
-    Clutter,
-    Lift,
-    Point,
-    TrueDState,
-    WorldReader,
-)
 from ssh_abduction.data.checks import (
     a_number,
     a_path,
@@ -45,11 +36,25 @@ from ssh_abduction.data.checks import (
     numbers,
     one_of,
 )
-from ssh_abduction.data.errors import brief, named, printable
+from ssh_abduction.data.errors import brief, is_finite, named, printable
 from ssh_abduction.data.files import parse_json, read_file
+from ssh_abduction.data.json_fields import FieldReader
 
-__all__ = ["Clutter", "Lift", "TrueDState", "World", "checked_segments", "distances_to", "pose_of"]
-
+Array = NDArray[np.float64]
+Angles: TypeAlias = Literal["right", "any"]
+Point: TypeAlias = tuple[float, float]
+FORMAT, VERSION = "ssh-world", 1
+ACTIONS = ("travel", "right", "left", "around")
+# Largest length of the straight pieces of an arc in degrees, and of a ragged wall in metres.
+ARC, RAGGED = 5.0, 0.3
+# Largest total length of ragged walls, in metres.
+LONGEST = 20_000
+# A wall is oblique if it is more than SQUARE radians off the two main directions. In a world with
+# right angles, at most the share OBLIQUE of the walls, by length, is oblique, such as a column or a
+# cut corner.
+SQUARE, OBLIQUE = math.radians(5), 0.1
+# Smallest `reach` of a world in metres: a laser reports no smaller range.
+NEAREST = 0.01
 # Largest size of a world file in bytes.
 LARGEST = 64 * 2**20
 
@@ -314,3 +319,286 @@ class World:
         name, segments = read_occupancy(Path(a_path("path", path, SimulatorError)))
         middle = segments.reshape(-1, 2).mean(0)
         return cls(printable(name), segments, start=(float(middle[0]), float(middle[1]), 0.0))
+
+
+@dataclass(frozen=True)
+class TrueDState:
+    """The true pose of a dstate, for evaluation only.
+
+    Attributes:
+        name: Name of the dstate.
+        place: Name of its place.
+        path: Name of its path.
+        direction: 1 if the heading is along the path, -1 if it is against it.
+        pose: (x, y, heading) in metres and radians.
+    """
+
+    name: str
+    place: str
+    path: str
+    direction: int
+    pose: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Lift:
+    """A lift from one point to another. The floors of a world lie beside each other in one plane.
+
+    Attributes:
+        name: Name of the action that takes it. Lifts from different points may share a name.
+        start: (x, y) in metres where the robot gets in.
+        end: (x, y) in metres where it gets out, with the same heading.
+    """
+
+    name: str
+    start: Point
+    end: Point
+
+
+@dataclass(frozen=True)
+class Clutter:
+    """A closed polygon that may be moved or absent on each tour, such as a piece of furniture.
+
+    Attributes:
+        segments: (n, 4) sides of the polygon in metres, as in the file.
+        moves: Largest shift in x and in y on a tour, in metres.
+        present: Probability that the polygon is there on a tour.
+    """
+
+    segments: Array = field(repr=False)
+    moves: tuple[float, float] = (0.0, 0.0)
+    present: float = 1.0
+
+
+def are_square(walls: Array) -> bool:
+    """Check whether nearly all walls, (n, 4), by length, are parallel or perpendicular."""
+    ways = (walls[:, 2] - walls[:, 0]) + 1j * (walls[:, 3] - walls[:, 1])
+    lengths = np.abs(ways)
+    directions = np.angle(ways) * 4  # Makes perpendicular directions equal.
+    axis = directions[lengths.argmax()]
+    off = np.abs(np.angle(np.exp(1j * (directions - axis)))) / 4
+    return bool(lengths[off > SQUARE].sum() <= OBLIQUE * lengths.sum())
+
+
+class WorldReader(FieldReader):
+    """Reads and checks the fields of a world file.
+
+    All methods but `wrong` return the checked value, or raise SimulatorError if it is invalid.
+    The error has `name`, the name of the field, and `where`, the name of the file.
+    """
+
+    error, mend = SimulatorError, "mend it (docs/reference/worlds.md)"
+
+    def fields(self, data: Any) -> dict[str, Any]:
+        """Read the arguments of `World`, by name, from a JSON object."""
+        if (
+            not isinstance(data, Mapping)
+            or data.get("format") != FORMAT
+            or data.get("version") != VERSION
+        ):
+            raise self.wrong(
+                "format", f'an object with "format": "{FORMAT}", "version": {VERSION}', data
+            )
+        segments, each = self.walls(data), partial(self.each, data, optional=True)
+        # Places are those of dstates and those listed; routes may also lead through other points.
+        dstates = each("dstates", self.dstate)
+        places = {state.place: state.pose[:2] for state in dstates} | self.points(
+            data.get("places", {}), "places"
+        )
+        via = self.points(data.get("via", {}), "via")
+        stops = {**via, **places}
+        lifts = each("lifts", self.lift)
+        route = self.route(self.list(data, "route", optional=True), stops, lifts)
+        start = [*stops[route[0]], 0.0] if set(route) & set(stops) else [0, 0, 0]
+        name = data.get("name", printable(Path(self.where).stem))
+        return {
+            "name": a_text(f"{self.where}: name", name, SimulatorError),
+            "segments": self.ragged(segments, data.get("ragged", 0.0)),
+            "angles": self.angles(data.get("angles"), segments),
+            "clutter": each("clutter", self.clutter),
+            "start": self.pose(data.get("start", start), "start"),
+            "route": route,
+            "reach": self.reach(data.get("reach", 1.0)),
+            "dstates": dstates,
+            "places": places,
+            "via": via,
+            "lifts": lifts,
+        }
+
+    def walls(self, data: Mapping[str, Any]) -> Array:
+        """Read all walls, as segments: (n, 4), metres."""
+        each = partial(self.each, data, optional=True)
+        walls = [
+            *each("polygons", self.loop),
+            *each("segments", self.segment),
+            *each("arcs", self.arc),
+        ]
+        if "occupancy" in data:
+            walls.append(self.occupancy(data["occupancy"]))
+        if not walls:
+            raise self.wrong(
+                "polygons", "at least one wall in polygons, segments, arcs or occupancy", []
+            )
+        return np.vstack(walls)
+
+    def row(self, value: Any, count: int, name: str) -> Array:
+        """Read a list of `count` finite numbers: (count,)."""
+        good = isinstance(value, list) and len(value) == count
+        if not good or not all(is_finite(x) and abs(x) <= FARTHEST for x in value):
+            raise self.wrong(name, f"{count} finite numbers, of at most {FARTHEST:,.0f}", value)
+        return np.array(value, dtype=float)
+
+    def segment(self, value: Any, name: str) -> Array:
+        """Read a wall: (1, 4), metres."""
+        return self.row(value, 4, name).reshape(1, 4)
+
+    def loop(self, value: Any, name: str) -> Array:
+        """Read a list of points, and make the sides of the closed polygon: (n, 4), metres."""
+        if not isinstance(value, list) or len(value) < 3:
+            raise self.wrong(name, "at least three points [x, y]", value)
+        points = np.array([self.row(p, 2, f"{name}[{i}]") for i, p in enumerate(value)])
+        return np.hstack([points, np.roll(points, -1, axis=0)])
+
+    def arc(self, value: Any, name: str) -> Array:
+        """Read an arc, and approximate it by segments: (n, 4), metres.
+
+        It lists x and y of the centre, radius, and first and last direction in degrees
+        counterclockwise.
+        """
+        x, y, radius, first, last = self.row(value, 5, name)
+        if not radius > 0 or not 0 < last - first <= 360:
+            raise self.wrong(
+                name,
+                "[x, y, radius above 0, from, to], where `to` is up to 360 degrees above `from`",
+                value,
+            )
+        angles = np.radians(np.linspace(first, last, 1 + math.ceil((last - first) / ARC)))
+        points = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
+        return np.hstack([points[:-1], points[1:]])
+
+    def occupancy(self, value: Any) -> Array:
+        """Read the walls, (n, 4) metres, of an occupancy map in a file beside this one."""
+        if not isinstance(value, str):
+            raise self.wrong("occupancy", "the name of a YAML file", value)
+        return read_occupancy(Path(self.where).parent / value)[1]
+
+    def ragged(self, walls: Array, value: Any) -> Array:
+        """Divide walls, (n, 4) metres, into pieces, and shift the ends of the pieces at random.
+
+        The shifts are always the same, so that a world looks the same on each drive.
+        `value` is the standard deviation of the shifts in metres; 0 changes nothing.
+        """
+        if not is_finite(value) or not 0 <= value <= 1:
+            raise self.wrong("ragged", "metres by which walls are uneven, 0 to 1", value)
+        if not value:
+            return walls
+        if np.hypot(*(walls[:, 2:] - walls[:, :2]).T).sum() > LONGEST:
+            raise self.wrong(
+                "ragged",
+                f"walls of at most {LONGEST:,} m together, as uneven walls have many pieces",
+                value,
+            )
+        pieces = []
+        for x1, y1, x2, y2 in walls:
+            line = np.linspace(
+                (x1, y1), (x2, y2), 1 + math.ceil(math.hypot(x2 - x1, y2 - y1) / RAGGED)
+            )
+            pieces.append(np.hstack([line[:-1], line[1:]]))
+        # Shift equal ends equally, so that walls that meet still meet.
+        ends, which = np.unique(
+            np.vstack(pieces).reshape(-1, 2).round(6), axis=0, return_inverse=True
+        )
+        ends += np.random.default_rng(0).normal(0, value, ends.shape)
+        return np.asarray(ends[which.ravel()].reshape(-1, 4))
+
+    def points(self, value: Any, name: str) -> dict[str, Point]:
+        """Read an object of points: a dict from name to (x, y) in metres."""
+        if not isinstance(value, Mapping):
+            raise self.wrong(name, "an object of names and points [x, y]", value)
+        if clash := next((text for text in value if text in ACTIONS or "," in text), None):
+            raise self.wrong(name, "names without commas that are no actions", clash)
+        found = {
+            text: self.row(point, 2, f"{name}.{text}").tolist() for text, point in value.items()
+        }
+        return {text: (x, y) for text, (x, y) in found.items()}
+
+    def lift(self, value: Any, name: str) -> Lift:
+        """Read a lift: an object with name, from and to."""
+        if not isinstance(value, Mapping) or not isinstance(value.get("name"), str):
+            raise self.wrong(name, "an object with name, from and to", value)
+        action = value["name"]
+        if not action or action in ACTIONS or "," in action:
+            raise self.wrong(f"{name}.name", "a name without commas that is no action", action)
+        start, end = (self.row(value.get(k), 2, f"{name}.{k}") for k in ("from", "to"))
+        return Lift(action, (float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
+
+    def route(
+        self, value: Sequence[Any], stops: Mapping[str, Point], lifts: Sequence[Lift] = ()
+    ) -> tuple[str, ...]:
+        """Check a route, which consists of actions only or of the names of `stops` only."""
+        actions = [*ACTIONS, *dict.fromkeys(lift.name for lift in lifts)]
+        by_places = any(isinstance(stop, str) and stop in stops for stop in value)
+        for i, stop in enumerate(value):
+            if by_places and not (isinstance(stop, str) and stop in stops):
+                raise self.wrong(
+                    f"route[{i}]",
+                    f"a place ({', '.join(stops)}), as there are others in the route",
+                    stop,
+                )
+            if not by_places and stop not in actions:
+                raise self.wrong(
+                    f"route[{i}]",
+                    f"{', '.join(actions[:-1])} or {actions[-1]}"
+                    + (", or the name of a place" if stops else ""),
+                    stop,
+                )
+        return tuple(value)
+
+    def reach(self, value: Any) -> float:
+        """Check the reach, in metres."""
+        if not is_finite(value) or not NEAREST <= value <= FARTHEST:
+            raise self.wrong("reach", f"metres above 0, {NEAREST} to {FARTHEST:,.0f}", value)
+        return float(value)
+
+    def angles(self, value: Any, walls: Array) -> Angles:
+        """Return how streets meet: at right angles ("right") or at any angles ("any").
+
+        If the file says nothing (None), it is "right" if nearly all walls have one of two
+        perpendicular directions, else "any". Raises SimulatorError for another value.
+        """
+        if value not in (None, "right", "any"):
+            raise self.wrong("angles", '"right" or "any"', value)
+        chosen: Angles = value or ("right" if are_square(walls) else "any")
+        return chosen
+
+    def pose(self, value: Any, name: str) -> tuple[float, float, float]:
+        """Read a pose. Its heading is in degrees in the file, and in radians in the result."""
+        x, y, degrees = self.row(value, 3, name)
+        return float(x), float(y), math.radians(degrees)
+
+    def clutter(self, value: Any, name: str) -> Clutter:
+        """Read a polygon that may move."""
+        if not isinstance(value, Mapping):
+            raise self.wrong(name, "an object with a polygon", value)
+        moves = self.row(value.get("moves", [0, 0]), 2, f"{name}.moves")
+        present = value.get("present", 1.0)
+        if not is_finite(present) or not 0 <= present <= 1:
+            raise self.wrong(f"{name}.present", "a probability", present)
+        return Clutter(
+            self.loop(value.get("polygon"), f"{name}.polygon"),
+            (float(moves[0]), float(moves[1])),
+            float(present),
+        )
+
+    def dstate(self, value: Any, name: str) -> TrueDState:
+        """Read a true dstate."""
+        if not isinstance(value, Mapping) or value.get("direction") not in (1, -1):
+            raise self.wrong(
+                name, "an object with name, place, path, direction 1 or -1, pose", value
+            )
+        texts = [value.get(key) for key in ("name", "place", "path")]
+        if not all(isinstance(text, str) for text in texts):
+            raise self.wrong(name, "texts for name, place and path", value)
+        label, place, path = map(str, texts)
+        pose = self.pose(value.get("pose"), f"{name}.pose")
+        return TrueDState(label, place, path, int(value["direction"]), pose)

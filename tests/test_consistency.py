@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perception.places.closures import VisitMatch
-from perception.places.consistency import agreeing, fitted_poses
+from perception.places.closures import VisitMatch, agreeing, fitted_poses
 from perception.places.matching import Match
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit

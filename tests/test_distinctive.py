@@ -9,11 +9,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from perception.places.distinctive import find_visits
-from perception.places.local_map import CELL, LocalMaps, Patch
-from perception.places.recent import Recent
+from perception.places.distinctive import find_visits, joined
+from perception.places.local_map import CELL, LocalMaps, Patch, Recent
 from perception.places.skeleton import junctions
-from perception.places.stays import joined
 from perception.places.track import Track
 from perception.places.visits import Visit, Way
 from perception.readers.scans import LaserScanner, RobotLog, Scan

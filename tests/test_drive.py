@@ -14,17 +14,14 @@ import pytest
 from test_plans import SCHOOLS, plan_of, xml
 
 from perception.readers.logs import read_log
-from simulator.buildings import Building
-from simulator.cruise import drive_along
+from simulator.cruise import FreeSpace, drive_along
 from simulator.drive import Recorder
 from simulator.driver import Driver
 from simulator.errors import SimulatorError, SimulatorWarning
-from simulator.freespace import FreeSpace
 from simulator.laser import Laser
-from simulator.odometer import Odometer
 from simulator.plans import Plan
-from simulator.robot import Body, SimulatedRobot
-from simulator.rounds import Rooms, Round, holds, record_plan
+from simulator.robot import Body, Odometer, SimulatedRobot
+from simulator.rounds import Building, Rooms, Round, holds, record_plan
 from simulator.tours import record, simulate
 from simulator.world import World
 from ssh_abduction.cli import main

@@ -17,10 +17,9 @@ from streets import drawn
 
 from simulator.driver import Driver
 from simulator.errors import SimulatorError
-from simulator.junctions import Pilot
+from simulator.junctions import Panorama, Pilot, Place, compass
 from simulator.laser import BEARINGS, Laser
 from simulator.robot import Body, SimulatedRobot
-from simulator.surroundings import Panorama, Place, compass
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Theory, Trace, solve

@@ -23,8 +23,7 @@ from test_log_checks import (
 )
 
 from perception.errors import LogError
-from perception.places.importing import import_live, import_log, stream_visits
-from perception.places.live import LOOKS
+from perception.places.importing import LOOKS, import_live, import_log, stream_visits
 from perception.readers.logs import SURVEYED, live_log, read_log
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_carmen

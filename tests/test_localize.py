@@ -19,8 +19,7 @@ from sklearn.neighbors import KNeighborsClassifier
 from worlds import rectangle
 
 from perception.errors import ImageWarning, PerceptionError
-from perception.likelihood import ImageLikelihood
-from perception.recognition import PlaceRecogniser, recogniser
+from perception.recognition import ImageLikelihood, PlaceRecogniser, recogniser
 from perception.store import save
 from ssh_abduction import Localiser, SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main

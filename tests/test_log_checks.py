@@ -15,7 +15,7 @@ from coarse import every_second_beam, hall
 
 from perception.errors import LogError
 from perception.places import importing, log_checks
-from perception.places.contradictions import scans_after_a_carry
+from perception.places.following import scans_after_a_carry
 from perception.places.importing import import_log, tracked
 from perception.places.track import Track
 from perception.readers.echoes import LaserOptions, interpret_log

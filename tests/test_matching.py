@@ -13,13 +13,12 @@ from test_distinctive import log_of
 from perception.places import closures, matching
 from perception.places.closures import VisitMatch, find_closures, uncertainty
 from perception.places.distinctive import WINDOW, find_visits
-from perception.places.following import _matched
+from perception.places.following import Surfaces, _matched
 from perception.places.local_map import CELL, PackedPatch, Patch
 from perception.places.matching import Match, Scene, Turned, match
 from perception.places.tracing import closure_of, to_trace
 from perception.places.track import Track, odometer_covariance, points_turned
 from perception.places.visits import Visit, Way
-from perception.places.walls import Surfaces
 from perception.readers.scans import LaserScanner, RobotLog, Scan
 from ssh_abduction.data.odometry import displacement_between
 

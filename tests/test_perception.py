@@ -34,15 +34,17 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from perception import quality, store, views
 from perception.appearance import PanoramaTransformer
-from perception.confidence import confidence, nearest_views, warn_of_doubts
 from perception.errors import ImageWarning, PerceptionError
 from perception.features import strongest, telling_features
 from perception.quality import (
     cluster_quality,
     cluster_spread,
+    confidence,
+    nearest_views,
     spanning_tree,
     trimmed_quality,
     uncertainty_coefficient,
+    warn_of_doubts,
 )
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecogniser, learning_curve, recogniser

@@ -13,14 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simulator.driver import Driver, act, climb
+from simulator.driver import LONG, Driver, act, climb, sight
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS, Laser
-from simulator.odometer import reported
-from simulator.robot import Body, SimulatedRobot
-from simulator.sight import LONG, sight
-from simulator.tour_log import noise_model
-from simulator.tours import simulate
+from simulator.robot import Body, SimulatedRobot, reported
+from simulator.tours import noise_model, simulate
 from simulator.world import World
 from ssh_abduction import Trace
 from ssh_abduction.data import Odometry

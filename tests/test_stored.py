@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import tracemalloc
 from dataclasses import fields
 from pathlib import Path
@@ -10,10 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perception.readers import stored
 from perception.readers.logs import read_log
-from perception.readers.scans import LaserScanner, Scan
-from perception.readers.stored import ScanTable, in_turn, without_ranges
+from perception.readers.scans import LaserScanner, Scan, ScanTable, in_turn, without_ranges
 from perception.readers.writers import write_carmen
 
 BEAMS = 360
@@ -40,7 +39,7 @@ def no_file() -> None:
 
 
 def test_ranges_stay_in_memory_on_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stored.tempfile, "TemporaryFile", no_file)
+    monkeypatch.setattr(tempfile, "TemporaryFile", no_file)
     scans = scans_of(3)
     for kept, scan in zip(in_turn(ScanTable(scans)), scans, strict=True):
         assert (kept.ranges == scan.ranges).all()

@@ -9,6 +9,9 @@ increment has a covariance.
 If the odometer jumps (`jumps`), the scan is matched near the previous pose without odometry. If it
 matches, the track goes on, and only the increment is unknown: this is a cut. If nothing in the scan
 was seen before, the robot may be anywhere. Then the track is broken, and a new trajectory begins.
+
+Scans may also contradict the scans before them: walls of one lie in free space of the other. This
+happens where the robot was carried while nothing was logged, or where a file holds two drives.
 """
 
 from __future__ import annotations
@@ -16,26 +19,48 @@ from __future__ import annotations
 import math
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from perception.places.contradictions import scans_after_a_carry
 from perception.places.jumps import Doubt, Unknown, is_missing, unknown_steps
 from perception.places.track import (
     Array,
     Track,
     covariance_turned,
     odometer_covariance,
+    points_moved,
     points_turned,
     wrapped,
 )
-from perception.places.walls import FEW_POINTS, ScanFit, Surfaces, in_sight, surfaces_in
-from perception.readers.scans import RobotLog, Scan
-from perception.readers.stored import in_turn
+from perception.readers.scans import RobotLog, Scan, in_turn
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
+# Longer beams are not matched, in metres, since neighbouring beams are too far apart to show a
+# wall.
+FARTHEST = 25.0
+# Standard deviation in metres of the distance from a point to its wall: noise of the laser and
+# unevenness of walls.
+ROUGHNESS = 0.05
+# Fewer points of a scan do not show whether the robot is where it seems to be.
+FEW_POINTS = 20
+# Errors of neighbouring points are correlated: this many points count as one independent point.
+TOGETHER = 3
+# Largest distance in metres from a point to a wall: BEGIN in the first round, then SHRINK times as
+# large in each round, but at least END. ROUNDS is the largest number of rounds.
+BEGIN, END, SHRINK, ROUNDS = 1.0, 0.25, 0.75, 12
+# Points of a scan intrude if they lie in the free space of the other scans, at least MARGIN metres
+# from walls. A scan contradicts the scans before it if two things hold: less than the share POORLY
+# of its points matches, and more than the share INTRUDING of either side intrudes. BESIDE scans on
+# each side are compared. In good logs, at most 27 % of the points of scans that match so badly
+# intrude. The share INTRUDING_RARELY suffices if the share that matches is more than WORSE below
+# the RARELY-th percentile of the log.
+INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
+INTRUDING_RARELY, WORSE, RARELY = 0.15, 0.25, 1.0
 # Number of previous scans to match a scan with.
 RECENT = 40
 # Largest number of points of a scan to match, evenly spread. It bounds the time for a scan.
@@ -308,3 +333,194 @@ def _accumulating(information: Array, prior: Array) -> Array:
     return np.asarray(
         by_odometer @ np.linalg.inv(prior) @ by_odometer.T + 2 / (RECENT + 1) * by_walls
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Points on smooth surfaces."""
+
+    points: Array  # (m, 2) metres
+    normals: Array  # (m, 2) unit normals
+
+    def __len__(self) -> int:
+        """The number of points."""
+        return len(self.points)
+
+    def moved(self, pose: Pose | Array) -> Surfaces:
+        """Transform to the frame that a pose is given in, from the frame of the pose."""
+        return Surfaces(points_moved(pose, self.points), points_turned(pose[2], self.normals))
+
+    def some(self, most: int) -> Surfaces:
+        """Take at most this many points, evenly spread."""
+        kept = np.unique(np.linspace(0, len(self) - 1, min(len(self), most)).astype(int))
+        return Surfaces(self.points[kept], self.normals[kept])
+
+    @staticmethod
+    def joined(several: Iterable[Surfaces]) -> Surfaces:
+        """Make one of several."""
+        parts = [(one.points, one.normals) for one in several]
+        points, normals = map(np.concatenate, zip(*parts, strict=True))
+        return Surfaces(points, normals)
+
+
+def surfaces_in(scan: Scan) -> Surfaces:
+    """Find the smooth surfaces that a scan shows, in the frame of the robot."""
+    laser, ranges, good = scan.laser, scan.ranges, in_sight(scan)
+    r = np.where(good, ranges, 0.0)
+    points = np.stack([r * np.cos(laser.bearings), r * np.sin(laser.bearings)], axis=1)
+    normals = np.full(points.shape, np.nan)
+    # The farthest neighbours that still lie on one line with the point give the best normal.
+    for k in (1, 2, 3):
+        if len(points) <= 2 * k:
+            break
+        middle = slice(k, len(points) - k)
+        line = points[2 * k :] - points[: -2 * k]
+        length = np.hypot(*line.T)
+        normal = np.stack([-line[:, 1], line[:, 0]], axis=1) / np.maximum(length, 1e-9)[:, None]
+        off = np.abs(products(points[middle] - points[: -2 * k], normal))
+        smooth = (
+            good[2 * k :]
+            & good[: -2 * k]
+            & good[middle]
+            & (length > 1e-6)
+            & (length < 0.25 + 0.1 * r[middle])
+            & (off < ROUGHNESS)
+        )
+        normals[middle][smooth] = normal[smooth]
+    on_surface = good & np.isfinite(normals[:, 0])
+    return Surfaces(points[on_surface], normals[on_surface]).moved(laser.mount)
+
+
+def in_sight(scan: Scan) -> NDArray[np.bool_]:
+    """Mask of the beams that meet something near enough to be matched, (beams,)."""
+    return np.asarray(np.isfinite(scan.ranges) & (scan.ranges < min(FARTHEST, scan.laser.reach)))
+
+
+def products(first: Array, second: Array) -> Array:
+    """The scalar products of vectors, (n, 2) each: (n,). A sum over an axis is slower."""
+    return np.asarray(first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class ScanFit:
+    """Moves a scan until its points lie on walls.
+
+    The scan is in the frame of the robot, and the walls are in the frame of the track.
+    """
+
+    scan: Surfaces
+    walls: Surfaces
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """The walls. These settings build the tree faster, and queries take no longer."""
+        return cKDTree(self.walls.points, compact_nodes=False, balanced_tree=False)
+
+    def improved(self, guess: Array, weight: Array) -> tuple[float, Array, Array]:
+        """Move a pose until the points lie on the walls, by Gauss-Newton steps.
+
+        `weight` is the (3, 3) inverse covariance of the guess. Returns the share of the points on
+        walls, the pose, and its inverse covariance.
+        """
+        information, pose, share = weight, guess, 0.0
+        for count in range(ROUNDS):
+            placed = points_moved(pose, self.scan.points)
+            distance, nearest = self.tree.query(
+                placed, distance_upper_bound=max(END, BEGIN * SHRINK**count)
+            )
+            met = np.flatnonzero(np.isfinite(distance))
+            facing = points_turned(pose[2], self.scan.normals[met])
+            alike = products(facing, self.walls.normals[nearest[met]])
+            met = met[np.abs(alike) > 0.8]
+            share = float((distance[met] < END).sum() / len(placed))
+            if len(met) < 5:
+                break
+            normal = self.walls.normals[nearest[met]]
+            off = products(placed[met] - self.walls.points[nearest[met]], normal)
+            arm = placed[met] - pose[:2]
+            jacobian = np.column_stack(
+                [normal, arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]]
+            )
+            # Cauchy weights give little influence to points that are far off.
+            weights = 1 / (TOGETHER * ROUGHNESS**2 * (1 + (off / (2 * ROUGHNESS)) ** 2))
+            astray = pose - guess
+            astray[2] = wrapped(astray[2])
+            information = jacobian.T @ (jacobian * weights[:, None]) + weight
+            step = np.linalg.solve(information, jacobian.T @ (weights * off) + weight @ astray)
+            pose = pose - step
+            if np.abs(step).max() < 1e-4:
+                break
+        return share, pose, information
+
+
+def contradicting_scans(log: RobotLog, track: Track) -> list[int]:
+    """Find the scans that match badly and contradict the scans before them."""
+    rare = float(np.nanpercentile(track.shares, RARELY)) - WORSE
+    return [
+        i
+        for i, share in _intruding_shares(log, track).items()
+        if share > (INTRUDING_RARELY if track.shares[i] < rare else INTRUDING)
+    ]
+
+
+def scans_after_a_carry(log: RobotLog, track: Track) -> list[int]:
+    """Find the scans to which the robot was carried, although the odometer does not jump.
+
+    Of contradicting scans near each other, the one that contradicts most is listed.
+    """
+    shares = _intruding_shares(log, track)
+    return [
+        i
+        for i, share in shares.items()
+        if share > INTRUDING
+        and (share, -i) == max((shares.get(k, 0.0), -k) for k in range(i - BESIDE, i + BESIDE + 1))
+    ]
+
+
+def _intruding_shares(log: RobotLog, track: Track) -> dict[int, float]:
+    """For each scan that matches badly, the share of points that intrude on either side."""
+    found: dict[int, float] = {}
+    # A scan without a share meets no wall, or the laser is covered.
+    seeing = ~np.isnan(track.shares)
+    for i in np.flatnonzero(track.shares < POORLY).tolist():
+        before = [k for k in range(max(0, i - BESIDE), i) if seeing[k]]
+        after = [k for k in range(i, min(len(log), i + BESIDE)) if seeing[k]]
+        if before and not track.cuts_between(i - BESIDE, i + BESIDE - 1):
+            # If the next scans do not contradict, this scan alone was matched wrongly.
+            found[i] = min(
+                _intruding_share(log, track, before, some) for some in (after, after[1:]) if some
+            )
+    return found
+
+
+def _intruding_share(
+    log: RobotLog, track: Track, before: Sequence[int], after: Sequence[int]
+) -> float:
+    """The share of the points of either scans that intrude on the others; 0 for few points."""
+    pairs = [pair for k in before for n in after for pair in ((k, n), (n, k))]
+    inside, seen = np.sum([_intruding(log, track, *pair) for pair in pairs], axis=0)
+    return float(inside / seen) if seen >= FEW_POINTS * len(pairs) else 0.0
+
+
+def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, int]:
+    """Count the points of scan `one` in the free space of `other`, and those in its view."""
+    pose = moved(track.pose(one), log.scans[one].laser.mount)
+    scan, laser = log.scans[other], log.scans[other].laser
+    x, y, heading = displacement_between(moved(track.pose(other), laser.mount), pose)
+    met = np.isfinite(log.scans[one].ranges) & (log.scans[one].ranges > 0)
+    angles = log.scans[one].laser.bearings[met] + heading
+    points = log.scans[one].ranges[met] * np.exp(1j * angles) + complex(x, y)
+    onward = math.copysign(1.0, laser.step)
+    beam = np.rint(onward * (np.angle(points) - laser.first) % math.tau / abs(laser.step))
+    beam = beam.astype(int)
+    in_view = (beam >= 1) & (beam < len(scan.ranges) - 1)
+    beam, far = beam[in_view], np.abs(points[in_view])
+    ranges = np.nan_to_num(scan.ranges, nan=0.0, posinf=laser.reach)
+    free, wall = (_neighbours(ranges, beam, best) for best in (np.min, np.max))
+    margin = MARGIN + MARGIN / 8 * far
+    return int((far < free - margin).sum()), int((far < wall + MARGIN).sum())
+
+
+def _neighbours(ranges: Array, beam: Array, best: Callable[..., Array]) -> Array:
+    """For each of k beams, the `best` (np.min or np.max) of its range and its neighbours', (k,)."""
+    return best([ranges[beam - 1], ranges[beam], ranges[beam + 1]], axis=0)

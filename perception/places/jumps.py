@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from perception.readers.poses import RecordedTrack as Odometry
 from perception.readers.poses import sources_of
-from perception.readers.scans import RobotLog, Scan
-from perception.readers.stored import in_turn
+from perception.readers.scans import RobotLog, Scan, in_turn
 from ssh_abduction.data.odometry import Pose, displacement_between
 from ssh_abduction.data.words import counted
 

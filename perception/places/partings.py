@@ -29,7 +29,15 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist, pdist, squareform
 
 from perception.places.closures import VisitMatch
-from perception.places.stays import RIM, SAME, STAY, are_near, joined, taken, with_ways_in_order
+from perception.places.distinctive import (
+    RIM,
+    SAME,
+    STAY,
+    are_near,
+    joined,
+    taken,
+    with_ways_in_order,
+)
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit, Way
 

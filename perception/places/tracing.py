@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.places.closures import NOISE, VisitMatch, uncertainty
+from perception.places.distinctive import RIM, SMALL
 from perception.places.local_map import CELL, PackedPatch
-from perception.places.stays import RIM, SMALL
 from perception.places.track import Array, Track, covariance_turned, points_turned, wrapped
 from perception.places.visits import Visit, Way, patches_of
 from perception.readers.scans import RobotLog

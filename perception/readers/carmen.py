@@ -47,31 +47,28 @@ from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.readers.carmen_survey import (
-    Findings,
-    Meaning,
-    meaning_of,
-    mount_in_log,
-    reach_of,
-    survey_of,
-    without_codes,
-)
-from perception.readers.lines import LONGEST_LINE, lines
-from perception.readers.messages import (
     EDGES,
     KINDS,
     VERTICES,
-    Damaged,
+    Findings,
+    Meaning,
     ScanLine,
     edge_of,
+    meaning_of,
+    mount_in_log,
     parameters_of,
     pose_at,
+    reach_of,
     refuse_cut,
     scan_line,
+    survey_of,
     time_at,
     vertex_of,
+    without_codes,
     words,
 )
-from perception.readers.scans import Damage, LaserScanner, Scan, SurveyedLog, laser_of
+from perception.readers.lines import LONGEST_LINE, lines
+from perception.readers.scans import Damage, Damaged, LaserScanner, Scan, SurveyedLog, laser_of
 from ssh_abduction.data.files import LINE_OF_A_LOG
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
-from perception.readers.scans import Scan, shared
-from perception.readers.stored import ScanTable, in_memory, in_turn
+from perception.readers.scans import Scan, ScanTable, in_memory, in_turn, shared
 from ssh_abduction.data.checks import a_number, numbers, one_of
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Pose, displacement_between

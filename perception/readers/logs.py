@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import IO, cast
 
 from perception.errors import LogError
-from perception.readers import bag_files, bag_topics, bags, carmen
+from perception.readers import bag_files, bags, carmen
 from perception.readers.echoes import LaserOptions, interpret_log, interpret_scan, interpreter_of
 from perception.readers.lines import LONGEST_LINE, Piped, lines, opened, piped
-from perception.readers.scans import Damage, RobotLog, Scan, SurveyedLog
-from perception.readers.stored import ScanTable
+from perception.readers.scans import Damage, RobotLog, Scan, ScanTable, SurveyedLog
 from ssh_abduction.data.checks import a_list, a_path, a_text
 from ssh_abduction.data.errors import brief, named
 from ssh_abduction.data.odometry import Pose
@@ -192,7 +191,7 @@ def _reading(
                 f"{named(path)}: expected a file of the format {format}, got a folder; name "
                 "the file"
             )
-        with bag_topics.bag_opened(path, "ros2") as bag:
+        with bag_files.bag_opened(path, "ros2") as bag:
             yield bags.read(bag, topics, odom_topic)
         return
     # A file is a log in lines or a bag, by its content.
@@ -206,7 +205,7 @@ def _reading(
                 )
             yield carmen.read(file, named(path), format)
             return
-    with bag_topics.bag_opened(path, found) as bag:
+    with bag_files.bag_opened(path, found) as bag:
         yield bags.read(bag, topics, odom_topic)
 
 

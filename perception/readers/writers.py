@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
-from perception.readers.bag_topics import TRANSFORMS, typestore
+from perception.readers.bag_files import TRANSFORMS, typestore
 from perception.readers.scans import LaserScanner, Scan
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import save_file

@@ -72,8 +72,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from perception.confidence import warn_of_doubts
-    from perception.quality import uncertainty_coefficient
+    from perception.quality import uncertainty_coefficient, warn_of_doubts
     from perception.views import ViewClusterer
     from ssh_abduction.learning.traces import Traces
 

@@ -142,8 +142,8 @@ def run(options: argparse.Namespace) -> int:
 def _drive(options: argparse.Namespace) -> RecordedDrive:
     """Simulate the drive to write as a robot's log. Raise AbductionError for wrong options."""
     from simulator.drive import EVERY
-    from simulator.odometer import Odometer
     from simulator.plans import Plan
+    from simulator.robot import Odometer
     from simulator.rounds import record_plan
     from simulator.tours import record
     from simulator.world import World

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator
 from sklearn.neighbors import NearestNeighbors
 
-from perception.confidence import NOISE, warn_of_doubts
+from perception.quality import NOISE, warn_of_doubts
 from perception.recognition import cloned, recogniser
 from perception.views import ISOLATED, ViewClusterer, as_view_clusterer
 from ssh_abduction.data.checks import a_whole_number

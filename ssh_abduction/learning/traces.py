@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from perception.appearance import features_of
-from perception.confidence import nearest_views
 from perception.errors import PerceptionError
 from perception.images import images_of
+from perception.quality import nearest_views
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import TraceError, brief, named
 from ssh_abduction.data.trace import Trace

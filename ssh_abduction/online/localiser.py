@@ -26,7 +26,7 @@ observed o:
 A map without its trace gives (4); a map with its trace gives (3). Robots make errors, so `Chances`
 gives the probabilities that (3) and (4) do not hold. There is also one more hypothesis: the robot
 is *nowhere*, that is, at no dstate of the map. Let f be (3) or (4), or the probability of an image
-by a recogniser's distances (perception/likelihood.py). Then
+by a recogniser's distances (perception/recognition.py). Then
 
     p(o|x)        = (1 - misread) f(o|x) + misread q(o)
     q(o)          = (Σ_x f(o|x) + g(o)) / (N + 1)
@@ -83,7 +83,7 @@ from ssh_abduction.online.estimates import (
 )
 
 if TYPE_CHECKING:
-    from perception.likelihood import ImageLikelihood
+    from perception.recognition import ImageLikelihood
 
 # Dead reckoning follows a robot outside the map for this many steps.
 MOST_AWAY = 20
@@ -407,7 +407,7 @@ class Localiser:
 
     def _likelihood(self, recogniser: Any) -> ImageLikelihood:
         """Make the object that computes how probable an image is at each dstate."""
-        from perception.likelihood import ImageLikelihood
+        from perception.recognition import ImageLikelihood
 
         found = ImageLikelihood.of(recogniser)
         classes = found.classes

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from perception.places.importing import Imported
-from perception.readers.scans import RobotLog, Scan
-from perception.readers.stored import in_turn
+from perception.readers.scans import RobotLog, Scan, in_turn
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
