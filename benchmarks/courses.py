@@ -104,7 +104,8 @@ def joins_of(trace: Trace, solution: Solution) -> list[tuple[float, bool]]:
 
     Args:
         trace: The trace of a log, with poses as its truth.
-        solution: Its maps, with probabilities; without them there are no joins.
+        solution: Its maps, with probabilities; without them, as if a limit ended the search, there
+            are no joins.
     """
     told = told_poses(trace)
     visit = [0]
@@ -112,8 +113,8 @@ def joins_of(trace: Trace, solution: Solution) -> list[tuple[float, bool]]:
         visit.append(visit[-1] if action.kind == "turn" else t)
     return [
         (probability, math.dist(told[first][:2], told[second][:2]) <= ONE)  # type: ignore[index]
-        for first, second, probability in (solution.weighed.joins if solution.weighed else ())
-        if visit[first] != visit[second]
+        for first, second, probability in (solution.weighed and solution.weighed.joins) or ()
+        if visit[first] != visit[second] and probability is not None
     ]
 
 

@@ -304,7 +304,7 @@ def joins(solution: Solution, known: Known) -> tuple[tuple[float, bool], ...]:
 
     Returns:
         For each join, the probability that the solver gives it, and whether it is true. Empty if
-        maps are counted, or if their costs cannot be trusted.
+        maps are counted, if their costs cannot be trusted, or if a limit ended the search.
     """
     if solution.weighed is None or solution.weighed.doubt is not None:
         return ()
@@ -319,7 +319,8 @@ def joins(solution: Solution, known: Known) -> tuple[tuple[float, bool], ...]:
             truth = known.dstates if at[step] is None else known.places
             of = "dstate" if at[step] is None else "place"
             probability = solution.probability(before, step, of)
-            found.append((probability, truth[before] == truth[step]))
+            if probability is not None:  # a finished search
+                found.append((probability, truth[before] == truth[step]))
         last[place] = step
     return tuple(found)
 
