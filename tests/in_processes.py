@@ -70,6 +70,19 @@ def stay(_: int, path: str, __: Callable[[], bool]) -> None:
     time.sleep(1000)
 
 
+def hand_over_and_vanish(number: int, path: str, _: Callable[[], bool]) -> None:
+    """Hand two things over, and end without an answer."""
+    workers.hand_over("first")
+    workers.hand_over("second")
+    vanish(number, path, _)
+
+
+def hand_over_and_stay(number: int, path: str, _: Callable[[], bool]) -> None:
+    """Hand something over, and ignore all signals."""
+    workers.hand_over("first")
+    stay(number, path, _)
+
+
 def answer_and_end(number: int, seconds: float, _: Callable[[], bool]) -> None:
     """Answer, and end this process some seconds later, as a guard does at a limit."""
     workers.reply(number)

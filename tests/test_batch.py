@@ -24,8 +24,8 @@ from coarse import hall
 from worlds import ENDLESS, TOURS, drive, rectangle
 
 from perception.readers.writers import write_carmen
-from ssh_abduction import Theory, Trace
-from ssh_abduction.cli import cluster_jobs, main, mapping
+from ssh_abduction import Solution, Theory, Trace
+from ssh_abduction.cli import batch, cluster_jobs, main, mapping
 from ssh_abduction.cli.batch import SolveQuestion
 from ssh_abduction.cli.cluster_jobs import Absence, answers_on_cluster
 from ssh_abduction.cli.jobs import FileAnswer, answers_here
@@ -48,6 +48,41 @@ class Deadly(SolveQuestion):
             time.sleep(0.3)  # let other traces start
             os.kill(os.getpid(), signal.SIGKILL)
         return SolveQuestion.answer(self, number, path, *rest)
+
+
+class Killed(SolveQuestion):
+    """Kill the process of a search that is not hurried, once it has handed a map over.
+
+    Traces named early are killed before that.
+    """
+
+    def answer(self, number: int, path: str, *rest: Any) -> FileAnswer:
+        if self.limit is None or self.limit > batch.HURRY:
+            if "early" in path:
+                os.kill(os.getpid(), signal.SIGKILL)
+            hand_over = workers.hand_over
+
+            def killed(known: object) -> None:
+                hand_over(known)
+                os.kill(os.getpid(), signal.SIGKILL)
+
+            workers.hand_over = killed
+        return SolveQuestion.answer(self, number, path, *rest)
+
+
+class KilledMapping(MapQuestion):
+    """Kill the process that maps a log, once it has handed a map over."""
+
+    def answer(self, number: int, path: str, *rest: Any) -> FileAnswer:
+        if self.known is None:
+            hand_over = workers.hand_over
+
+            def killed(known: object) -> None:
+                hand_over(known)
+                os.kill(os.getpid(), signal.SIGKILL)
+
+            workers.hand_over = killed
+        return MapQuestion.answer(self, number, path, *rest)
 
 
 class KilledOnce(MapQuestion):
@@ -361,6 +396,77 @@ def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler:
             assert lines[number].startswith(
                 f"{path}: {'error: process: expected' if 'deadly' in path else 'optimal'}"
             )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize("as_json", [False, True])
+def test_killed_process_loses_no_map(as_json: bool, traces: Path, scheduler: str) -> None:
+    endless = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
+    (traces / "early.jsonl").write_text((traces / "slow.jsonl").read_text())
+    killed = Killed(endless, 1000, 0, 10**6, Speedups(), as_json)
+    paths, stop = ["slow.jsonl", "early.jsonl", "slow.jsonl"], StopFlag()
+    for answers in (
+        answers_here(killed, paths, 2, stop),
+        answers_on_cluster(killed, paths, scheduler, None, stop),
+    ):
+        found = {answer.number: answer for answer in answers}
+        assert sorted(found) == [*range(len(paths))]
+        for number, path in enumerate(paths):
+            answer = found[number]
+            why = "memory" if "slow" in path else "time"
+            assert f"{why} limit" in answer.line
+            assert "feasible" in answer.line
+            assert answer.code == 10
+            assert answer.warnings[-1].startswith(f"{path}: process: expected an answer, got a ")
+            if as_json:
+                solution = Solution.from_dict(json.loads(answer.line))
+                assert (len(solution), solution.bound.dstates) > (0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_killed_process_loses_no_map_of_a_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The next call maps the log again."""
+    log, folder = str(tmp_path / "hall.log"), tmp_path / "runs"
+    write_carmen(log, hall()[:80])
+    command = ["map", log, "-o", str(folder), "--jobs", "1"]
+    with monkeypatch.context() as patched:
+        patched.setattr(mapping, "MapQuestion", KilledMapping)
+        assert main(command) in (0, 10)
+    assert "got a killed process" in capsys.readouterr().err
+    assert len(Solution.load(folder / "maps.json")) > 0
+    assert json.loads((folder / "run.json").read_text())["interrupted"]
+    assert main(command) in (0, 10)
+    assert "done already" not in capsys.readouterr().out
+
+
+# Adds up numbers for about a minute on an idle processor.
+BUSY = "for number in range(10**9): pass"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="slow start of processes")
+@pytest.mark.parametrize("words", [["--memory-limit", "2000"], ["--scheduler"]])
+def test_no_map_is_lost_to_load(words: list[str], traces: Path, scheduler: str) -> None:
+    """Twenty busy processes for each processor."""
+    paths = [f"slow{number}.jsonl" for number in range(4)]
+    for path in paths:
+        shutil.copy("slow.jsonl", path)
+    command = [sys.executable, "-m", "ssh_abduction", "solve", *paths, *ENDLESS, "--jobs", "2"]
+    command += [*words, *([scheduler] if "--scheduler" in words else []), "--time-limit", "0.5"]
+    busy = [sys.executable, "-c", BUSY]
+    load = [subprocess.Popen(busy) for _ in range(20 * (os.cpu_count() or 1))]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    finally:
+        for process in load:
+            process.kill()
+            process.wait()
+    assert [line.partition(":")[2][:9] for line in done.stdout.splitlines()] == [" feasible"] * 4
+    assert done.returncode == 10
 
 
 @pytest.mark.slow

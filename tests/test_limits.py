@@ -19,14 +19,21 @@ from pathlib import Path
 
 import clingo
 import pytest
-from in_processes import answer_and_end, sleep, stay, vanish
+from in_processes import (
+    answer_and_end,
+    hand_over_and_stay,
+    hand_over_and_vanish,
+    sleep,
+    stay,
+    vanish,
+)
 from limits import Case, cases, outcome
 from worlds import rectangle
 
 import ssh_abduction
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.checker.proof import check_bound
-from ssh_abduction.cli import main
+from ssh_abduction.cli import guard, main
 from ssh_abduction.explain import explain, explain_pair, explain_trace
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
 from ssh_abduction.solver import Search, Status, check_rules, find_backbone
@@ -269,6 +276,7 @@ def test_dead_or_late_worker_loses_only_its_task(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(workers, "STARTING", 0.5)
+    monkeypatch.setattr(workers, "STARVED", 1.0)
     path = str(tmp_path / "pid")
     assert list(workers.answers(vanish, [(7, path), (8, path)], 1, lambda: False, None, 1.0)) == [
         workers.Lost(7, False),
@@ -277,6 +285,37 @@ def test_dead_or_late_worker_loses_only_its_task(
     assert list(workers.answers(stay, [(9, path)], 1, lambda: False, 0.1, 1.0)) == [
         workers.Lost(9, True)
     ]
+
+
+def test_lost_task_has_what_its_process_handed_over_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "STARTING", 0.5)
+    monkeypatch.setattr(workers, "STARVED", math.inf)
+    tasks = [(number, str(tmp_path / "pid")) for number in range(2)]
+    found = workers.answers(hand_over_and_vanish, tasks, 1, lambda: False, None, 1.0)
+    assert list(found) == [workers.Lost(number, False, "second") for number in range(2)]
+    found = workers.answers(hand_over_and_stay, tasks[:1], 1, lambda: False, 0.1, 1.0)
+    assert list(found) == [workers.Lost(0, True, "first")]
+
+
+@pytest.mark.parametrize(
+    ("known", "used", "is_late"),
+    [
+        ((), 0.0, True),
+        (None, 0.9, False),
+        (None, 1.1, True),
+    ],
+)
+def test_guard_lets_a_starving_search_find_its_first_map(
+    known: tuple[object, ...] | None, used: float, is_late: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second of the clock is over, of which the process had `used` seconds of the processor."""
+    monkeypatch.setattr(guard, "LATE", (1.0, 0.0))
+    guarding = guard.Guard(lambda: None, limit=1.0, known=lambda: known)
+    guarding._began -= 1.1
+    monkeypatch.setattr(guarding, "_used", lambda: used)
+    assert (guarding._why() == "time limit") == is_late
 
 
 def test_stopped_workers_answer_and_start_nothing() -> None:

@@ -11,11 +11,11 @@ import contextlib
 import ctypes
 import gc
 import sys
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from ssh_abduction.cli import EXIT_ERROR
 from ssh_abduction.cli.cluster_jobs import answers_of
@@ -49,6 +49,25 @@ from ssh_abduction.theory.theory import Theory
 # This is a last resort: a process should end itself earlier, by its `Guard`. On a busy machine the
 # Guard may be several seconds late.
 GUARDED, OVERDUE = 1.2, 10.0
+# If a process ended without a map, another one searches for this many seconds. Then it makes a map
+# without a search, however long that takes.
+HURRY = 0.5
+
+
+class Known(NamedTuple):
+    """What is known of the answer for a trace: plain data, which another process can print."""
+
+    solution: Solution
+    found: int  # the number of maps that were found
+    explanation: Explanation | None
+    warnings: Sequence[str]
+
+    @classmethod
+    def of(
+        cls, search: Search, solution: Solution, explanation: Explanation | None = None
+    ) -> Known:
+        """Collect what is known from a search and its solution."""
+        return cls(solution, search.count, explanation, Warnings(search).of(solution))
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +143,8 @@ class SolveQuestion(FileQuestion):
             for ssh_map in search:
                 kept += [ssh_map] if self.json else []
             explanation = why_no_map(search)
-            solution = search.solution(tuple(kept))
-            return self._answer(number, path, search, solution, explanation, search.backbone)
+            known = Known.of(search, search.solution(tuple(kept)), explanation)
+            return self._answer(number, path, known, search.backbone)
 
     def _guarded(
         self,
@@ -141,7 +160,7 @@ class SolveQuestion(FileQuestion):
             try:
                 solution = search.snapshot(why)
                 solution = replace(solution, maps=tuple(kept) or solution.maps)
-                answer = self._answer(number, path, search, solution, None, None)
+                answer = self._answer(number, path, Known.of(search, solution))
             except Exception as error:  # without an answer, the process would seem to be killed
                 answer = self.failed(number, path, error)
             # Nobody reads the exit code of this process.
@@ -149,25 +168,45 @@ class SolveQuestion(FileQuestion):
 
         if not workers.serves():
             return contextlib.nullcontext()
-        return Guard(search.interrupt, last_words, self.limit, self.memory, given_up=given_up)
+        return Guard(
+            search.interrupt,
+            last_words,
+            self.limit,
+            self.memory,
+            given_up=given_up,
+            known=lambda: (search.best, search.bound) if search.best else None,
+            hand_over=lambda: workers.hand_over(Known.of(search, search.so_far("time limit"))),
+        )
+
+    def rescued(self, lost: workers.Lost, path: str, *, stopped: bool) -> FileAnswer | None:
+        """Implement `FileQuestion.rescued`: answer with the best map so far."""
+        if lost.known is None:
+            return None
+        known: Known = lost.known
+        why: Stop = "interrupted" if stopped else "time limit" if lost.late else "memory limit"
+        known = known._replace(solution=replace(known.solution, stopped=why))
+        answer = self._answer(lost.number, path, known)
+        return answer if stopped else self.warned(answer, path, self.warning_of(lost))
+
+    def hurried(self, known: Known | None) -> SolveQuestion:
+        """Implement `FileQuestion.hurried`: give the search little time."""
+        return replace(self, limit=min(self.limit or HURRY, HURRY))
+
+    def warned(self, answer: FileAnswer, path: str, warning: str) -> FileAnswer:
+        return replace(answer, warnings=(*answer.warnings, f"{named(path)}: {warning}"))
 
     def _answer(
-        self,
-        number: int,
-        path: str,
-        search: Search,
-        solution: Solution,
-        explanation: Explanation | None,
-        backbone: Backbone | None,
+        self, number: int, path: str, known: Known, backbone: Backbone | None = None
     ) -> FileAnswer:
         """Make the answer for a solution: its line, exit code and warnings."""
-        found = Warnings(search).of(solution)
+        solution, count, explanation, found = known
         if self.json:
             written = [written_map(*given) for given in all_given(solution)]
+            opening = answer_opening(solution)
             ending = answer_ending(solution, explanation, len(written), backbone, found)
-            line = json_line({"trace": path, **answer_opening(search), "maps": written, **ending})
+            line = json_line({"trace": path, **opening, "maps": written, **ending})
         else:
-            line = f"{named(path)}: {headline(solution, search.count, explanation)}"
+            line = f"{named(path)}: {headline(solution, count, explanation)}"
         where = f"{named(path)}:"
         warnings = tuple(text if text.startswith(where) else f"{where} {text}" for text in found)
         return FileAnswer(number, line, exit_code(solution), warnings)

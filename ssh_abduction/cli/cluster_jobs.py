@@ -13,7 +13,12 @@ from concurrent.futures import CancelledError
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from ssh_abduction.cli.jobs import FileQuestion, answers_here
+from ssh_abduction.cli.jobs import (
+    FileQuestion,
+    answers_here,
+    answers_of_processes,
+    hurried_answer,
+)
 from ssh_abduction.cli.outcome import StopFlag, warn
 from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError, SolverError, brief
@@ -78,7 +83,7 @@ def answers_on_cluster(
         most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
         absence = Absence(lambda: len(client.ncores()), question.limit, address)
         attempt = partial(_on_workers, question, client, most, absence)
-        for answer in _answers(question, paths, attempt):
+        for answer in _answers(question, paths, attempt, stop.is_set):
             yield answer
             if stop.is_set():
                 return
@@ -88,12 +93,13 @@ def _answers(
     question: FileQuestion,
     paths: Sequence[str],
     attempt: Callable[[list[Task], list[Task]], Iterator[Any]],
+    stopped: Callable[[], bool],
 ) -> Iterator[Any]:
     """Yield answers in any order, and find out which files kill their workers.
 
     When a worker is killed, all files that it was working on are suspects. Try each suspect again
-    alone. If its worker is killed again, the file is to blame and gets a lost answer. `attempt`
-    appends the suspects to its second argument.
+    alone. If its worker is killed again, the file is to blame, and a process here makes some map
+    soon. `attempt` appends the suspects to its second argument.
     """
     suspects: list[Task] = []
     yield from attempt([*enumerate(paths)], suspects)
@@ -101,7 +107,8 @@ def _answers(
         again: list[Task] = []
         yield from attempt([task], again)
         for _ in again:
-            yield question.lost(workers.Lost(task[0], late=False), task[1])
+            lost = workers.Lost(task[0], late=False)
+            yield from hurried_answer(question, (*task, None), lost, stopped)
 
 
 class Absence:
@@ -234,6 +241,4 @@ def _on_worker(question: FileQuestion, number: int, path: str, content: Any) -> 
         return question.answer(number, path, content, given_up)
     # A task that exceeds its limits is killed together with its process. So it gets its own
     # process, as other tasks may run in this one.
-    work, limits = [(number, path, content)], (question.overdue, question.patience)
-    answer: Any = next(workers.answers(question.answer, work, 1, given_up, *limits))
-    return question.lost(answer, path) if isinstance(answer, workers.Lost) else answer
+    return next(answers_of_processes(question, [(number, path, content)], 1, given_up), None)

@@ -16,14 +16,25 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from operator import is_not
 from types import TracebackType
 from typing import NoReturn, Self
 
 from ssh_abduction.runtime import program
-from ssh_abduction.solver import POLL, WAITING, Stop, end_all, processor_clock, resident_memory
+from ssh_abduction.solver import (
+    POLL,
+    STARVED,
+    WAITING,
+    Stop,
+    end_all,
+    processor_clock,
+    resident_memory,
+)
 
 # A search is ended after the first number times its time limit, plus the second in seconds.
 LATE = 1.1, 0.8
+# To hand over what is known may take one of this many seconds.
+HANDING = 10.0
 # A search is ended at the first number times its memory limit, plus the second in MiB.
 LARGE = 1.1, 100.0
 # A search must end within this many seconds after Ctrl-C.
@@ -47,6 +58,8 @@ class Guard:
         limit: The time limit in seconds; None for no limit.
         memory: The memory limit in MiB; None for no limit.
         given_up: Returns whether the answer is not needed any more.
+        known: Returns the best map so far, and other objects that improve; None without a map.
+        hand_over: Is called soon after `known` returns another object. It may raise exceptions.
     """
 
     def __init__(
@@ -58,14 +71,20 @@ class Guard:
         memory: float | None = None,
         *,
         given_up: Callable[[], bool] = lambda: False,
+        known: Callable[[], tuple[object, ...] | None] = tuple,
+        hand_over: Callable[[], None] = lambda: None,
     ) -> None:
         self._interrupt, self._last_words, self._given_up = interrupt, last_words, given_up
+        self._known, self._hand_over = known, hand_over
+        self._handed: tuple[object, ...] | None = None  # what was known then
+        self._hands_at = 0.0  # when the next map may be handed over
         self._limit, self._memory = limit, memory
         self._signals, self._printer = _Signals(), _Printer()
         self._finished: int | None = None  # the exit code, once the whole answer is printed
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._over = threading.Event()
         self._began = time.monotonic()
+        self._used = processor_clock(time.process_time, STARVED)
         self._since_call: Callable[[], float] | None = None  # the seconds since Ctrl-C
 
     def __enter__(self) -> Self:
@@ -105,6 +124,7 @@ class Guard:
         """Watch the limits and signals, in the second thread, until the `with` block ends."""
         speaking = self._printer.speaking
         while not self._over.wait(POLL):
+            self._hand_over_news()
             if self._is_called():
                 self._interrupt()
             why = self._why()
@@ -116,6 +136,18 @@ class Guard:
                     speaking.release()
             elif self._is_deaf() and self._printer.is_unread():
                 self._leave(program.interrupted_code())
+
+    def _hand_over_news(self) -> None:
+        """Hand over what is known if it is new, in at most a tenth of the time."""
+        known, begun = self._known(), time.monotonic()
+        if known is None or begun < self._hands_at:
+            return
+        if self._handed is None or any(map(is_not, known, self._handed)):
+            # The other thread changes data that are read here. If this fails, try again later.
+            with suppress(Exception):
+                self._hand_over()
+                self._handed = known
+            self._hands_at = begun + HANDING * (time.monotonic() - begun)
 
     def _is_called(self) -> bool:
         """Whether the search has to end: a signal arrived, or nobody needs the answer any more."""
@@ -132,12 +164,16 @@ class Guard:
         """The reason to end the process now; None if there is none."""
         if self._is_deaf():
             return "interrupted"
-        seconds = time.monotonic() - self._began - self._printer.waited
-        if self._limit is not None and seconds > LATE[0] * self._limit + LATE[1]:
+        if self._limit is not None and self._is_late(LATE[0] * self._limit + LATE[1]):
             return "time limit"
         if self._memory is not None and resident_memory() > LARGE[0] * self._memory + LARGE[1]:
             return "memory limit"
         return None
+
+    def _is_late(self, most: float) -> bool:
+        """Whether the search took more than `most` seconds; longer if it starves without a map."""
+        seconds = time.monotonic() - self._began - self._printer.waited
+        return seconds > most and (self._known() is not None or self._used() > most)
 
     def _is_deaf(self) -> bool:
         """Whether the search still runs although it was asked to end more than DEAF seconds ago."""

@@ -6,9 +6,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol, TypeAlias
 
 from ssh_abduction.cli import EXIT_ERROR
 from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c
@@ -16,6 +16,9 @@ from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, SolverError, printable
 from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
 from ssh_abduction.solver import workers
+
+# The number of a file, its path, and its content; None to read it in the process.
+Task: TypeAlias = tuple[int, str, Any]
 
 
 def in_a_line(error: Exception) -> str:
@@ -71,9 +74,35 @@ class FileQuestion(Protocol):
             given_up: Returns whether the answer is not needed any more.
         """
 
+    def why_lost(self, lost: workers.Lost) -> str:
+        """Say why a process ended without an answer."""
+        return self.late if lost.late else self.killed
+
+    def warning_of(self, lost: workers.Lost) -> str:
+        """Say why the map of a file is only the best one until its process ended."""
+        return f"{self.why_lost(lost)}; its map is the best one until then"
+
+    def rescued(self, lost: workers.Lost, path: str, *, stopped: bool) -> Any:
+        """Make an answer of what a process handed over before it ended; None if that is too little.
+
+        `stopped` says whether a person ended it.
+        """
+        return None
+
+    def hurried(self, known: Any) -> FileQuestion:
+        """Return the question whose answer is some map that is found soon.
+
+        `known` is what a process handed over before it ended; None if it handed nothing over.
+        """
+        return self
+
+    def warned(self, answer: Any, path: str, warning: str) -> Any:
+        """Return an answer with one more warning."""
+        return replace(answer, warnings=(*answer.warnings, warning))
+
     def lost(self, lost: workers.Lost, path: str) -> Any:
         """Make the answer for a file whose process ended without an answer."""
-        return self.failed(lost.number, path, SolverError(self.late if lost.late else self.killed))
+        return self.failed(lost.number, path, SolverError(self.why_lost(lost)))
 
     def failed(self, number: int, path: str, error: Exception) -> Any:
         """Make the answer for a file that raised an error."""
@@ -84,9 +113,9 @@ def answers_here(
 ) -> Generator[Any]:
     """Yield answers from processes of this machine, in the order in which they are ready.
 
-    `jobs` is the number of processes; -1 for one per core. If a process is killed, only its own
-    file is lost. Ctrl-C sets `stop`, which the processes watch. Unfinished files then still
-    yield what is known. A second Ctrl-C raises KeyboardInterrupt.
+    `jobs` is the number of processes; -1 for one per core. Ctrl-C sets `stop`, which the processes
+    watch. Unfinished files then still yield what is known. A second Ctrl-C raises
+    KeyboardInterrupt.
     """
 
     from joblib import effective_n_jobs
@@ -94,13 +123,48 @@ def answers_here(
     tasks = [(number, path, None) for number, path in enumerate(paths)]
     processes = min(effective_n_jobs(jobs), len(paths))
     with on_ctrl_c(stop.ask):
-        for answer in workers.answers(
-            question.answer, tasks, processes, stop.is_set, question.overdue, question.patience
-        ):
-            if not isinstance(answer, workers.Lost):
-                yield answer
-            elif not stop.is_set():  # a process that was stopped without an answer is no error
-                yield question.lost(answer, paths[answer.number])
+        yield from answers_of_processes(question, tasks, processes, stop.is_set)
+
+
+def answers_of_processes(
+    question: FileQuestion,
+    tasks: Sequence[Task],
+    processes: int,
+    stopped: Callable[[], bool],
+) -> Iterator[Any]:
+    """Yield the answers for some files from processes of this machine.
+
+    If a process is killed or late, the last map that it handed over is its answer. If it had none,
+    another process makes some map soon. Only if that is killed, too, the answer is an error.
+    `stopped` returns whether to end early.
+    """
+    losses: list[workers.Lost] = []
+    by_number = {task[0]: task for task in tasks}
+    limits = question.overdue, question.patience
+    for answer in workers.answers(question.answer, tasks, processes, stopped, *limits):
+        if not isinstance(answer, workers.Lost):
+            yield answer
+            continue
+        rescued = question.rescued(answer, by_number[answer.number][1], stopped=stopped())
+        if rescued is not None:
+            yield rescued
+        elif not stopped():  # a process that was stopped without an answer is no error
+            losses.append(answer)
+    for lost in losses:
+        yield from hurried_answer(question, by_number[lost.number], lost, stopped)
+
+
+def hurried_answer(
+    question: FileQuestion, task: Task, lost: workers.Lost, stopped: Callable[[], bool]
+) -> Iterator[Any]:
+    """Yield some map from another process, after the process of a task ended without one."""
+    hurried, path = question.hurried(lost.known), task[1]
+    limits = hurried.overdue, hurried.patience
+    for answer in workers.answers(hurried.answer, [task], 1, stopped, *limits):
+        if not isinstance(answer, workers.Lost):
+            yield question.warned(answer, path, question.warning_of(lost))
+        elif not stopped():
+            yield question.lost(lost, path)
 
 
 def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> int:

@@ -39,6 +39,7 @@ from ssh_abduction.cli.text import counted
 from ssh_abduction.data.corrections import ASSERTIONS, Corrections
 from ssh_abduction.data.corrections_file import beside, load_corrections, to_yaml
 from ssh_abduction.data.errors import AbductionError, MapError, brief, named
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.words import attributes_of
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, check_limit, workers
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 from ssh_abduction.robot_logs.log_picture import paths_mean_something
 
 GIVEN_UP = "expected time to map this log, got an interruption; map it again"
+HURRY = 0.5  # seconds for the search, after the process that mapped the log was killed
 KEPT = 64  # the copy of a log for a worker keeps this many last characters of its name
 
 
@@ -71,12 +73,22 @@ class MapQuestion(FileQuestion):
     ladder: bool  # whether to compute what each kind of evidence contributes
     # Names and corrections of a person, to be obeyed; None for none.
     corrections: Corrections | None = None
+    # The best maps of a process that mapped the log and was killed; None if none was killed.
+    known: tuple[SSHMap, ...] | None = None
 
     patience: ClassVar = 10.0
     killed: ClassVar = (
         "process: expected an answer, got a killed process, as when memory runs out; map fewer "
         "logs at a time (--jobs)"
     )
+
+    def hurried(self, known: SSHMap | None) -> MapQuestion:
+        """Implement `FileQuestion.hurried`: go on from the best map, and give the search no time.
+
+        The run counts as interrupted, so that the next call maps the log again.
+        """
+        maps = () if known is None else (known,)
+        return replace(self, limit=HURRY, ladder=False, known=maps)
 
     def obeying(self, folder: Path) -> MapQuestion:
         """Return this question with the corrections in a folder, if any. Raises MapError."""
@@ -174,14 +186,22 @@ class MapQuestion(FileQuestion):
                 answer = self._answer(number, paths, begun[0].known(), content, started)
             return "", interrupted_code(), partial(keep or workers.reply, answer)
 
-        guard = Guard(interrupt, last_words, given_up=given_up)
+        def best() -> tuple[SSHMap] | None:
+            search = begun[0].search if begun else None
+            return (search.best,) if search and search.best else None
+
+        def hand_over() -> None:
+            if workers.serves() and (found := best()):
+                workers.hand_over(found[0])
+
+        guard = Guard(interrupt, last_words, given_up=given_up, known=best, hand_over=hand_over)
         # A worker process does not handle Ctrl-C: its parent stops it.
         with contextlib.nullcontext() if workers.serves() else on_ctrl_c(end), guard:
             from perception.readers.logs import read_log
-            from ssh_abduction.robot_logs.log_maps import LogMapping, map_log
+            from ssh_abduction.robot_logs.log_maps import INTERRUPTED, LogMapping, map_log
 
             logs = [read_log(file, **self.reading) for file in files]
-            begun.append(LogMapping())
+            begun.append(LogMapping(self.known or ()))
             for log, name in zip(logs, names, strict=True):
                 for warning in log.warnings:
                     tell(warning if len(logs) == 1 else f"{name}: {warning}")
@@ -200,6 +220,8 @@ class MapQuestion(FileQuestion):
             )
             if self.corrections:
                 say_obeyed(self.corrections, done.imported.trace)
+            if self.known is not None:
+                done = replace(done, interrupted=True, notes=(*done.notes, INTERRUPTED))
             answer = self._answer(number, paths, done, content, started)
             if keep:
                 guard.finish(answer.code, save=partial(keep, answer))
@@ -241,7 +263,8 @@ class MapQuestion(FileQuestion):
         seconds = f"{time.monotonic() - started:.1f} s"
         parts = [found, how, joins, solution.joined, f"{visits} in {way}", seconds]
         line = f"{' + '.join(map(named, paths))}: {'; '.join(filter(None, parts))}"
-        code = interrupted_code() if done.interrupted else exit_code(solution)
+        is_ended = done.interrupted and self.known is None  # by a person
+        code = interrupted_code() if is_ended else exit_code(solution)
         notes = (*log.warnings, *done.notes, *solution.warnings)
         return FileAnswer(number, line, code, notes, tuple(files.items()))
 

@@ -65,9 +65,11 @@ def why_no_map(search: Search) -> Explanation | None:
         return Explanation(clash.start, clash.stop - 1, ()) if clash else None
 
 
-def answer_opening(search: Search) -> dict[str, Any]:
+def answer_opening(found: Search | Solution) -> dict[str, Any]:
     """Make the fields of a solution's JSON that come before its maps."""
-    return written_opening(search.theory, len(search.trace), search.limits.within)
+    if isinstance(found, Search):
+        return written_opening(found.theory, len(found.trace), found.limits.within)
+    return written_opening(found.theory, found.steps, found.within)
 
 
 def all_given(solution: Solution) -> list[Given]:

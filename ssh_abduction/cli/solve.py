@@ -214,7 +214,12 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
                 return printed.last_words(solution), exit_code(solution), save
 
             limits = options.time_limit, options.memory_limit
-            guard = Guard(search.interrupt, last_words, *limits)
+            guard = Guard(
+                search.interrupt,
+                last_words,
+                *limits,
+                known=lambda: (search.best,) if search.best else None,
+            )
             until_printed.enter_context(guard)
             explanation = printed.searched(guard.say)
         solution = obeying.finished(search.solution(tuple(printed.kept)), options.time_limit)

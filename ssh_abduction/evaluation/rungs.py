@@ -25,9 +25,10 @@ from typing import Any
 
 from ssh_abduction.data.checks import a_count_of_maps, a_flag, an_instance
 from ssh_abduction.data.errors import MapError, SolverError, TheoryError
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.evaluation import Evaluation, evaluate, tells_names
-from ssh_abduction.solver import Search, Solution, check_limit
+from ssh_abduction.solver import Search, Solution, Start, check_limit
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -71,10 +72,12 @@ class Rung:
 class UnderWay:
     """A series of searches that can be ended together.
 
-    A signal handler or another thread can end the current search and all later ones.
+    A signal handler or another thread can end the current search and all later ones. Each search
+    begins with the `known` maps that the checker accepts.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, known: tuple[SSHMap, ...] = ()) -> None:
+        self._start = Start(known=known)
         self.search: Search | None = None  # the current or last search; None before the first one
         self.interrupted = False  # whether `interrupt` was called, or Ctrl-C ended a search
 
@@ -98,7 +101,9 @@ class UnderWay:
     ) -> Solution:
         """Solve a trace as `ssh_abduction.solve` does. Ctrl-C ends this and all later searches."""
         theory.check_steps(trace)
-        self.search = Search(trace, theory, time_limit=time_limit, max_maps=max_maps)
+        self.search = Search(
+            trace, theory, time_limit=time_limit, max_maps=max_maps, _start=self._start
+        )
         if self.interrupted:  # perhaps before there was a search
             self.search.interrupt()
         solution = self.search.solution(tuple(self.search))

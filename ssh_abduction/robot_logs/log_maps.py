@@ -250,10 +250,13 @@ def how_it_ended(solution: Solution, allowed: float) -> str | None:
 
 
 class LogMapping(UnderWay):
-    """The mapping of a log while it runs. Another thread or a signal handler may interrupt it."""
+    """The mapping of a log while it runs. Another thread or a signal handler may interrupt it.
 
-    def __init__(self) -> None:
-        super().__init__()
+    Each search begins with the `known` maps that the checker accepts.
+    """
+
+    def __init__(self, known: tuple[SSHMap, ...] = ()) -> None:
+        super().__init__(known)
         self.latest: Callable[[], LogMap] | None = None  # what `known` returns
 
     def known(self) -> LogMap:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp import workers as workers
     from ssh_abduction.solver.asp.control import Control as Control
     from ssh_abduction.solver.asp.limits import POLL as POLL
+    from ssh_abduction.solver.asp.limits import STARVED as STARVED
     from ssh_abduction.solver.asp.limits import WAITING as WAITING
     from ssh_abduction.solver.asp.limits import LimitError as LimitError
     from ssh_abduction.solver.asp.limits import Stop as Stop

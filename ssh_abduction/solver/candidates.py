@@ -20,7 +20,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.limits import LimitError, Watch, processor_clock
+from ssh_abduction.solver.asp.limits import STARVED, LimitError, Watch, processor_clock
 from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond, sketches_of
 from ssh_abduction.solver.guesses.mended import first_contradiction, mended_sketch
 from ssh_abduction.solver.guesses.separate import has_no_frames, separate_map
@@ -192,7 +192,7 @@ class Candidates:
                 before = self._known.best
                 share = 1.0 if attempt in (surest, *smaller[-1:]) else SKETCH_SHARE
                 part = (
-                    Watch().part(max(seconds, SUREST), processor_clock())
+                    Watch().part(max(seconds, SUREST), processor_clock(waiting=STARVED))
                     if attempt is surest
                     else whole.part(share * whole.left())
                 )

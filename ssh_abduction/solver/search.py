@@ -448,14 +448,24 @@ class Search:
             if known.status in (Status.UNKNOWN, Status.FEASIBLE):
                 parts.candidates.sketch(OVERTIME)
         known.raise_bound(parts.prefixes.engine.bound)
-        best = known.best
-        if best is not None and known.status is Status.UNKNOWN:
-            known.status = Status.FEASIBLE
         known.stopped = stopped
+        return self.so_far(stopped)
+
+    def so_far(self, stopped: Stop) -> Solution:
+        """Make an answer with the best map so far, while another thread goes on with the search.
+
+        Args:
+            stopped: The reason to name in the answer, if the search ends now.
+        """
+        known = self._parts.known
+        best, status = known.best, known.status
+        if best is not None and status is Status.UNKNOWN:
+            status = Status.FEASIBLE
         # Clingo cannot say how large its program is while another thread uses it.
         maps = () if best is None else (_with_names(best, self.trace, drives_of(self.trace)),)
         solution = self._answer.solution(maps, Grounding(0, 0))
-        return replace(solution, complete=known.status is Status.UNSATISFIABLE)
+        is_complete = status is Status.UNSATISFIABLE
+        return replace(solution, status=status, complete=is_complete, stopped=stopped)
 
 
 def _begin_with(maps: Sequence[SSHMap], parts: Parts, weighing: Weighing | None) -> None:

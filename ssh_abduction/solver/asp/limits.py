@@ -24,6 +24,8 @@ TICK = 0.5
 # Work that is limited by processor time may wait for the processor, or for another thread, until
 # WAITING times as many seconds are over.
 WAITING = 4.0
+# The work for the first map may wait this many times as long: without a map there is no answer.
+STARVED = 30.0
 
 Stop: TypeAlias = Literal[
     "work limit", "time limit", "memory limit", "interrupted", "maps limit", "no proof"

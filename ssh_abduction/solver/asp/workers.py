@@ -23,11 +23,11 @@ from contextlib import suppress
 from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from ssh_abduction.runtime.program import command, search_path
-from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch
+from ssh_abduction.solver.asp.limits import POLL, STARVED, LimitError, Watch
 
 Result = TypeVar("Result")
 
-# A process may take this many seconds to start, even on a busy machine.
+# A process may take this many seconds to start.
 STARTING = 10.0
 DYING = 1.0  # seconds to wait for the end of a process that was killed
 
@@ -38,10 +38,14 @@ _folders: set[tempfile.TemporaryDirectory[str]] = set()
 
 
 class Lost(NamedTuple):
-    """Stands for a missing answer, as the process of a task ended, or was killed for being late."""
+    """Stands for a missing answer, as the process of a task ended, or was killed for being late.
+
+    `known` is what the process handed over last; None if it handed nothing over.
+    """
 
     number: int
     late: bool
+    known: Any = None
 
 
 class Worker:
@@ -50,6 +54,8 @@ class Worker:
     def __init__(self, folder: str) -> None:
         """Start a process that makes its temporary files in a folder."""
         self.deadline: float | None = None
+        self._longer = 0.0  # seconds after the deadline for a task that has handed nothing over
+        self._known: bytes | None = None  # what the current task handed over last, pickled
         self._late = False
         self.process = subprocess.Popen(
             command(__name__),
@@ -72,12 +78,22 @@ class Worker:
                 assert end
                 end.close()
 
+    def allow(self, seconds: float | None, *, starving: bool) -> None:
+        """Let the current task be late after some seconds; None for never.
+
+        `starving` gives it longer on a busy machine, until it hands something over.
+        """
+        if seconds is not None:
+            self._longer = (STARVED - 1) * seconds if starving else 0.0
+            self.deadline = time.monotonic() + seconds
+
     def done(self, number: int, work: Callable[..., Any], arguments: tuple[object, ...]) -> Any:
         """Let the process call `work`. Return the result of `work`, or Lost if the process ends.
 
         `number` is the number of the task, for Lost. `work` must be picklable. After `arguments`,
-        it gets a function that returns whether to stop early.
+        it gets a function that returns whether to stop early. `work` may call `hand_over`.
         """
+        self._known = None
         self._send((work, arguments))
         output = self.process.stdout
         assert output
@@ -87,10 +103,14 @@ class Worker:
                 self._begun = line.endswith(_BEGIN)
                 if not line:
                     return self._lost(number)
-            answer, ends = pickle.load(output)
-            if ends:  # it must not get another task while it ends
-                self.process.wait()
-            return answer
+            while True:
+                kind, answer = pickle.load(output)
+                if kind == _KNOWN:
+                    self._known = answer
+                    continue
+                if kind == _LAST:  # it must not get another task while it ends
+                    self.process.wait()
+                return answer
         except (EOFError, pickle.UnpicklingError):
             return self._lost(number)
         finally:
@@ -100,7 +120,8 @@ class Worker:
         """Wait for the end of the process, and return Lost for a task."""
         self.process.kill()
         self.process.wait()
-        return Lost(number, self._late)
+        known = None if self._known is None else pickle.loads(self._known)
+        return Lost(number, self._late, known)
 
     def give_up(self) -> None:
         """Ask the process to end its current task soon. Do not give it another task."""
@@ -108,7 +129,8 @@ class Worker:
 
     def end_if_late(self) -> None:
         """Kill the process if its deadline has passed."""
-        if self.deadline is not None and time.monotonic() > self.deadline:
+        longer = self._longer if self._known is None else 0.0
+        if self.deadline is not None and time.monotonic() > self.deadline + longer:
             self._late = True
             self.kill()
 
@@ -136,7 +158,7 @@ def answers(
     `work` is as in `Worker.done`. A task is a tuple of arguments; the first is its number.
     Once `stopped` returns True, no further task begins, and running tasks may take `patience`
     seconds more. `seconds` is the time for a task, after which its process is killed; None for no
-    limit.
+    limit. On a busy machine, the first thing to `hand_over` may take STARVED times as long.
     """
     waiting = queue.SimpleQueue[tuple[Any, ...]]()
     for task in tasks:
@@ -158,10 +180,8 @@ def answers(
                 if over.is_set():  # perhaps the other workers have been ended already
                     worker.end()
                     break
-                if seconds is not None:
-                    worker.deadline = (
-                        time.monotonic() + seconds + (0.0 if worker is before else STARTING)
-                    )
+                starting = 0.0 if worker is before else STARTING
+                worker.allow(seconds and seconds + starting, starving=True)
                 ready.put(worker.done(task[0], work, task))
         except queue.Empty:
             pass
@@ -183,7 +203,7 @@ def answers(
             for worker in {*filter(None, workers)} - asked if stopped() else ():
                 asked.add(worker)
                 worker.give_up()
-                worker.deadline = time.monotonic() + patience
+                worker.allow(patience, starving=False)
             with suppress(queue.Empty):
                 answer = ready.get(timeout=POLL)
                 if answer is None:
@@ -309,17 +329,27 @@ class _Work:
 
 
 _outputs: list[BinaryIO] = []  # the stream for answers, in a worker process
+_sending = threading.Lock()
+# The kinds of messages to the parent process: what is known so far, an answer, and an answer after
+# which the process ends.
+_KNOWN, _ANSWER, _LAST = range(3)
 
 
 def reply(answer: object) -> None:
     """Send the answer of a task that cannot return, and then end this process."""
-    _send(answer, ends=True)
+    _send(_LAST, answer)
 
 
-def _send(answer: object, *, ends: bool) -> None:
-    """Send an answer to the parent process, and say whether this process ends after it."""
-    pickle.dump((answer, ends), _outputs[0])
-    _outputs[0].flush()
+def hand_over(known: object) -> None:
+    """Send what is known of the answer so far, in case this process ends without an answer."""
+    _send(_KNOWN, pickle.dumps(known))
+
+
+def _send(kind: int, answer: object) -> None:
+    """Send a message to the parent process."""
+    with _sending:
+        pickle.dump((kind, answer), _outputs[0])
+        _outputs[0].flush()
 
 
 def serves() -> bool:
@@ -341,4 +371,4 @@ def serve() -> None:
     pieces = _Work(tempfile.tempdir)
     while True:
         work, arguments = pieces.waiting.get()
-        _send(work(*arguments, pieces.given_up.is_set), ends=False)
+        _send(_ANSWER, work(*arguments, pieces.given_up.is_set))
