@@ -58,7 +58,7 @@ def test_beam_joins_steps_of_unknown_view_with_known_ones(misread: float) -> Non
     trace = known.trace.with_views([v if t % 4 else None for t, v in enumerate(known.trace.views)])
     (found, *_) = maps_of(trace, Theory(misread=misread), 4)
     assert truth.is_true(found, known)
-    assert solve(trace, Theory(misread=misread), time_limit=1.5).maps[0].labels == found.labels
+    assert solve(trace, Theory(misread=misread), work_limit=1.5).maps[0].labels == found.labels
 
 
 def test_beam_finds_the_true_causal_map() -> None:

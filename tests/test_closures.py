@@ -149,7 +149,7 @@ def test_map_of_least_cost_has_no_probability_if_it_fits_badly(last: int, fits: 
     solution = solve(closed(0, last, (0.0, 0.0, 0.0)))
     assert solution.weighed is not None
     assert solution.weighed.proven
-    assert (solution.confidence > 0.9) is fits
+    assert ((solution.confidence or 0.0) > 0.9) is fits
     assert ("the best map does not fit the displacements" in solution.weighed.sentence) is not fits
 
 

@@ -340,7 +340,7 @@ def test_map_on_an_unreliable_track_has_no_probability(
     reliable = Solution.load(runs / "hall" / "maps.json")
     for solution, is_reliable in ((doubtful, False), (reliable, True)):
         said = "no probability is given, as the track is unreliable" in solution.sureness
-        assert (solution.confidence == 0.0, said) == (not is_reliable, not is_reliable)
+        assert (solution.confidence is None, said) == (not is_reliable, not is_reliable)
 
 
 def test_map_has_poses_if_the_search_left_no_time_to_fit_them(

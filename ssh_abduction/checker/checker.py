@@ -42,7 +42,7 @@ from ssh_abduction.checker import (
 from ssh_abduction.checker.reading import Check, Reading
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.clock import SHORT_TURN, look_at_clock
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
@@ -117,7 +117,7 @@ def violations(
     # Regions follow from a map and decide nothing. They are checked if the map lists them.
     checks += [*region_axioms.AXIOMS.items()] if ssh_map.regions is not None else []
     for name, test in checks:
-        look_at_clock()
+        look_at_clock(SHORT_TURN)
         for steps, message in test(reading):
             yield Violation(name, tuple(map(reading.named, sorted(set(steps)))), message)
 

@@ -218,11 +218,14 @@ def _costs_hold(
     weighed = Solution.from_dict(data, where, trace).weighed  # the fields have the right form
     false = list(false_costs(trace, data, maps, theory))
     for name in ("confidence", "place_confidence") if weighed else ():
-        right: float = getattr(weighed, name)
-        # Files of earlier versions have no confidence in places.
-        claimed = data["weighed"].get(name, right if name == "place_confidence" else None)
-        if not (is_finite(claimed) and abs(claimed - right) <= ROUNDED):
+        right: float | None = getattr(weighed, name)
+        claimed = data["weighed"].get(name)
+        if right is None:
+            is_right, expected = claimed is None, "null, as the search did not finish"
+        else:
+            is_right = is_finite(claimed) and abs(claimed - right) <= ROUNDED
             expected = f"{right:.6f}, by the costs of the rivals"
+        if not is_right:
             false.append(f"weighed.{name}: expected {expected}, got {brief(claimed)}")
     said += false
     rivals = len(data["weighed"]["rivals"])  # the first one is map 1

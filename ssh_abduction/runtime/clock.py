@@ -28,8 +28,9 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 
-# The work of a turn of a loop that looks at the clock, in microunits, if it names no other number.
-TURN = 100
+# The work of a turn of a loop that looks at the clock, in microunits, if it names no other number;
+# and of a turn of a short loop over steps.
+TURN, SHORT_TURN = 800, 80
 MICRO = 1_000_000  # microunits in a unit; whole numbers add up to the same sum in each order
 
 
@@ -100,7 +101,7 @@ def look_at_clock(micro: int = TURN) -> None:
 def each_looking(items: Iterable[Item]) -> Iterator[Item]:
     """Yield the items, and call `look_at_clock` before each."""
     for item in items:
-        look_at_clock()
+        look_at_clock(SHORT_TURN)
         yield item
 
 

@@ -21,7 +21,6 @@ number.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -34,7 +33,6 @@ from ssh_abduction.data.groups import gathered, indices_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.costs.repeats import shares_of
 from ssh_abduction.solver.steps.apart import apart_classes, apart_matrix, clique, grown_clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
@@ -182,10 +180,6 @@ class _Cliques:
         ]
         self.size = sum(map(len, self._cliques))
 
-    def size_of(self, node: int) -> int:
-        """Return the size of the clique in the part of a node."""
-        return len(self._cliques[self.part[node]])
-
     def size_with(self, pairs: Sequence[tuple[int, int]]) -> int:
         """Return the size of a clique of the whole graph if some more pairs are apart, too."""
         apart, larger = self.apart, dict[int, Ints]()
@@ -253,18 +247,6 @@ class _Joined:
                 then = self._apart[(arrives - arrives[:, None]) % self._turns, b[:, None], b]
                 e, f = np.nonzero(then)
                 self._apart[(out[f] - out[e]) % self._turns, a[e], a[f]] = True
-
-    def apart_steps(self) -> Flags:
-        """Flag the pairs of steps that are at different dstates."""
-        return self._dstates.apart[np.ix_(self._node_of, self._node_of)]
-
-    def dstates_of(self, steps: Ints) -> int:
-        """Return the least number of dstates of a part of the steps. Other steps are apart."""
-        return self._dstates.size_of(self._node_of[steps[0]])
-
-    def places_of(self, classes: Ints) -> int:
-        """Return the least number of places of some classes."""
-        return _Cliques(self._places.apart[np.ix_(classes, classes)]).size
 
     def may_join(self, a: int, b: int) -> bool:
         """Whether two classes may be at one place as in the map."""
@@ -372,33 +354,6 @@ class Forcing:
         """Find joins that every map of a cost below `most` has, until no more are found."""
         self._laying = self._least_laying(most)
         self._forced(self.visits, self.joins, most, {}, 1)
-
-    def repeated(self, problem: Problem, labels: Sequence[int]) -> Iterator[float]:
-        """Yield rising lower bounds on the cost of every map with these joins (`repeats.py`).
-
-        `labels` has the dstate of each step in a known map.
-        """
-        classes = _Joined(self.visits, self.joins)
-        if classes.fails:
-            return
-        (dstate, place), (dstates, places) = self._prices, classes.counts
-        # Groups of drives that share no place have places of their own.
-        units = self._units()
-        least = min(classes.places_of(np.unique(self.joins[units == one])) for one in {*units})
-        low = (
-            dstates * dstate
-            + self._misfit.of_returns([]) / 2
-            + min(
-                max(groups * least, places) * place + (len({*units}) - groups) * self._overlap.price
-                for groups in range(1, len({*units}) + 1)
-            )
-        )
-        visit, apart = self._misfit.visit, classes.apart_steps()
-        gains = defaultdict[int, float](float)  # by the first step of a part
-        for some, shares in shares_of(problem.trace, visit, apart, np.array(labels), dstate):
-            gain = float(shares.sum()) - dstate * classes.dstates_of(some)
-            gains[int(some[0])] = max(gain, gains[int(some[0])])
-            yield low + sum(gains.values())
 
     def _units(self) -> Ints:
         """Return the group of drives of each visit. Closures tie the drives of a group."""

@@ -19,8 +19,7 @@ cheaper maps are found, each with a probability proportional to exp(-cost).
 *Places* are minimised only after dstates, so clingo proves no lower bound on them. Evidence gives
 one: the size of a set of steps that are pairwise at different places.
 
-*Better bounds* come from joins that all cheap maps have (`forced.py`). If the robot may be off the
-poses of its dstates, as in logs, `scatter.py` gives one, too.
+*Better bounds* come from joins that all cheap maps have (`forced.py`).
 """
 
 from __future__ import annotations
@@ -42,7 +41,6 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.costs import repeats
 from ssh_abduction.solver.costs.beams import Beams
 from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of, misfit_of
 from ssh_abduction.solver.costs.estimating import (
@@ -57,7 +55,6 @@ from ssh_abduction.solver.costs.estimating import (
 )
 from ssh_abduction.solver.costs.forced import Forcing
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.costs.scatter import is_for, least_cost
 from ssh_abduction.solver.costs.wrong_displacements import search_jumps
 from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.judging import Judging
@@ -170,9 +167,6 @@ class Weighing:
         may_be_wrong = range(1, len(parts.task.trace)) if parts.task.theory.jumped else ()
         self._base = self._misfit.of_returns([], may_be_wrong) / 2  # of every map
         task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
-        if self.candidates and is_for(parts.task.problem):
-            most = self.candidates[0].nats
-            self.bound = least_cost(parts.task.problem, self._misfit.visit, most)
         if self.candidates and Forcing.holds_for(task.problem):
             task = self._with_forced_joins(task)
         if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
@@ -222,9 +216,6 @@ class Weighing:
 
     def _bounds(self, forcing: Forcing, best: Candidate) -> Iterator[float]:
         """Yield lower bounds on the cost of all maps. Find joins that all cheap maps have."""
-        problem = self._parts.task.problem
-        if repeats.has_independent_errors(problem):
-            yield from forcing.repeated(problem, best.map.dstate_at)
         forcing.force(self._most)
         if forcing.low < best.nats - EQUAL:
             yield from forcing.bounds(best.nats, self.bound)

@@ -43,6 +43,7 @@ from ssh_abduction.solver.geometry.linear import (
     system_solved,
     weighted,
 )
+from ssh_abduction.solver.work import FIT, FIT_OF_ONE
 from ssh_abduction.theory.evidence.loops import vectors_turned
 
 Array: TypeAlias = NDArray[np.float64]
@@ -316,7 +317,7 @@ class Poses:
 
     def _residuals(self, unknown: Array) -> Array:
         """Compute predicted minus actual displacements, and the priors, in standard deviations."""
-        look_at_clock()
+        look_at_clock(FIT + FIT_OF_ONE * len(self._moved))
         predicted = self._predicted(unknown)[0]
         off = predicted - self._moved
         off[:, 2] -= math.tau * np.round(off[:, 2] / math.tau)

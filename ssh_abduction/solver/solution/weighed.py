@@ -146,18 +146,21 @@ class Weighed:
         return self.bound >= self.nats - EQUAL
 
     @property
-    def confidence(self) -> float:
-        """The probability of the best map among its rivals.
+    def finished(self) -> bool:
+        """Whether the best map is proven to be the best, or `searched`."""
+        return self.proven or self.searched
 
-        If the best map is neither proven to be the best nor `searched`, a map that costs as little
-        as the bound is counted as one more rival. This makes the confidence small. A map that
-        breaks axioms is counted as a rival at a cost BROKEN nats higher. If there is a `doubt`, the
-        confidence is 0.
+    @property
+    def confidence(self) -> float | None:
+        """The probability of the best map among its rivals; None if it is unknown.
+
+        It is unknown if the search did not finish, or if there is a `doubt`. A map that breaks
+        axioms is counted as a rival at a cost BROKEN nats higher.
         """
         return self._confidence(self.weights[0])
 
     @property
-    def place_confidence(self) -> float:
+    def place_confidence(self) -> float | None:
         """The probability that the places of the best map are right, even if its dstates are not.
 
         It is that of all rivals with the same places, computed as `confidence`. Equal to
@@ -171,14 +174,12 @@ class Weighed:
         )
         return self._confidence(math.fsum(alike))
 
-    def _confidence(self, share: float) -> float:
+    def _confidence(self, share: float) -> float | None:
         """Return the confidence in maps that have this share of the weights of all rivals."""
-        if self.doubt is not None:
-            return 0.0
-        is_likely = self.proven or self.searched
-        unknown = 0.0 if is_likely else math.exp(min(self.nats - self.bound, MOST))
+        if self.doubt is not None or not self.finished:
+            return None
         broken = math.exp(min((self.broken - BROKEN) / self.excess, MOST))
-        return share / (1 + self.weights[0] * (unknown + broken))
+        return share / (1 + self.weights[0] * broken)
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
         """Return the probability, by the known rivals, that two steps are at one dstate or place.
@@ -260,12 +261,16 @@ class Weighed:
         """How probable the best map is, and which of its joins is least sure, in words."""
         if self.doubt is not None:
             return f"no probability is given, as {self.doubt}"
-        whole, at = map(probability_in_words, (self.confidence, self.place_confidence))
-        text = (
-            f"the best map has probability {whole}" + f", and its places alone {at}" * (at != whole)
-            if self.proven or self.searched
-            else f"a map that costs {self.nats - self.bound:.1f} nats less may exist"
-        )
+        if self.confidence is None or self.place_confidence is None:
+            text = (
+                "no probability is given, as the search did not finish: a map that costs up to "
+                f"{self.nats - self.bound:.1f} of {self.nats:.1f} nats less may exist, and more "
+                "work may find it or exclude it"
+            )
+        else:
+            whole, at = map(probability_in_words, (self.confidence, self.place_confidence))
+            text = f"the best map has probability {whole}"
+            text += f", and its places alone {at}" * (at != whole)
         given = ""
         if self.broken > SAID:
             text += f"; a map that breaks axioms costs {self.broken:.1f} nats less"
@@ -291,7 +296,7 @@ class Weighed:
             return f"{text}; the best map joins no two visits"
         first, second, probability = self.joins[0]
         sure = probability_in_words(probability)
-        if not (self.proven or self.searched):
+        if not self.finished:
             if len(self.rivals) == 1:
                 return f"{text}; no other map was found, so it is unknown which joins are doubtful"
             given = f" among the {len(self.rivals)} maps found"
@@ -309,8 +314,8 @@ class Weighed:
             **({"excess": round(self.excess, 6)} if self.excess > 1 else {}),
             **({} if self.doubt is None else {"doubt": self.doubt}),
             **({"gaps": list(self.gaps)} if self.gaps else {}),
-            "confidence": round(self.confidence, 6),
-            "place_confidence": round(self.place_confidence, 6),
+            "confidence": _rounded(self.confidence),
+            "place_confidence": _rounded(self.place_confidence),
             "rivals": [rival.to_dict() for rival in self.rivals],
         }
 
@@ -349,6 +354,11 @@ class Weighed:
         searched = record.get("searched") is True
         gaps = read.integers(record.get("gaps", []), "weighed.gaps")
         return cls(bound, within, rivals, searched, broken, excess, doubt, gaps, drives)
+
+
+def _rounded(probability: float | None) -> float | None:
+    """Round a probability to six decimals, as files have it."""
+    return None if probability is None else round(probability, 6)
 
 
 def probability_in_words(probability: float) -> str:
