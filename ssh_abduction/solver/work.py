@@ -8,7 +8,7 @@ from __future__ import annotations
 
 # A conflict of clasp, and an answer of it, in units.
 CONFLICT, ANSWER = 2e-4, 2e-4
-# An iteration of a least-squares fit of poses, and what each displacement adds to it, in microunits.
+# An iteration of a least-squares fit of poses, and what each displacement adds, in microunits.
 FIT, FIT_OF_ONE = 900, 6
 # An atom that clingo grounds, and a call of `@go_on` by which it asks whether to go on, in
 # microunits.
