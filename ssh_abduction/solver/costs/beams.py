@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.candidates import SKETCH_SHARE
-from ssh_abduction.solver.geometry.equations import spreads_of
+from ssh_abduction.solver.costs.scatter import is_for
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.solution.weighed import EQUAL
@@ -103,9 +103,8 @@ class Beams:
         parts, watch = self._parts, self._parts.watch
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         theory = parts.task.theory
-        is_log = spreads_of(parts.task.trace).any()
         several = theory.several_drives or theory.lifts
-        most = JUMPED if theory.jumped else BOUNDED if is_log else 1.0
+        most = JUMPED if theory.jumped else BOUNDED if is_for(parts.task.problem) else 1.0
         shares = {width: min(end, most) for width, end in WIDTHS.items()}
         widths = [width for width in WIDTHS if width <= BROAD or not several]
         with suppress(StageTimeError), watch.stage(time.end(SMOOTHING)):

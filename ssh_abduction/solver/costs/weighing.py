@@ -19,7 +19,8 @@ cheaper maps are found, each with a probability proportional to exp(-cost).
 *Places* are minimised only after dstates, so clingo proves no lower bound on them. Evidence gives
 one: the size of a set of steps that are pairwise at different places.
 
-*Better bounds* come from joins that all cheap maps have (`forced.py`).
+*Better bounds* come from joins that all cheap maps have (`forced.py`). If the robot may be off the
+poses of its dstates, as in logs, `scatter.py` gives one, too.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.costs import scatter
 from ssh_abduction.solver.costs.beams import Beams
 from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of, misfit_of
 from ssh_abduction.solver.costs.estimating import (
@@ -88,6 +90,8 @@ EXCESS = 2.25
 PATIENCE, MORE = 10.0, 5.0
 # Finding joins that all cheap maps have takes at most this share of the time, and PATIENCE seconds.
 FORCING = 0.4
+# The bound by the scatter of visits takes at most this share of the time that is left then.
+SCATTER = 0.5
 # Estimating rivals may end OVERTIME seconds late. It gets at least LEAST_ESTIMATING seconds.
 OVERTIME, LEAST_ESTIMATING = 0.5, 0.1
 
@@ -169,6 +173,8 @@ class Weighing:
         task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         if self.candidates and Forcing.holds_for(task.problem):
             task = self._with_forced_joins(task)
+        if self.candidates and scatter.is_for(parts.task.problem):
+            self._raise_by_scatter()
         if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
             if self.candidates and parts.task.theory.jumped and parts.candidates.beam(1):
                 search_jumps(parts.task.trace, parts.candidates, self.candidates[0].map, self.add)
@@ -213,6 +219,14 @@ class Weighing:
         return replace(
             Task.of(task.problem.changed(theory=theory), task.watch), speedups=task.speedups
         )
+
+    def _raise_by_scatter(self) -> None:
+        """Raise the bound by the scatter of visits about their places."""
+        most = self.candidates[0].nats
+        seconds = SCATTER * self._parts.watch.left()
+        with suppress(LimitError), heeding(self._parts.watch.part(seconds).check):
+            bound = scatter.least_cost(self._parts.task.problem, self._misfit.visit, most)
+            self.bound = max(self.bound, bound)
 
     def _bounds(self, forcing: Forcing, best: Candidate) -> Iterator[float]:
         """Yield lower bounds on the cost of all maps. Find joins that all cheap maps have."""
