@@ -15,8 +15,8 @@ from ssh_abduction.data.odometry import Covariance, Odometry, displacement_betwe
 from ssh_abduction.data.odometry import moved as moved_pose
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
 from ssh_abduction.theory import encodings
+from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.fields import COUNTS, PRICES, Count
-from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
 
 ACTIONS = (*STANDARD_ACTIONS.values(), Action("creep", "travel"), Action("veer", "turn", "right"))

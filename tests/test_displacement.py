@@ -31,9 +31,8 @@ from ssh_abduction.solver.geometry.fit import Poses, fit
 from ssh_abduction.solver.geometry.linear import inverse, least_squares, system_solved
 from ssh_abduction.solver.geometry.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
-from ssh_abduction.theory.evidence.displacement import Displacement
+from ssh_abduction.theory.evidence.displacement import Displacement, Returns
 from ssh_abduction.theory.evidence.loops import Loops
-from ssh_abduction.theory.evidence.returns import Returns
 from ssh_abduction.theory.evidence.together import joint_squares
 from ssh_abduction.theory.settle import settle
 

@@ -21,7 +21,7 @@ from ssh_abduction.solver.asp.own_rules import can_be_asked, keeps_own_rules
 from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond, sketches_of
 from ssh_abduction.solver.steps.log import Log
-from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.settle import Problem, settle
 
 WORLDS: dict[str, nx.Graph] = {

@@ -44,7 +44,7 @@ from ssh_abduction.solver.asp.own_rules import EXAMPLE
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.steps import certificate
 from ssh_abduction.solver.steps.certificate import noise_in
-from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.settle import settle
 
 # Seconds after which a process that obeys its limit has ended, even on a slow and busy machine. One

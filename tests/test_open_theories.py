@@ -36,8 +36,8 @@ from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory import settle as problems
+from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs, evidence_of
-from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import SPEEDUPS, TABLE, row
 
@@ -467,7 +467,7 @@ def test_rules_with_characters_that_abort_clingo_are_refused(
     solve(Trace.from_steps("aa", ["travel"])).maps[0].save(tmp_path / "map.json")
     known = str(tmp_path / "map.json")
     for verb, *maps in (["solve"], ["explain"], ["ladder"], ["next", known], ["check", known]):
-        assert main([verb, str(trace), *maps, "--set", f"rules={path}"]) == 1
+        assert main([verb, *maps, str(trace), "--set", f"rules={path}"]) == 1
         assert re.search(message, capsys.readouterr().err)
     with pytest.raises(TheoryError, match=message):
         Theory.causal().replace(rules=[path])
@@ -496,7 +496,7 @@ def test_error_names_the_wrong_file_of_rules(text: str, where: str) -> None:
             solve(Trace.from_steps("aa", ["travel"]), Theory(rules=files))
 
 
-@pytest.mark.parametrize("words", ["solve T", "solve T --jobs 1", "check T M"])
+@pytest.mark.parametrize("words", ["solve T", "solve T --jobs 1", "check M T"])
 def test_assertion_about_an_unknown_step_is_an_error(
     words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -519,7 +519,7 @@ def test_assertion_about_an_unknown_step_is_an_error(
 
 
 def test_endless_file_of_rules_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ssh_abduction.theory.rules.LARGEST", 100)
+    monkeypatch.setattr("ssh_abduction.theory.encodings.LARGEST", 100)
     (tmp_path / "own.lp").write_text("% long\n" * 100)
     with pytest.raises(TheoryError, match="cannot be read: expected at most"):
         Theory.causal().replace(rules=[tmp_path / "own.lp"])

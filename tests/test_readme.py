@@ -27,7 +27,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.output import streets, to_svg
 from ssh_abduction.robot_logs import log_maps
 from ssh_abduction.solver import Solution, Status, solve
-from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.theory import Theory
 
 ROOT = Path(__file__).parent.parent

@@ -22,7 +22,7 @@ from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
 from ssh_abduction.online.hypotheses import ExtendedMap, shares_of_rivals
 from ssh_abduction.solver import Solution, Status
-from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.encodings import Rules
 
 BOTH = Theory.causal().replace(misread=1.5, slipped=3)
 

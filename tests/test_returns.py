@@ -16,10 +16,9 @@ from ssh_abduction import SSHMap, Theory, Trace
 from ssh_abduction.checker import geometry
 from ssh_abduction.checker.geometry import refused_returns
 from ssh_abduction.data import DState, Odometry, together
-from ssh_abduction.theory.evidence.displacement import Displacement
+from ssh_abduction.theory.evidence.displacement import Displacement, Returns
 from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares
 from ssh_abduction.theory.evidence.protocol import Equality
-from ssh_abduction.theory.evidence.returns import Returns
 from ssh_abduction.theory.evidence.together import Together, joint_squares
 
 

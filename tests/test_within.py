@@ -23,7 +23,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Cost, Status
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sources.exact import prefixes
-from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.settle import settle
 
 ACES3, EXAMPLE = "examples/aces3-route.jsonl", "examples/notched-rectangle.jsonl"

@@ -24,7 +24,7 @@ from ssh_abduction.data.star import Star, star_to_json
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.data.words import counted
 from ssh_abduction.solver import Watch, observation
-from ssh_abduction.theory.evidence.alike import are_alike
+from ssh_abduction.theory.evidence.of_steps import are_alike
 from ssh_abduction.theory.fields import IN_TOLERANCE
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory

@@ -1,30 +1,19 @@
-"""The values that the fields of a theory may have, and their checks."""
+"""The fields of a theory that all theories have, and the checks of their values."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import fields
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal, TypeAlias, get_args, get_origin, get_type_hints
 
 from ssh_abduction.data.checks import a_flag, a_whole_number, one_of
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.errors import TheoryError, brief, is_finite
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.rules import Rules
-
-if TYPE_CHECKING:
-    from ssh_abduction.theory.theory import Theory
+from ssh_abduction.theory.encodings import Rules
 
 Count: TypeAlias = Literal["dstates", "paths", "places", "excuses", "auto", "tenths"]
 Pair: TypeAlias = tuple[int, int]  # two steps
-CHOICES: dict[str, tuple[str, ...]] = {
-    "level": ("causal", "topological"),
-    "boundary": ("none", "strict", "defeasible"),
-    "path_order": ("partial", "total"),
-    "star": ("auto", "none", "alike", "pattern", "frame", "gateways"),
-    "displacement": ("auto", "none", "use"),
-    "weigh": ("auto", "cost", "count"),
-}
 # Values of `star` for which gateways match if their directions agree within their spreads.
 IN_TOLERANCE = ("alike", "gateways")
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
@@ -66,6 +55,78 @@ EXCUSED = {
     "changed": {"star_pattern", "star_frame", "gateway_frame"},
 }
 DEAREST = 1000.0  # the most dstates that a fault may cost
+MOST_JOINT = 2  # the most returns that may be tested together
+MOST_STEPS = 2**31  # the numbers of steps are below this: clingo's numbers have 32 bits
+CAUSAL = "Theory.causal() (--theory causal)"  # for error messages
+
+
+@dataclass(frozen=True)
+class Choices:
+    """The fields that every theory has. `Theory` explains each field.
+
+    A field of a new object is checked, and converted to its standard form. TheoryError is raised if
+    a field is wrong, or two contradict each other.
+    """
+
+    level: Literal["causal", "topological"] = "topological"
+    boundary: Literal["none", "strict", "defeasible"] = "strict"
+    symmetric_sides: bool = True
+    path_order: Literal["partial", "total"] = "total"
+    next_place: bool = False
+    all_on_paths: bool = False
+    star: Literal["auto", "none", "alike", "pattern", "frame", "gateways"] = "auto"
+    displacement: Literal["auto", "none", "use"] = "auto"
+    reject: float = 0.001
+    joint: int = 2
+    returns: int = 0
+    prefer: tuple[Count, ...] = AUTO
+    without: tuple[str, ...] = ()
+    rules: tuple[Rules, ...] = ()
+    planar: bool = False
+    same: tuple[Pair, ...] = ()
+    different: tuple[Pair, ...] = ()
+    elsewhere: tuple[Pair, ...] = ()
+    same_place: tuple[Pair, ...] = ()
+    misread: float = 0.0
+    slipped: float = 0.0
+    jumped: float = 0.0
+    changed: float = 0.0
+    unknown_views: bool = False
+    several_drives: bool = False
+    lifts: bool = False
+    weigh: Literal["auto", "cost", "count"] = "auto"
+    prices: tuple[float, float, float] = PRICES
+
+    def __post_init__(self) -> None:
+        for name, values in CHOICES.items():
+            one_of(name, getattr(self, name), values, TheoryError)
+        for field in fields(self):
+            if isinstance(field.default, bool):
+                flag = a_flag(field.name, getattr(self, field.name), TheoryError)
+                object.__setattr__(self, field.name, flag)
+        _check_numbers(self)
+        _check_prices(self)
+        _set_names(self, "prefer", (*COUNTS, *AUTO))
+        _set_names(self, "without", [a.name for a in encodings.axioms()])
+        object.__setattr__(self, "rules", Rules.all_of(self.rules))
+        for name in ASSERTIONS:
+            object.__setattr__(self, name, _pairs(name, getattr(self, name)))
+        for wrong in _contradictions(self):
+            raise TheoryError(wrong)
+
+    @property
+    def has_faults(self) -> bool:
+        """Whether a map may treat parts of the trace as wrong, at a cost."""
+        return any(getattr(self, kind) > 0 for kind in EXCUSED)
+
+
+# The values of the fields that have a few named ones.
+CHOICES: dict[str, tuple[str, ...]] = {
+    name: get_args(kind)
+    for name, kind in get_type_hints(Choices).items()
+    if get_origin(kind) is Literal
+}
+
 # The fields that are covered by the axioms of a theory. Speed-ups must name any other field that
 # they respect, such as one that is added later.
 SPOKEN_FOR = {
@@ -102,46 +163,6 @@ PATHS = (
     "path_order_total",
     "course_needs_travel",
 )
-MOST_JOINT = 2  # the most returns that may be tested together
-MOST_STEPS = 2**31  # the numbers of steps are below this: clingo's numbers have 32 bits
-CAUSAL = "Theory.causal() (--theory causal)"  # for error messages
-
-
-def normalise(theory: Theory) -> None:
-    """Check all fields of a new theory, and convert each to its standard form.
-
-    Raises TheoryError if a field is wrong, or two contradict each other.
-    """
-    for name, values in CHOICES.items():
-        one_of(name, getattr(theory, name), values, TheoryError)
-    for field in fields(theory):
-        if isinstance(field.default, bool):
-            flag = a_flag(field.name, getattr(theory, field.name), TheoryError)
-            object.__setattr__(theory, field.name, flag)
-    _check_numbers(theory)
-    _check_prices(theory)
-    _set_names(theory, "prefer", (*COUNTS, *AUTO))
-    _set_names(theory, "without", [a.name for a in encodings.axioms()])
-    object.__setattr__(theory, "rules", Rules.all_of(theory.rules))
-    for name in ASSERTIONS:
-        object.__setattr__(theory, name, _pairs(name, getattr(theory, name)))
-    _check_rules(theory)
-    if theory.level == "causal":
-        _check_causal(theory)
-    if "auto" in theory.prefer and theory.prefer != AUTO:
-        raise TheoryError(
-            f"prefer: expected auto without other counts, got {', '.join(theory.prefer)}; name "
-            "the counts, or leave it out"
-        )
-    if theory.has_faults:
-        _check_faults(theory)
-    if theory.weigh == "cost":
-        _check_weigh(theory)
-    if "excuses" in theory.prefer and theory.boundary != "defeasible":
-        raise TheoryError(
-            f"prefer: expected boundary=defeasible with excuses, got {theory.boundary}; take "
-            f"{choice('boundary', 'defeasible')}"
-        )
 
 
 def choice(name: str, value: str) -> str:
@@ -149,87 +170,110 @@ def choice(name: str, value: str) -> str:
     return f"{name}={value} (--set {name}={value})"
 
 
-def _check_causal(theory: Theory) -> None:
-    """Check that the other fields suit a causal theory. Raises TheoryError."""
+def can_weigh(theory: Choices) -> bool:
+    """Whether the maps of a theory can be compared by their cost in nats."""
+    return _prefers_dstates(theory) and theory.boundary != "defeasible"
+
+
+def _prefers_dstates(theory: Choices) -> bool:
+    """Whether a theory minimises dstates first, or what fits the trace."""
+    return theory.prefer == AUTO or theory.prefer[:1] == ("dstates",)
+
+
+def _contradictions(theory: Choices) -> Iterator[str]:
+    """Yield a sentence for each contradiction between two fields."""
+    taken = {axiom.name for axiom in encodings.axioms()}
+    for rules in theory.rules:
+        for axiom in rules.axioms:
+            if axiom.name in taken:
+                yield (
+                    f"{rules.name}: @axiom({axiom.name}): expected a name that no other axiom "
+                    "has; rename this axiom"
+                )
+            taken.add(axiom.name)
+    if theory.level == "causal":
+        yield from _not_causal(theory)
+    preferred = ", ".join(theory.prefer) or "nothing"
+    if "auto" in theory.prefer and theory.prefer != AUTO:
+        yield (
+            f"prefer: expected auto without other counts, got {preferred}; name the counts, or "
+            "leave it out"
+        )
+    if theory.has_faults:
+        yield from _not_with_faults(theory)
+    if theory.weigh == "cost" and not _prefers_dstates(theory):
+        yield (
+            f"prefer: expected dstates first where maps are weighed, got {preferred}; leave it "
+            f"out, or take {choice('weigh', 'count')}"
+        )
+    if theory.weigh == "cost" and theory.boundary == "defeasible":
+        yield (
+            "weigh: expected count where excuses are allowed, as the price of an excuse in nats "
+            f"is not known, got cost; take {choice('weigh', 'count')}"
+        )
+    if "excuses" in theory.prefer and theory.boundary != "defeasible":
+        yield (
+            f"prefer: expected boundary=defeasible with excuses, got {theory.boundary}; take "
+            f"{choice('boundary', 'defeasible')}"
+        )
+
+
+def _not_causal(theory: Choices) -> Iterator[str]:
+    """Yield what does not suit a causal theory."""
     for name, values in (("boundary", ("none",)), ("star", ("none", "alike"))):
         if getattr(theory, name) not in values:
-            raise TheoryError(
+            yield (
                 f"{name}: expected {' or '.join(values)} with level=causal, got "
                 f"{getattr(theory, name)}; leave {name} out, and take {CAUSAL}"
             )
     if set(theory.prefer) - {"dstates", *AUTO}:
-        raise TheoryError(
+        yield (
             f"prefer: expected dstates with level=causal, got {', '.join(theory.prefer)}; "
             f"leave prefer out, and take {CAUSAL}"
         )
     if theory.same_place:
-        raise TheoryError(
+        yield (
             "same_place: expected a topological theory, as causal maps have no places, got "
             "level=causal; say which steps are one dstate (same, --same)"
         )
 
 
-def _check_weigh(theory: Theory) -> None:
-    """Check that maps can be compared by cost. Raises TheoryError."""
+def _not_with_faults(theory: Choices) -> Iterator[str]:
+    """Yield what does not suit a theory that allows faults."""
     if not _prefers_dstates(theory):
-        raise TheoryError(
-            "prefer: expected dstates first where maps are weighed, got "
-            f"{', '.join(theory.prefer) or 'nothing'}; leave it out, or take "
-            f"{choice('weigh', 'count')}"
-        )
-    if theory.boundary == "defeasible":
-        raise TheoryError(
-            "weigh: expected count where excuses are allowed, as the price of an excuse in nats "
-            f"is not known, got cost; take {choice('weigh', 'count')}"
-        )
-
-
-def can_weigh(theory: Theory) -> bool:
-    """Whether the maps of a theory can be compared by their cost in nats."""
-    return _prefers_dstates(theory) and theory.boundary != "defeasible"
-
-
-def _prefers_dstates(theory: Theory) -> bool:
-    """Whether a theory minimises dstates first, or what fits the trace."""
-    return theory.prefer == AUTO or theory.prefer[:1] == ("dstates",)
-
-
-def _check_faults(theory: Theory) -> None:
-    """Check that the other fields allow faults. Raises TheoryError."""
-    if not _prefers_dstates(theory):
-        raise TheoryError(
+        yield (
             "prefer: expected dstates first where faults are allowed, got "
             f"{', '.join(theory.prefer) or 'nothing'}; faults cost dstates"
         )
     others = [kind for kind in EXCUSED if kind != "changed" and getattr(theory, kind)]
     if theory.star == "gateways" and others:
-        raise TheoryError(
+        yield (
             f"star: expected another value where {', '.join(others)} is allowed, got gateways; "
             f"take {choice('star', 'alike')}"
         )
     if theory.boundary == "defeasible":
-        raise TheoryError(
+        yield (
             "boundary: expected no excuses where faults are allowed, got defeasible; take "
             f"{choice('boundary', 'strict')}"
         )
     if theory.jumped and theory.displacement == "none":
-        raise TheoryError(
+        yield (
             "jumped: expected displacements to be used, which may be wrong, got "
             f"displacement=none; leave it out, or take {choice('displacement', 'auto')}"
         )
     if theory.changed and (others or theory.level == "causal"):
-        raise TheoryError(
+        yield (
             "changed: expected a topological theory without other faults, as gateways of places "
             f"change, got {', '.join(others) or 'level=causal'}; leave one out"
         )
     if theory.planar:
-        raise TheoryError(
+        yield (
             "planar: expected no planarity where faults are allowed; leave it out (--set "
             "planar=false)"
         )
 
 
-def _check_numbers(theory: Theory) -> None:
+def _check_numbers(theory: Choices) -> None:
     """Check the fields that are numbers, and round the prices of faults. Raises TheoryError."""
     for name in EXCUSED:
         price = getattr(theory, name)
@@ -256,7 +300,7 @@ def _check_numbers(theory: Theory) -> None:
     object.__setattr__(theory, "reject", float(theory.reject))
 
 
-def _check_prices(theory: Theory) -> None:
+def _check_prices(theory: Choices) -> None:
     """Convert the prices to three floats. Raises TheoryError."""
     given: Any = theory.prices
     try:
@@ -279,20 +323,7 @@ def _check_prices(theory: Theory) -> None:
     object.__setattr__(theory, "prices", prices)
 
 
-def _check_rules(theory: Theory) -> None:
-    """Check that the user's axioms have names of their own. Raises TheoryError."""
-    taken = {axiom.name for axiom in encodings.axioms()}
-    for rules in theory.rules:
-        for axiom in rules.axioms:
-            if axiom.name in taken:
-                raise TheoryError(
-                    f"{rules.name}: @axiom({axiom.name}): expected a name that no other axiom "
-                    "has; rename this axiom"
-                )
-            taken.add(axiom.name)
-
-
-def _set_names(theory: Theory, field: str, allowed: Iterable[str]) -> None:
+def _set_names(theory: Choices, field: str, allowed: Iterable[str]) -> None:
     """Convert a field to a tuple of different names out of those allowed. Raises TheoryError."""
     value = getattr(theory, field)
     if not isinstance(value, str | list | tuple):

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from ssh_abduction.data.checks import a_path, a_text, a_whole_number, an_instance, an_object, one_of
 from ssh_abduction.data.corrections import ASSERTIONS
@@ -33,16 +33,13 @@ from ssh_abduction.theory.fields import (
     LAID,
     PATHS,
     PREFERRED,
-    PRICES,
     SPOKEN_FOR,
     WITH_DISPLACEMENTS,
+    Choices,
     Count,
-    Pair,
     choice,
-    normalise,
 )
 from ssh_abduction.theory.pairs import Pairs
-from ssh_abduction.theory.rules import Rules
 
 # Treating a view or a star as wrong costs LEAST_SURE to MOST_SURE times the price: even a very
 # confident view may be wrong.
@@ -52,9 +49,9 @@ LARGEST_TOML = 2**20  # bytes
 SETTLED = ("returns", "unknown_views", "several_drives", "lifts")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 @encodings.with_declared_fields
-class Theory:
+class Theory(Choices):
     """An immutable choice of axioms and of what to minimise.
 
     Take a preset such as `causal`, change it with `replace`, or set the fields by name.
@@ -113,38 +110,6 @@ class Theory:
             logarithms of odds). A fault costs its `misread`, `slipped`, `jumped` or `changed`,
             times the price of a dstate. Used only if maps are compared by cost.
     """
-
-    level: Literal["causal", "topological"] = "topological"
-    boundary: Literal["none", "strict", "defeasible"] = "strict"
-    symmetric_sides: bool = True
-    path_order: Literal["partial", "total"] = "total"
-    next_place: bool = False
-    all_on_paths: bool = False
-    star: Literal["auto", "none", "alike", "pattern", "frame", "gateways"] = "auto"
-    displacement: Literal["auto", "none", "use"] = "auto"
-    reject: float = 0.001
-    joint: int = 2
-    returns: int = 0
-    prefer: tuple[Count, ...] = AUTO
-    without: tuple[str, ...] = ()
-    rules: tuple[Rules, ...] = ()
-    planar: bool = False
-    same: tuple[Pair, ...] = ()
-    different: tuple[Pair, ...] = ()
-    elsewhere: tuple[Pair, ...] = ()
-    same_place: tuple[Pair, ...] = ()
-    misread: float = 0.0
-    slipped: float = 0.0
-    jumped: float = 0.0
-    changed: float = 0.0
-    unknown_views: bool = False
-    several_drives: bool = False
-    lifts: bool = False
-    weigh: Literal["auto", "cost", "count"] = "auto"
-    prices: tuple[float, float, float] = PRICES
-
-    def __post_init__(self) -> None:
-        normalise(self)
 
     def __repr__(self) -> str:
         return shortly(self)
@@ -218,11 +183,6 @@ class Theory:
         dstate, place, _ = self.prices
         number = 1 if self.star == "alike" else LAID
         return number * (dstate + place if self.level == "topological" else dstate)
-
-    @property
-    def has_faults(self) -> bool:
-        """Whether a map may treat parts of the trace as wrong, at a cost."""
-        return any(getattr(self, kind) > 0 for kind in EXCUSED)
 
     def without_faults(self) -> Theory:
         """Return this theory without faults: a map may treat nothing as wrong."""

@@ -7,11 +7,10 @@ The checker does not know such rules. So clingo checks a map: it grounds the rul
 of the map as facts. If the rules read only what a map shows, clingo has no choices except those in
 the rules themselves. So the check takes hardly longer than grounding.
 
->>> from ssh_abduction.solver.asp import facts
-from ssh_abduction import Theory, Trace, solve
+>>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.solver.asp.own_rules import check_rules, keeps_own_rules
 >>> from ssh_abduction.theory.settle import settle
->>> from ssh_abduction.theory.rules import Rules
+>>> from ssh_abduction.theory.encodings import Rules
 >>> trace = Trace.from_steps("aba", ["go", "go"])
 >>> ssh_map = solve(trace, Theory.causal())[0]
 >>> rules = [Rules("own.lp", f"#program step(t). :- same(I,t), t-I > {n}.") for n in (1, 2)]
@@ -40,7 +39,7 @@ from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts import number_symbols
 from ssh_abduction.solver.asp.limits import POLL
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 

@@ -1,4 +1,4 @@
-"""Lifts as evidence: a lift leads to another floor.
+"""Lifts as evidence: a lift leads to another floor, and from one place to one place.
 
 A *stretch* is the steps of a drive between two lifts. The stretches before and after a lift are on
 different floors. So no two of their steps are at one place. Two stretches are on one floor if they
@@ -81,3 +81,32 @@ def _meetings(ssh_map: SSHMap) -> Iterator[Equality]:
             yield Equality(first, t)
         elif place is not None and (first := places.setdefault(place, t)) != t:
             yield Equality(first, t, "place")
+
+
+@dataclass(frozen=True)
+class Landings(Evidence):
+    """Evidence from lifts that are taken again at the same place.
+
+    A robot may enter a lift with any heading, so at several dstates of a place. It always leaves
+    it at the same place of the other floor.
+    """
+
+    name: ClassVar[str] = "landings"
+    axiom: ClassVar[str] = "one_landing"
+
+    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
+        places = [ssh_map.place_of(t) for t in range(len(ssh_map.dstate_at))]
+        first: dict[tuple[int | None, str], int] = {}  # the first step after each lift
+        for t in range(1, len(places)):
+            action = trace.actions[t - 1]
+            if not action.changes_floor or places[t - 1] is None:
+                continue
+            landing = first.setdefault((places[t - 1], action.name), t)
+            if places[landing] != places[t]:
+                return frozenset(
+                    (
+                        Equality(landing - 1, t - 1, "place"),
+                        Equality(landing, t, "place", holds=False),
+                    )
+                )
+        return None
