@@ -38,7 +38,7 @@ from ssh_abduction.data.checks import (
 )
 from ssh_abduction.data.errors import brief, is_finite, named, printable
 from ssh_abduction.data.files import parse_json, read_file
-from ssh_abduction.data.json_fields import FieldReader
+from ssh_abduction.data.schema import FieldReader
 
 Array = NDArray[np.float64]
 Angles: TypeAlias = Literal["right", "any"]

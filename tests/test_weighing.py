@@ -26,7 +26,7 @@ from ssh_abduction.checker.cost_claims import false_costs, misfit
 from ssh_abduction.cli import main
 from ssh_abduction.data import Closure, MapError, Odometry, SolverError, TheoryError, together
 from ssh_abduction.data.drives import Drive
-from ssh_abduction.data.json_fields import FieldReader
+from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.costs import beams, weighing

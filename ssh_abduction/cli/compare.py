@@ -13,7 +13,7 @@ from ssh_abduction.cli.text import compared, counted, depending
 from ssh_abduction.data.errors import brief, named, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
-from ssh_abduction.data.words import attributes_of
+from ssh_abduction.data.schema import attributes_of
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison

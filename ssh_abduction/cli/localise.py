@@ -26,8 +26,8 @@ from ssh_abduction.cli.text import steps_in_words, table
 from ssh_abduction.data.errors import LocaliserError, MapError, named, said_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import only_known
 
 if TYPE_CHECKING:
     from ssh_abduction.data.maps import SSHMap

@@ -40,7 +40,7 @@ from ssh_abduction.data.corrections import ASSERTIONS, Corrections
 from ssh_abduction.data.corrections_file import beside, load_corrections, to_yaml
 from ssh_abduction.data.errors import AbductionError, MapError, brief, named
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.words import attributes_of
+from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, check_limit, workers
 from ssh_abduction.theory.joins import joins_in_words

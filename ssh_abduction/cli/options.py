@@ -21,8 +21,9 @@ from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
+from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import meant, only_known
+from ssh_abduction.data.words import meant
 from ssh_abduction.theory.fields import CHOICES
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory

@@ -10,10 +10,10 @@ from ssh_abduction.cli.options import add_maps, check_number
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import describe
 from ssh_abduction.data.corrections_file import named_beside
-from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.regions import described
+from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.solver import drives_in
 
 

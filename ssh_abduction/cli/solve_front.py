@@ -11,8 +11,8 @@ from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
+from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import attributes_of
 from ssh_abduction.runtime import program
 from ssh_abduction.solver import Front, fault_front
 from ssh_abduction.theory.theory import Theory

@@ -23,8 +23,8 @@ from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named, said_of
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, check_labels, maps_of
+from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import attributes_of
 
 
 def add_parser(verbs: Verbs) -> None:

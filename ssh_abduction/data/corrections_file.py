@@ -28,9 +28,9 @@ from ssh_abduction.data.corrections import (
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, named
 from ssh_abduction.data.files import json_line, parse_yaml, read_file, save_file
-from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.map_parts import NAMED
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.schema import FieldReader
 
 FILE = "corrections.yaml"  # the name of the file beside a map
 LARGEST = 2**24  # bytes

@@ -21,12 +21,11 @@ import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import accumulate, pairwise
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from ssh_abduction.data.action import Action
 from ssh_abduction.data.checks import a_list, a_text, all_instances
@@ -34,6 +33,7 @@ from ssh_abduction.data.errors import TraceError, brief
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.schema import SparseData
 from ssh_abduction.data.sidecar import images_file
 from ssh_abduction.data.star import is_four
 from ssh_abduction.data.step import Step
@@ -49,7 +49,7 @@ ALONE = "drive 1"  # the name of the only drive of a trace without a name
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class Drive(SparseData):
     """A drive of a trace: the steps from `first` up to, but not including, `stop`.
 
     Attributes:
@@ -63,10 +63,6 @@ class Drive:
     first: int
     stop: int
     fingerprint: str | None = field(default=None, compare=False)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the drive as plain data, as `solve --json` prints it."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 class DriveStep(int):

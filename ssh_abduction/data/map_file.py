@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,9 @@ from typing import Any
 from ssh_abduction.data.checks import a_path
 from ssh_abduction.data.errors import MapError, brief, is_writable, named
 from ssh_abduction.data.files import HalfCharacter, NotFinite, parse_json, save_file
-from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
 from ssh_abduction.data.regions import Region
+from ssh_abduction.data.schema import FieldReader, Shape
 
 # What files of solutions and of single maps begin with.
 SOLUTION_FORMAT, MAP_FORMAT, VERSION = "ssh-solution", "ssh-map", 1
@@ -117,28 +119,39 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
 class _MapReader(FieldReader):
     """Reads and checks the fields of a map."""
 
+    @property
+    def pair(self) -> Shape[Any]:
+        """The shape of two integers."""
+        return self.exactly(2, self.integer, "a list of two numbers")
+
     def fields(self, data: Any) -> dict[str, Any]:
         """Return the arguments of SSHMap by name."""
         record = self.mapping(data, "")
-        dstates = self.each(record, "dstates", self._dstate)
-        places = self.each(record, "places", self.integer, optional=True)
-        paths = self.each(record, "paths", self._path, optional=True)
-        names = self.each(record, "names", self._name, optional=True)
+        each, may_have = partial(self.each, record), partial(self.each, record, optional=True)
+        dstates = each("dstates", self._dstate)
+        places, paths = may_have("places", self.integer), may_have("paths", self._path)
+        names = may_have("names", self._name)
         # Fields refer to dstates, places and paths by their ids, so check these first.
         self._check_ids(dstates, places, paths)
         labels = self._labels(record, len(dstates))
         self._check_once("names", [name.text for name in names])
+        region = partial(self._region, {*places}, {path.id for path in paths})
+        regions = None if record.get("regions") is None else each("regions", region)
+        for number, found in enumerate(regions or ()):
+            if found.id != number:
+                expected = f"{number}, its number in the list"
+                raise self.wrong(f"regions[{number}].id", expected, found.id)
         return {
             "dstate_at": labels,
             "starts": self._starts(record, len(labels)),
             "dstates": dstates,
-            "links": self.each(record, "links", partial(self._link, len(dstates))),
+            "links": each("links", partial(self._link, len(dstates))),
             "places": places,
             "paths": paths,
-            "excused": self.each(record, "excused", self._pair, optional=True),
-            "faults": self.each(record, "faults", partial(self._fault, len(labels)), optional=True),
+            "excused": may_have("excused", self.pair),
+            "faults": may_have("faults", partial(self._fault, len(labels))),
             "fit": self._fit(record, len(dstates)),
-            "regions": self._regions(record, {*places}, {p.id for p in paths}),
+            "regions": regions,
             "names": names,
         }
 
@@ -190,37 +203,38 @@ class _MapReader(FieldReader):
         return starts
 
     def _dstate(self, value: Any, name: str) -> DState:
-        """Convert and check a dstate. The caller checks that its place and path exist."""
-        record = self.mapping(value, name)
+        """Read a dstate. The caller checks that its place and path exist."""
         expected = "a text or an integer, or null where it is unknown"
-        if "view" not in record:
+        if "view" not in self.mapping(value, name):
             raise self.wrong(f"{name}.view", expected, None)
-        view = self.view(record["view"], f"{name}.view", expected)
-        direction = self.optional(record.get("direction"), f"{name}.direction")
-        path = self.optional(record.get("path"), f"{name}.path")
-        if direction not in (None, 1, -1) or (direction is None) != (path is None):
+        number = self.maybe(self.integer)
+        dstate = self.record(
+            DState,
+            value,
+            name,
+            id=self.integer,
+            view=self.view(expected),
+            place=number,
+            path=number,
+            direction=number,
+            heading=self.maybe(self.within(0, 359, "a slot, 0 to 3, or degrees, 0 to 359")),
+            floor=self.maybe(self.within(0, math.inf, "the number of a floor, from 0")),
+        )
+        way = dstate.direction
+        if way not in (None, 1, -1) or (way is None) != (dstate.path is None):
             raise self.wrong(
-                f"{name}.direction", "1 or -1 where there is a path, null elsewhere", direction
+                f"{name}.direction", "1 or -1 where there is a path, null elsewhere", way
             )
-        heading = self.optional(record.get("heading"), f"{name}.heading")
-        if heading is not None and not 0 <= heading < 360:
-            raise self.wrong(f"{name}.heading", "a slot, 0 to 3, or degrees, 0 to 359", heading)
-        place = self.optional(record.get("place"), f"{name}.place")
-        floor = self.optional(record.get("floor"), f"{name}.floor")
-        if floor is not None and floor < 0:
-            raise self.wrong(f"{name}.floor", "the number of a floor, from 0", floor)
-        number = self.integer(record.get("id"), f"{name}.id")
-        return DState(number, view, place, path, direction, heading, floor)
+        return dstate
 
     def _path(self, value: Any, name: str) -> MapPath:
-        record = self.mapping(value, name)
-        order = self.integers(record.get("order"), f"{name}.order")
-        if len(set(order)) < len(order):
-            raise self.wrong(f"{name}.order", "each place once", list(order))
-        return MapPath(self.integer(record.get("id"), f"{name}.id"), order)
+        path = self.record(MapPath, value, name, id=self.integer, order=self.integers)
+        if len(set(path.order)) < len(path.order):
+            raise self.wrong(f"{name}.order", "each place once", list(path.order))
+        return path
 
     def _link(self, dstates: int, value: Any, name: str) -> tuple[int, str, int]:
-        """Convert and check a link. Its two dstates have ids below `dstates`."""
+        """Read a link. Its two dstates have ids below `dstates`."""
         good = (
             isinstance(value, list)
             and len(value) == 3
@@ -231,73 +245,57 @@ class _MapReader(FieldReader):
             raise self.wrong(name, "[dstate, action name, dstate]", value)
         return value[0], value[1], value[2]
 
-    def _pair(self, value: Any, name: str) -> tuple[int, int]:
-        if not isinstance(value, list) or len(value) != 2:
-            raise self.wrong(name, "a list of two numbers", value)
-        return self.integer(value[0], name), self.integer(value[1], name)
-
     def _fault(self, steps: int, value: Any, name: str) -> Fault:
-        """Convert and check a fault. Its step must be less than `steps`."""
-        record = self.mapping(value, name)
-        if record.get("kind") not in FAULTS:
-            raise self.wrong(f"{name}.kind", " or ".join(FAULTS), record.get("kind"))
-        step = self.integer(record.get("step"), f"{name}.step")
-        if not 0 <= step < steps:
-            raise self.wrong(f"{name}.step", f"a step from 0 to {steps - 1}", step)
-        seen, expected = (
-            self.view(record.get(part), f"{name}.{part}", "a text or an integer")
-            for part in ("seen", "expected")
+        """Read a fault. Its step must be less than `steps`."""
+        number, view = self.maybe(self.integer), self.view("a text or an integer")
+        fault = self.record(
+            Fault,
+            value,
+            name,
+            kind=self.one_of(FAULTS),
+            step=self.within(0, steps - 1, f"a step from 0 to {steps - 1}"),
+            seen=view,
+            expected=view,
+            cost=self.number,
+            place=number,
+            gateway=number,
+            towards=self.maybe(self.text),
+            bearing=number,
         )
-        cost = self.number(record.get("cost", 0), f"{name}.cost")
-        place, gateway, bearing = (
-            self.optional(record.get(part), f"{name}.{part}")
-            for part in ("place", "gateway", "bearing")
-        )
-        if record["kind"] == "changed":
-            if bearing is None and (place is None or gateway not in (0, 1, 2, 3)):
+        if fault.kind == "changed":
+            placed, bearing = fault.place is not None, fault.bearing
+            if bearing is None and not (placed and fault.gateway in range(4)):
                 what = "a slot, 0 to 3, and a place, for a change"
-                raise self.wrong(f"{name}.gateway", what, gateway)
-            if bearing is not None and (place is None or not 0 <= bearing < 360):
+                raise self.wrong(f"{name}.gateway", what, fault.gateway)
+            if bearing is not None and not (placed and 0 <= bearing < 360):
                 what = "degrees, 0 to 359, and a place, for a change"
                 raise self.wrong(f"{name}.bearing", what, bearing)
-        towards = record.get("towards")
-        if not isinstance(towards, str | None):
-            raise self.wrong(f"{name}.towards", "a text", towards)
-        return Fault(step, record["kind"], seen, expected, cost, place, gateway, towards, bearing)
+        return fault
 
-    def _regions(
-        self, record: Mapping[str, Any], places: set[int], paths: set[int]
-    ) -> tuple[Region, ...] | None:
-        """Convert and check the regions of a map; None if the file, of an early version, has none.
-
-        Their places and paths must be those of the map.
-        """
-        if record.get("regions") is None:
-            return None
-        listed = enumerate(self.list(record, "regions"))
-        return tuple(self._region(number, value, places, paths) for number, value in listed)
-
-    def _region(self, number: int, value: Any, places: set[int], paths: set[int]) -> Region:
-        """Convert and check a region with the number that it must have."""
-        name = f"regions[{number}]"
-        data = self.mapping(value, name)
-        if data.get("id") != number:
-            raise self.wrong(f"{name}.id", f"{number}, its number in the list", data.get("id"))
-        inner = _MapReader(f"{self.where}: {name}")
-        within = inner.each(data, "places", inner.integer)
-        bounds = inner.each(data, "bounds", inner._pair, optional=True)
-        inside = inner.each(data, "inside", inner.integer, optional=True)
-        door = inner.optional(data.get("door"), "door")
-        if not within or not {*within, *(() if door is None else (door,))} <= places:
-            raise inner.wrong("places", "some places of the map", [*within, door])
-        if any(h not in paths or d not in (1, -1) for h, d in bounds):
-            raise inner.wrong("bounds", "pairs of a path of the map and 1 or -1", [*bounds])
-        if any(not 0 <= i < number for i in inside):
-            raise inner.wrong("inside", "numbers of earlier regions", [*inside])
-        return Region(number, within, bounds, door, inside)
+    def _region(self, places: Set[int], paths: Set[int], value: Any, name: str) -> Region:
+        """Read a region. Its places and paths must be those of the map."""
+        reader = _MapReader(f"{self.where}: {name}")
+        region = reader.record(
+            Region,
+            self.mapping(value, name),
+            "",
+            id=reader.integer,
+            places=reader.integers,
+            bounds=reader.several(reader.pair, "a list"),
+            door=reader.maybe(reader.integer),
+            inside=reader.integers,
+        )
+        spots = [*region.places, *(() if region.door is None else (region.door,))]
+        if not region.places or not {*spots} <= places:
+            raise reader.wrong("places", "some places of the map", spots)
+        if any(h not in paths or d not in (1, -1) for h, d in region.bounds):
+            raise reader.wrong("bounds", "pairs of a path of the map and 1 or -1", [*region.bounds])
+        if any(not 0 <= i < region.id for i in region.inside):
+            raise reader.wrong("inside", "numbers of earlier regions", [*region.inside])
+        return region
 
     def _name(self, value: Any, name: str) -> Name:
-        """Convert and check the name of a place, path or region."""
+        """Read the name of a place, path or region."""
         record = self.mapping(value, name)
         kind = next((kind for kind in NAMED if kind in record), None)
         if kind is None or not isinstance(record.get("name"), str):
@@ -305,19 +303,20 @@ class _MapReader(FieldReader):
         return Name(kind, self.integer(record[kind], f"{name}.{kind}"), record["name"])
 
     def _fit(self, record: Mapping[str, Any], dstates: int) -> Fit | None:
-        """Convert and check the fit, with the poses of the dstates; None if there is none."""
+        """Read the fit, with the poses of the dstates; None if there is none."""
         if record.get("fit") is None:
             return None
-        found = self.mapping(record["fit"], "fit")
-        chi2, dof, p, scale, bend = (
-            self.number(found.get(name, 0), f"fit.{name}")
-            for name in ("chi2", "dof", "p", "scale", "bend")
+        numbers = dict.fromkeys(("chi2", "dof", "p", "scale", "bend"), self.number)
+        fit = self.record(Fit, record["fit"], "fit", **numbers)
+        three: Shape[Any] = self.exactly(3, self.number, "three numbers")
+        rows, spreads = (
+            self.each(record, name, three, optional=True) for name in ("poses", "spreads")
         )
-        rows = self.each(record, "poses", self.numbers, optional=True)
-        spreads = self.each(record, "spreads", self.numbers, optional=True)
         for name, listed in (("poses", rows), ("spreads", spreads)):
             if listed and len(listed) != dstates:
                 raise self.wrong(name, f"{dstates}, one per dstate", len(listed))
         spreads = spreads or ((0.0, 0.0, 0.0),) * len(rows)
-        poses = tuple(Pose(*row, spread) for row, spread in zip(rows, spreads, strict=True))
-        return Fit(chi2, int(dof), p, scale, bend, poses)
+        poses = tuple(
+            Pose(x, y, way, spread) for (x, y, way), spread in zip(rows, spreads, strict=True)
+        )
+        return replace(fit, dof=int(fit.dof), poses=poses)

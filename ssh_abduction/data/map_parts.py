@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ssh_abduction.data.observation import View
+from ssh_abduction.data.schema import PlainData, SparseData
 
 # What a person can name.
 NAMED = ("place", "path", "region")
@@ -63,7 +64,7 @@ def signed_path(path: int | None, direction: int | None) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class MapPath:
+class MapPath(PlainData):
     """A path and the order of its places.
 
     Attributes:
@@ -90,6 +91,10 @@ class Name:
     id: int
     text: str
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the name as a file of maps has it."""
+        return {self.kind: self.id, "name": self.text}
+
 
 def thing_named(text: str, names: Iterable[Name] = ()) -> tuple[str, int] | None:
     """Return the kind and the number of what a text names; None if it names nothing.
@@ -107,7 +112,7 @@ def thing_named(text: str, names: Iterable[Name] = ()) -> tuple[str, int] | None
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class Fault(SparseData):
     """A part of the trace that a map treats as wrong.
 
     Attributes:
@@ -155,10 +160,6 @@ class Fault:
             "jumped": f"the displacement that leads to step {self.step} is wrong: {self.seen}",
             "slipped": f"the action at step {self.step} slipped: {self.seen}",
         }[self.kind]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fault as plain data, without what is None."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ from ssh_abduction.data.map_file import (
 )
 from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
 from ssh_abduction.data.regions import Region, renumbered, right_of
+from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.lazy import card_of
@@ -279,29 +280,20 @@ class SSHMap:
             "id": self.id,
             "labels": list(self.dstate_at),
             "dstates": dstates,
-            "links": [list(link) for link in self.links],
-            "places": list(self.places),
-            "paths": [{"id": p.id, "order": list(p.order)} for p in self.paths],
+            **attributes_of(self, "links", "places", "paths"),
         }
         # Fields that most maps lack are written only if they are there.
-        if self.starts:
-            data["starts"] = list(self.starts)
-        if len(pieces := self.pieces) > 1:
-            data["pieces"] = [list(piece) for piece in pieces]
-        if self.names:
-            data["names"] = [{n.kind: n.id, "name": n.text} for n in self.names]
-        if self.excused:
-            data["excused"] = [list(pair) for pair in self.excused]
-        if self.faults:
-            data["faults"] = [fault.to_dict() for fault in self.faults]
+        more = attributes_of(self, "starts", "pieces", "names", "excused", "faults")
+        if len(more["pieces"]) == 1:
+            del more["pieces"]
+        data |= {name: value for name, value in more.items() if value}
         if self.regions is not None:
-            data["regions"] = [region.to_dict() for region in self.regions]
+            data |= attributes_of(self, "regions")
         if self.fit:
-            data["fit"] = self.fit.to_dict()
-            data["poses"] = [
-                [round(x, 4) for x in (pose.x, pose.y, pose.heading)] for pose in self.fit.poses
-            ]
-            data["spreads"] = [[round(x, 4) for x in pose.spread] for pose in self.fit.poses]
+            data |= {"fit": self.fit.to_dict()}
+            poses = self.fit.poses
+            data["poses"] = [[round(x, 4) for x in (p.x, p.y, p.heading)] for p in poses]
+            data["spreads"] = [[round(x, 4) for x in p.spread] for p in poses]
         return data
 
     @classmethod

@@ -15,9 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from ssh_abduction.data.map_parts import signed_path
+from ssh_abduction.data.schema import SparseData
 from ssh_abduction.data.words import noun_of
 
 # What makes places a region: ("beside", path, direction), ("between", place) or ("behind", place).
@@ -25,7 +26,7 @@ Reason: TypeAlias = tuple[str, int] | tuple[str, int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Region:
+class Region(SparseData):
     """A set of places of a map.
 
     Attributes:
@@ -46,17 +47,6 @@ class Region:
 
     def __str__(self) -> str:
         return described(self, named_by_number)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the region as plain data, without fields that are empty."""
-        data: dict[str, Any] = {"id": self.id, "places": [*self.places]}
-        if self.bounds:
-            data["bounds"] = [[*course] for course in self.bounds]
-        if self.door is not None:
-            data["door"] = self.door
-        if self.inside:
-            data["inside"] = [*self.inside]
-        return data
 
 
 def described(region: Region, called: Callable[[str, int], str]) -> str:

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence, Sized
+from collections.abc import Iterable, Sequence, Sized
 from dataclasses import MISSING, fields
 from typing import Any
 
@@ -55,39 +55,3 @@ def shortly(value: Any) -> str:
     """Return a repr of a dataclass with only those fields that differ from their defaults."""
     fields_told = ", ".join(f"{name}={text}" for name, text in that_differ(value).items())
     return f"{type(value).__name__}({fields_told})"
-
-
-def attributes_of(value: Any, *names: str) -> dict[str, Any]:
-    """Return attributes of a value by name, as plain data for JSON.
-
-    Tuples become lists, and values that have a `to_dict` become dicts.
-    """
-    return {name: _plain(getattr(value, name)) for name in names}
-
-
-class PlainData:
-    """The base class of dataclasses whose plain data for JSON is all of their fields."""
-
-    __slots__ = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return all fields as plain data, as the commands print it with --json."""
-        value: Any = self
-        return attributes_of(value, *(field.name for field in fields(value)))
-
-
-def only_known(**fields: Any) -> dict[str, Any]:
-    """Return the fields that are not None.
-
-    >>> only_known(floor=2, name=None)
-    {'floor': 2}
-    """
-    return {name: value for name, value in fields.items() if value is not None}
-
-
-def _plain(value: Any) -> Any:
-    if hasattr(value, "to_dict"):
-        return value.to_dict()
-    if isinstance(value, Mapping):
-        return {key: _plain(part) for key, part in value.items()}
-    return [_plain(part) for part in value] if isinstance(value, tuple | list) else value

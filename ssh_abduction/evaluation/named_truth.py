@@ -36,8 +36,9 @@ from scipy.optimize import linear_sum_assignment
 
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
 from ssh_abduction.data.maps import SSHMap, check_labels, checked_map, checked_maps
+from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace, View, checked_trace
-from ssh_abduction.data.words import attributes_of, counted
+from ssh_abduction.data.words import counted
 
 _SORTS = ("dstate", "place", "path", "course")
 

@@ -38,8 +38,9 @@ from ssh_abduction.data.checks import a_number, an_instance
 from ssh_abduction.data.errors import TraceError, named
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
+from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace, checked_trace
-from ssh_abduction.data.words import attributes_of, counted
+from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.named_truth import map_of_trace
 from ssh_abduction.evaluation.trajectory import Relations, checked_pose, checked_time, three_numbers
 

@@ -24,8 +24,9 @@ from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import AbductionError, TheoryError, TraceError
 from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace
-from ssh_abduction.data.words import PlainData, attributes_of, noun_of
+from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.axioms import Axioms, Piece
 from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
 from ssh_abduction.solver import Status, Stop, check_rules

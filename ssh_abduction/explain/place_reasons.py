@@ -24,8 +24,8 @@ from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import course_named, list_in_words, regions_at
+from ssh_abduction.data.schema import PlainData
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import PlainData
 from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
 from ssh_abduction.solver import Cost, Judging, Stop, with_regions
 from ssh_abduction.theory.theory import Theory, checked_theory

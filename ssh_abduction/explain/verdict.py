@@ -9,7 +9,8 @@ from typing import Any
 
 from ssh_abduction.checker.checker import Violation
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.words import PlainData, attributes_of, noun_of
+from ssh_abduction.data.schema import PlainData, attributes_of
+from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.no_map import ClashingAxiom, Explanation, clashes_of, steps_listed
 from ssh_abduction.solver import Cost, Stop
 from ssh_abduction.theory.theory import Theory

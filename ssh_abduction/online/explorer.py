@@ -48,8 +48,9 @@ from ssh_abduction.data.checks import a_function, a_whole_number
 from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.data.words import attributes_of, counted
+from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation import evaluate
 from ssh_abduction.online.mapper import OnlineMapper
 from ssh_abduction.rivals.explore import next_experiment

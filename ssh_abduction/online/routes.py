@@ -43,8 +43,9 @@ from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.map_parts import signed_path
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import Region, course_named, named_by_number, right_of
+from ssh_abduction.data.schema import attributes_of, only_known
 from ssh_abduction.data.trace import View
-from ssh_abduction.data.words import attributes_of, counted, only_known
+from ssh_abduction.data.words import counted
 from ssh_abduction.online.move_graph import MoveGraph, Node
 from ssh_abduction.rivals.listing import Listing, Maps
 

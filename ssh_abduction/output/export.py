@@ -32,8 +32,8 @@ from ssh_abduction.data.checks import a_flag, one_of
 from ssh_abduction.data.errors import MapError, brief, is_writable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import only_known
 from ssh_abduction.output.graphs import in_text, to_dot, to_graphml, to_networkx
 from ssh_abduction.output.headings import Turns, degrees_of
 from ssh_abduction.output.roads import DIGITS, NO_PLACES, Road, Roads, Stop, undecided_places

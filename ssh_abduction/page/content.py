@@ -18,8 +18,9 @@ from statistics import median
 from typing import Any
 
 from ssh_abduction.data.maps import SSHMap, check_of_trace
+from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import attributes_of, counted
+from ssh_abduction.data.words import counted
 from ssh_abduction.output.layout import Layout, layout
 from ssh_abduction.output.map_scene import axes
 from ssh_abduction.page.overview import Spot, overview

@@ -32,7 +32,8 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.groups import indices_of
-from ssh_abduction.data.words import PlainData, attributes_of, counted
+from ssh_abduction.data.schema import PlainData, attributes_of
+from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.differences import Difference, difference
 from ssh_abduction.rivals.factors import deciding, independent, options_of
 from ssh_abduction.rivals.listing import Listing, Maps

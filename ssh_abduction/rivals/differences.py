@@ -26,7 +26,8 @@ from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.groups import firsts, gathered, indices_of
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
-from ssh_abduction.data.words import attributes_of, counted, noun_of
+from ssh_abduction.data.schema import attributes_of
+from ssh_abduction.data.words import counted, noun_of
 from ssh_abduction.rivals.known_sides import Beside, only_in
 from ssh_abduction.rivals.table import NONE, Table
 from ssh_abduction.solver import Sort, stretches

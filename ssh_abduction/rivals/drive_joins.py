@@ -22,7 +22,8 @@ from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.groups import firsts, gathered
-from ssh_abduction.data.words import PlainData, counted
+from ssh_abduction.data.schema import PlainData
+from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import probability_in_words
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.words import PlainData, attributes_of, counted
+from ssh_abduction.data.schema import PlainData, attributes_of
+from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.consequences import Consequence
 from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.solver import Stop

@@ -23,7 +23,8 @@ from ssh_abduction.data.drives import named_steps
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.regions import right_of
-from ssh_abduction.data.words import PlainData, counted
+from ssh_abduction.data.schema import PlainData
+from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.listing import Listing
 
 SHOWN = 2  # a sentence names at most this many sides

@@ -20,10 +20,10 @@ from ssh_abduction.data.checks import a_flag, a_path, a_text, a_whole_number, an
 from ssh_abduction.data.corrections_file import named_beside
 from ssh_abduction.data.drives import Drive, pieces_in_words, with_named_faults
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
-from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.map_parts import Fault
 from ssh_abduction.data.maps import ID_LENGTH, SSHMap, checked_maps, maps_of
+from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.data.trace import View
 from ssh_abduction.solver import (
     Backbone,

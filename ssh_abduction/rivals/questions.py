@@ -17,7 +17,8 @@ import numpy as np
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.groups import indices_of
 from ssh_abduction.data.maps import Fault, SSHMap
-from ssh_abduction.data.words import attributes_of, noun_of
+from ssh_abduction.data.schema import attributes_of
+from ssh_abduction.data.words import noun_of
 from ssh_abduction.rivals.table import Bools, Table
 from ssh_abduction.solver import SORTS, stretches
 

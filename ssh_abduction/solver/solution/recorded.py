@@ -8,12 +8,13 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.errors import MapError, TheoryError
-from ssh_abduction.data.json_fields import FieldReader
+from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.trace_file import read_trace
 from ssh_abduction.solver.solution.weighed import Weighed
@@ -51,19 +52,16 @@ class Recorded:
     @classmethod
     def of(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Recorded:
         """Read these parts from the record of a solution. Raises MapError if a field is wrong."""
-        written = (
-            None
-            if record.get("certificate") is None
-            else read.mapping(record["certificate"], "certificate")
+        may_be_object = read.maybe(read.mapping)
+        written, explanation = (
+            may_be_object(record.get(name), name) for name in ("certificate", "explanation")
         )
         drives = drives_in(read, record, steps)
         return cls(
             certificate=None if written is None else _certificate(read, written, steps),
             written_certificate=written,
             warnings=warnings_in(read, record),
-            explanation=None
-            if record.get("explanation") is None
-            else read.mapping(record["explanation"], "explanation"),
+            explanation=explanation,
             joins=joins_in(read, record, steps, drives),
             drives=drives,
             onto=tuple(map(str, read.list(record, "onto", optional=True))),
@@ -117,14 +115,9 @@ def drives_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple
     """Read the drives, which divide the steps of the trace. Raises MapError."""
 
     def drive(value: Any, name: str) -> Drive:
-        written = read.mapping(value, name)
-        if not isinstance(written.get("name"), str):
-            raise read.wrong(f"{name}.name", "a text", written.get("name"))
-        first, stop = (read.integer(written.get(key), f"{name}.{key}") for key in ("first", "stop"))
-        fingerprint = written.get("fingerprint")
-        if not isinstance(fingerprint, str | None):
-            raise read.wrong(f"{name}.fingerprint", "a text", fingerprint)
-        return Drive(written["name"], first, stop, fingerprint)
+        shapes = {"name": read.text, "fingerprint": read.maybe(read.text)}
+        bounds = {"first": read.integer, "stop": read.integer}
+        return read.record(Drive, value, name, **shapes, **bounds)
 
     found = read.each(record, "drives", drive, optional=True)
     bounds = [0, *(drive.stop for drive in found)]
@@ -135,11 +128,8 @@ def drives_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple
 
 def warnings_in(read: FieldReader, record: Mapping[str, Any]) -> tuple[str, ...]:
     """Read the warnings about the trace. Raises MapError if one is not a text."""
-    warnings = read.list(record, "warnings", optional=True)
-    for i, warning in enumerate(warnings):
-        if not isinstance(warning, str):
-            raise read.wrong(f"warnings[{i}]", "a sentence", warning)
-    return tuple(warnings)
+    sentence = read.text_called("a sentence")
+    return read.each(record, "warnings", sentence, optional=True)
 
 
 def joins_in(
@@ -150,14 +140,12 @@ def joins_in(
 
     def join(value: Any, name: str) -> Join:
         written = read.mapping(value, name)
-        pair, of = written.get("steps"), written.get("of")
-        if not isinstance(pair, list) or len(pair) != 2:
-            raise read.wrong(f"{name}.steps", "two steps", pair)
-        first, second = (read.integer(step, f"{name}.steps") for step in pair)
+        two_steps = read.exactly(2, read.integer, "two steps")
+        first, second = two_steps(written.get("steps"), f"{name}.steps")
         if not 0 <= first < second < steps:
-            raise read.wrong(f"{name}.steps", f"two steps from 0 to {steps - 1}", pair)
-        if of not in ("place", "dstate"):
-            raise read.wrong(f"{name}.of", "place or dstate", of)
+            expected = f"two steps from 0 to {steps - 1}"
+            raise read.wrong(f"{name}.steps", expected, written["steps"])
+        of = read.one_of(("place", "dstate"))(written.get("of"), f"{name}.of")
         return Join(names[first], names[second], of == "place")
 
     return read.each(record, "by_minimality", join, optional=True)
@@ -165,18 +153,16 @@ def joins_in(
 
 def _certificate(read: FieldReader, written: Mapping[str, Any], steps: int) -> Certificate:
     """Read a certificate. Raises MapError."""
-    clique, refuted = (
-        read.integers(written.get(k), f"certificate.{k}") for k in ("clique", "refuted")
-    )
+    steps_shown = {"clique": read.integers, "refuted": read.integers}
+    found = read.record(Certificate, written, "certificate", **steps_shown)
+    clique, first = found.clique, len(found.clique)
     if len(set(clique)) < len(clique) or not all(0 <= step < steps for step in clique):
-        raise read.wrong(
-            "certificate.clique", f"different steps from 0 to {steps - 1}", list(clique)
-        )
-    if refuted != tuple(range(len(clique), len(clique) + len(refuted))):
-        raise read.wrong(
-            "certificate.refuted", f"the numbers of dstates from {len(clique)} on", list(refuted)
-        )
-    return Certificate(clique, refuted)
+        expected = f"different steps from 0 to {steps - 1}"
+        raise read.wrong("certificate.clique", expected, list(clique))
+    if found.refuted != tuple(range(first, first + len(found.refuted))):
+        expected = f"the numbers of dstates from {first} on"
+        raise read.wrong("certificate.refuted", expected, list(found.refuted))
+    return found
 
 
 def theory_in(value: Any, where: str) -> Theory:
@@ -209,26 +195,15 @@ def bound_in(read: FieldReader, value: Any) -> Bound:
 
 def effort_in(read: FieldReader, record: Mapping[str, Any]) -> Effort:
     """Read what the search did: prefix, times, grounding and evidence. Raises MapError."""
-    prefix = read.integer(record.get("prefix", 0), "prefix")
-    times = read.mapping(record.get("seconds", {}), "seconds")
-    seconds = Seconds(
-        *(
-            read.not_negative(times.get(k, 0.0), f"seconds.{k}")
-            for k in ("total", "ground", "solve")
-        )
+    times = dict.fromkeys(("total", "ground", "solve"), read.maybe(read.not_negative, 0.0))
+    sizes = dict.fromkeys(("rules", "atoms"), read.maybe(read.whole, 0))
+    counts = read.values(read.values(read.whole))
+    return Effort(
+        prefix=read.integer(record.get("prefix", 0), "prefix"),
+        seconds=read.record(Seconds, record.get("seconds", {}), "seconds", **times),
+        grounding=read.record(Grounding, record.get("grounding", {}), "grounding", **sizes),
+        evidence=counts(record.get("evidence", {}), "evidence"),
     )
-    sizes = read.mapping(record.get("grounding", {}), "grounding")
-    grounding = Grounding(
-        *(read.whole(sizes.get(k, 0), f"grounding.{k}") for k in ("rules", "atoms"))
-    )
-    evidence = {
-        kind: {
-            k: read.whole(v, f"evidence.{kind}.{k}")
-            for k, v in read.mapping(said, f"evidence.{kind}").items()
-        }
-        for kind, said in read.mapping(record.get("evidence", {}), "evidence").items()
-    }
-    return Effort(prefix, seconds, grounding, evidence)
 
 
 def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> tuple[Level, ...]:
@@ -242,17 +217,12 @@ def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> tuple[
         if not maps or record.get("cost") is None:
             return ()
         return (Level(cost_in(read, record["cost"], "cost"), maps, complete),)
-    levels = [
-        read.mapping(level, f"levels[{i}]") for i, level in enumerate(read.list(record, "levels"))
-    ]
-    found = tuple(
-        Level(
-            cost_in(read, level.get("cost"), f"levels[{i}].cost"),
-            read.whole(level.get("count"), f"levels[{i}].count"),
-            complete,
-        )
-        for i, level in enumerate(levels)
-    )
+
+    def level(value: Any, name: str) -> Level:
+        found = read.record(Level, value, name, cost=partial(cost_in, read), count=read.whole)
+        return replace(found, complete=complete)
+
+    found = read.each(record, "levels", level)
     counts = [level.count for level in found]
     if sum(counts) != maps:
         raise read.wrong("levels", f"{maps} maps in all, the number of listed maps", counts)

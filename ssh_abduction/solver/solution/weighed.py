@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Any
 
 from ssh_abduction.data.drives import Drive, drive_of_steps, named_steps
-from ssh_abduction.data.json_fields import FieldReader
 from ssh_abduction.data.map_parts import FAULTS
+from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.theory.overlap import groups_of
 
 EQUAL = 1e-6  # costs in nats that differ by less count as equal
@@ -335,25 +335,25 @@ class Weighed:
             MapError: A field is wrong.
         """
         record = read.mapping(value, "weighed")
-        written = record.get("rivals")
-        if not isinstance(written, list) or not written:
-            raise read.wrong("weighed.rivals", "a list of maps", written)
-        rivals = tuple(
-            _rival(read, rival, f"weighed.rivals[{i}]", steps) for i, rival in enumerate(written)
+        if not record.get("rivals"):
+            raise read.wrong("weighed.rivals", "a list of maps", record.get("rivals"))
+        rival = partial(_rival, read, steps)
+        found = read.record(
+            cls,
+            {**record, "searched": record.get("searched") is True},
+            "weighed",
+            rivals=read.several(rival, "a list of maps"),
+            bound=read.number,
+            within=read.number,
+            broken=read.number,
+            excess=read.number,
+            doubt=read.maybe(read.text),
+            searched=lambda value, _: value,
+            gaps=read.integers,
         )
-        bound, within = (read.number(record.get(k), f"weighed.{k}") for k in ("bound", "within"))
-        broken = (
-            read.number(record["broken"], "weighed.broken") if "broken" in record else -math.inf
-        )
-        excess = read.number(record.get("excess", 1.0), "weighed.excess")
-        if excess < 1:
-            raise read.wrong("weighed.excess", "a number of at least 1", excess)
-        doubt = record.get("doubt")
-        if doubt is not None and not isinstance(doubt, str):
-            raise read.wrong("weighed.doubt", "a text", doubt)
-        searched = record.get("searched") is True
-        gaps = read.integers(record.get("gaps", []), "weighed.gaps")
-        return cls(bound, within, rivals, searched, broken, excess, doubt, gaps, drives)
+        if found.excess < 1:
+            raise read.wrong("weighed.excess", "a number of at least 1", found.excess)
+        return replace(found, drives=drives)
 
 
 def _rounded(probability: float | None) -> float | None:
@@ -374,24 +374,26 @@ def groups_of_drives(at: Sequence[int], drives: Sequence[Drive]) -> int:
     return groups_of(at, drive, range(len(drives)))
 
 
-def _rival(read: FieldReader, value: Any, name: str, steps: int) -> Rival:
+def _rival(read: FieldReader, steps: int, value: Any, name: str) -> Rival:
     """Read a rival from the field `name`. Raises MapError."""
-    record = read.mapping(value, name)
-    dstates, places = (
-        read.integers(record.get(field, default), f"{name}.{field}")
-        for field, default in (("dstates", None), ("places", []))
+
+    def faults(value: Any, name: str) -> tuple[tuple[str, int], ...]:
+        if not isinstance(value, list) or not all(
+            isinstance(fault, list) and len(fault) == 2 and fault[0] in FAULTS for fault in value
+        ):
+            raise read.wrong(name, 'a list of faults such as ["jumped", 7]', value)
+        return tuple((kind, read.integer(step, name)) for kind, step in value)
+
+    rival = read.record(
+        Rival,
+        value,
+        name,
+        dstates=read.integers,
+        places=read.integers,
+        nats=read.number,
+        faults=faults,
+        estimated=lambda value, _: bool(value),
     )
-    if len(dstates) != steps or len(places) not in (0, steps):
+    if len(rival.dstates) != steps or len(rival.places) not in (0, steps):
         raise read.wrong(name, f"the dstates and places of {steps} steps", value)
-    nats = read.number(record.get("nats"), f"{name}.nats")
-    faults = _faults(read, record.get("faults", []), f"{name}.faults")
-    return Rival(nats, dstates, places, bool(record.get("estimated", False)), faults)
-
-
-def _faults(read: FieldReader, value: Any, name: str) -> tuple[tuple[str, int], ...]:
-    """Read the faults of a rival as pairs (kind, step). Raises MapError."""
-    if not isinstance(value, list) or not all(
-        isinstance(fault, list) and len(fault) == 2 and fault[0] in FAULTS for fault in value
-    ):
-        raise read.wrong(name, 'a list of faults such as ["jumped", 7]', value)
-    return tuple((kind, read.integer(step, name)) for kind, step in value)
+    return rival

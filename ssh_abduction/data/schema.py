@@ -1,0 +1,221 @@
+"""The schema of values in JSON: write values as plain data, and read and check the fields of files.
+
+A *shape* reads one value: it takes the value and the name of its field, and returns the checked
+value, or raises an error that names the field. Shapes are methods of a `FieldReader`, or are made
+by one. A record is read by the shapes of its fields:
+
+>>> from ssh_abduction.data.map_parts import MapPath
+>>> read = FieldReader("maps.json")
+>>> shapes = {"id": read.integer, "order": read.integers}
+>>> read.record(MapPath, {"id": 0, "order": [2, 3]}, "paths[0]", **shapes)
+MapPath(id=0, order=(2, 3))
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import MISSING, fields
+from typing import Any, ClassVar, TypeAlias, TypeVar
+
+from ssh_abduction.data.checks import a_text
+from ssh_abduction.data.errors import AbductionError, MapError, brief, is_finite, is_writable
+from ssh_abduction.data.observation import View
+
+T = TypeVar("T")
+Shape: TypeAlias = Callable[[Any, str], T]
+
+
+class PlainData:
+    """The base class of dataclasses whose plain data for JSON is all of their fields."""
+
+    __slots__ = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all fields as plain data, as the commands print it with --json."""
+        value: Any = self
+        return attributes_of(value, *(field.name for field in fields(value)))
+
+
+class SparseData(PlainData):
+    """The base class of dataclasses whose plain data leaves out fields that are None or empty."""
+
+    __slots__ = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as plain data, without those that are None or empty."""
+        data = PlainData.to_dict(self)
+        return {name: value for name, value in data.items() if value is not None and value != []}
+
+
+def attributes_of(value: Any, *names: str) -> dict[str, Any]:
+    """Return attributes of a value by name, as plain data for JSON."""
+    return {name: plain(getattr(value, name)) for name in names}
+
+
+def plain(value: Any) -> Any:
+    """Return plain data: tuples become lists, and values that have a `to_dict` become dicts."""
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if isinstance(value, Mapping):
+        return {key: plain(part) for key, part in value.items()}
+    return [plain(part) for part in value] if isinstance(value, tuple | list) else value
+
+
+def only_known(**fields: Any) -> dict[str, Any]:
+    """Return the fields that are not None.
+
+    >>> only_known(floor=2, name=None)
+    {'floor': 2}
+    """
+    return {name: value for name, value in fields.items() if value is not None}
+
+
+class FieldReader:
+    """Reads and checks fields of a JSON object from a file of maps.
+
+    Errors name the field by `name`, and the file by `where`. Readers of other files are subclasses.
+    """
+
+    error: ClassVar[type[AbductionError]] = MapError  # the class of the errors that are raised
+    mend: ClassVar = "write the file with solve --json"  # what messages advise the user to do
+
+    def __init__(self, where: str) -> None:
+        self.where = a_text("where", where, self.error)
+
+    def wrong(self, name: str, expected: str, value: Any) -> AbductionError:
+        """Return the error for a field with a wrong value."""
+        what = f"{self.where}: {name or 'map'}: expected {expected}"
+        return self.error(f"{what}, got {brief(value)}; {self.mend}")
+
+    def record(self, kind: type[T], value: Any, name: str, /, **shapes: Shape[Any]) -> T:
+        """Read an object as an instance of a dataclass, from the shape of each field.
+
+        A field that is missing keeps its default. If it has none, its shape reads None.
+        """
+        given, path = self.mapping(value, name), f"{name}." if name else ""
+        known: Any = kind
+        no_default = (MISSING, MISSING)
+        needed = {f.name for f in fields(known) if (f.default, f.default_factory) == no_default}
+        return kind(
+            **{
+                key: read(given.get(key), path + key)
+                for key, read in shapes.items()
+                if key in given or key in needed
+            }
+        )
+
+    def each(
+        self, record: Mapping[str, Any], name: str, read: Shape[T], optional: bool = False
+    ) -> tuple[T, ...]:
+        """Read the members of the list in a field; none if an optional field is missing."""
+        members = self.list(record, name, optional)
+        return tuple(read(value, f"{name}[{i}]") for i, value in enumerate(members))
+
+    def list(self, record: Mapping[str, Any], name: str, optional: bool = False) -> list[Any]:
+        """Return the list in a field of a record; an empty list if an optional field is missing."""
+        value = record.get(name, [] if optional else None)
+        if not isinstance(value, list):
+            raise self.wrong(name, "a list", value)
+        return value
+
+    def mapping(self, value: Any, name: str) -> Mapping[str, Any]:
+        if not isinstance(value, Mapping):
+            raise self.wrong(name, "an object", value)
+        return value
+
+    def integer(self, value: Any, name: str) -> int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise self.wrong(name, "an integer", value)
+        return value
+
+    def integers(self, value: Any, name: str) -> tuple[int, ...]:
+        return self.several(self.integer, "a list of integers")(value, name)
+
+    def whole(self, value: Any, name: str) -> int:
+        return self.within(0, math.inf, "a whole number, 0 or more")(value, name)
+
+    def number(self, value: Any, name: str) -> float:
+        if not is_finite(value):
+            raise self.wrong(name, "a finite number", value)
+        return float(value)
+
+    def not_negative(self, value: Any, name: str) -> float:
+        if self.number(value, name) < 0:
+            raise self.wrong(name, "a number, 0 or more", value)
+        return float(value)
+
+    def text(self, value: Any, name: str) -> str:
+        return self.text_called("a text")(value, name)
+
+    def text_called(self, expected: str) -> Shape[str]:
+        """Make the shape of a text, which messages call `expected`."""
+
+        def read(value: Any, name: str) -> str:
+            if not isinstance(value, str):
+                raise self.wrong(name, expected, value)
+            return value
+
+        return read
+
+    def values(self, read: Shape[T]) -> Shape[dict[str, T]]:
+        """Make the shape of an object whose values all have one shape."""
+        return lambda value, name: {
+            key: read(part, f"{name}.{key}") for key, part in self.mapping(value, name).items()
+        }
+
+    def within(self, low: int, high: float, expected: str) -> Shape[int]:
+        """Make the shape of an integer from `low` to `high`, which messages call `expected`."""
+
+        def read(value: Any, name: str) -> int:
+            if not low <= self.integer(value, name) <= high:
+                raise self.wrong(name, expected, value)
+            return int(value)
+
+        return read
+
+    def maybe(self, read: Shape[T], default: Any = None) -> Shape[T | Any]:
+        """Make the shape of a value that may be null, which becomes the default."""
+        return lambda value, name: default if value is None else read(value, name)
+
+    def one_of(self, choices: Collection[str]) -> Shape[Any]:
+        """Make the shape of a text that is one of these."""
+
+        def read(value: Any, name: str) -> Any:
+            if not isinstance(value, str) or value not in choices:
+                raise self.wrong(name, " or ".join(choices), value)
+            return value
+
+        return read
+
+    def several(self, read: Shape[T], expected: str) -> Shape[tuple[T, ...]]:
+        """Make the shape of a list, which messages call `expected`."""
+
+        def read_all(value: Any, name: str) -> tuple[T, ...]:
+            if not isinstance(value, list):
+                raise self.wrong(name, expected, value)
+            return tuple(read(part, f"{name}[{i}]") for i, part in enumerate(value))
+
+        return read_all
+
+    def exactly(self, count: int, read: Shape[T], expected: str) -> Shape[Any]:
+        """Make the shape of a list of `count` values, which messages call `expected`."""
+
+        def read_all(value: Any, name: str) -> tuple[T, ...]:
+            if not isinstance(value, list) or len(value) != count:
+                raise self.wrong(name, expected, value)
+            return tuple(read(part, name) for part in value)
+
+        return read_all
+
+    def view(self, expected: str) -> Shape[View | None]:
+        """Make the shape of a view: a text or an integer, or None for an unknown one."""
+
+        def read(value: Any, name: str) -> View | None:
+            is_view = isinstance(value, str | int | None) and not isinstance(value, bool)
+            if not is_view or (isinstance(value, str) and not is_writable(value)):
+                raise self.wrong(name, expected, value)
+            view: View | None = value
+            return view
+
+        return read
