@@ -94,6 +94,8 @@ class Axioms:
         self._stop = stop
         self._refusals = 0  # constraints added so far, because evidence rejected a map
         self._conclusions: list[clingo.Symbol] = []
+        self._picked = frozenset[clingo.Symbol]()  # those of which one has to fail, in a query
+        self._literals: dict[clingo.Symbol, int] = {}  # clingo's literals of atoms
         self._seen: list[_ArgumentModel] = []
         self._last_core: tuple[int, ...] = ()  # clingo's literals of the last unsat core
         self._control = Control(["--heuristic=Domain"] if relaxed else [])
@@ -205,13 +207,17 @@ class Axioms:
                 self._seen.append(seen)
 
         doubtful = found - frozenset(known)
-        for symbol in self._conclusions:
-            self._control.assign_external(facts.picked(symbol), symbol in doubtful)
+        self._pick(doubtful)
         while doubtful and self._solve(keep, active, [*assumed, (facts.some_fail(), True)]):
-            for symbol in doubtful - found:
-                self._control.assign_external(facts.picked(symbol), False)
             doubtful &= found
+            self._pick(doubtful)
         return found
+
+    def _pick(self, doubtful: frozenset[clingo.Symbol]) -> None:
+        """Ask the next query for a model in which one of these conclusions fails."""
+        for symbol in doubtful ^ self._picked:
+            self._control.assign_external(facts.picked(symbol), symbol in doubtful)
+        self._picked = doubtful
 
     def core(
         self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]
@@ -247,11 +253,13 @@ class Axioms:
     def _of_last_core(self, assumed: Sequence[Assumption]) -> list[Assumption]:
         """List those of the given assumptions that are in the last unsat core."""
         core = set(self._last_core)
-        atoms = self._control.symbolic_atoms
+        for symbol in {symbol for symbol, _ in assumed} - self._literals.keys():
+            if (atom := self._control.symbolic_atoms[symbol]) is not None:
+                self._literals[symbol] = atom.literal
         return [
             (symbol, true)
             for symbol, true in assumed
-            if (atom := atoms[symbol]) is None or atom.literal * (1 if true else -1) in core
+            if symbol not in self._literals or self._literals[symbol] * (1 if true else -1) in core
         ]
 
     def _answer(
