@@ -99,7 +99,14 @@ def test_scan_matching_corrects_the_odometry(hall: Path) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    ["check", "compare", "explain FOLDER 0 1", "explain FILE 0 1", "view -o PAGE", "localise"],
+    [
+        "check",
+        "compare",
+        "explain FOLDER 0 1",
+        pytest.param("explain FILE 0 1", marks=pytest.mark.slow),
+        "view -o PAGE",
+        "localise",
+    ],
 )
 def test_verbs_accept_the_folder_of_a_map(
     runs: Path, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -391,7 +398,14 @@ def test_search_without_a_limit_continues_until_it_has_a_map(
         )
 
 
-@pytest.mark.parametrize(("limit", "rung"), [(3.0, 1.0), (80.0, 5.0), (1000.0, 10.0)])
+@pytest.mark.parametrize(
+    ("limit", "rung"),
+    [
+        pytest.param(3.0, 1.0, marks=pytest.mark.slow),
+        (80.0, 5.0),
+        pytest.param(1000.0, 10.0, marks=pytest.mark.slow),
+    ],
+)
 def test_ladder_takes_a_quarter_of_the_limit(
     limit: float, rung: float, runs: Path, hall: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
