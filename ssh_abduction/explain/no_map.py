@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, count
-from typing import Any, Unpack
+from typing import Any
 
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.corrections import ASSERTIONS
@@ -28,7 +28,7 @@ from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.axioms import Axioms, Piece
-from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
+from ssh_abduction.explain.question import LimitedQuestion
 from ssh_abduction.solver import Status, Stop, check_rules
 from ssh_abduction.theory.settle import displacement_of, settle
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -297,14 +297,10 @@ class TraceExplanation:
 class TraceQuestion(LimitedQuestion[TraceExplanation]):
     """The search for the answer of `explain_trace`, with the same parameters."""
 
-    def __init__(
-        self, trace: Trace, theory: Theory | None = None, **limits: Unpack[QuestionLimits]
-    ) -> None:
-        super().__init__(trace, theory, **limits)
-        self._possible: bool | None = None
-        self._clash: Explanation | None = None
-        self._mends: list[Mend] = []
-        self._complete = False
+    _possible: bool | None = None
+    _clash: Explanation | None = None
+    _mends: tuple[Mend, ...] = ()
+    _complete: bool = False
 
     def known(self, why: Stop | None = None) -> TraceExplanation:
         """Return what is known so far. `why` is the limit that is about to end the search."""
@@ -340,7 +336,7 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
                     continue
                 found = self._has_map(trace, theory)
                 if found is not False:
-                    self._mends.append(Mend(step, kind, seen, instead, proven=bool(found)))
+                    self._mends += (Mend(step, kind, seen, instead, proven=bool(found)),)
                     break
         self._complete = True
 

@@ -13,7 +13,7 @@ and when the number of maps has changed. It takes the first of these that exists
 2. The shortest tour through all untried actions of the first map (`rivals/tour.py`). If the tour
    visits a place several times, the robot looks around there at the last visit.
 3. An untried action for which the minimal maps predict different outcomes.
-4. Actions that distinguish the map from a map without one of its returns (`return_doubts.py`).
+4. Actions that distinguish the map from a map without one of its returns (`ReturnDoubts`).
 
 When it is done
 ---------------

@@ -103,9 +103,10 @@ class Recovery(Keeper):
         problem, lead = self._problem, self._maps.lead
         if lead and self._confidence.known is None:
             self._confidence.known = lead.explained()
-        change = self._maps.follow(problem)
-        self._confidence.note(len(problem.trace) - 1, change.broke)
-        return change.lost_proof
+        lost_proof, broke = self._maps.follow(problem)
+        if broke:
+            self._confidence.broke.append((len(problem.trace) - 1, broke))
+        return lost_proof
 
     def answer(self, began: float) -> Solution:
         """Also say how sure the maps are."""
@@ -240,17 +241,13 @@ class Confidence:
         # The last map that was certain. If none was certain yet, the best map of the first answer.
         self.known: SSHMap | None = None
         self._chances = chances_of(theory)
-        self._broke: list[tuple[int, str]] = []  # step and sentence, since the map was certain
+        # Each step that contradicted the best map since it was certain, with a sentence.
+        self.broke: list[tuple[int, str]] = []
         self._located: _LocatedBelief | None = None
-
-    def note(self, step: int, broke: str | None) -> None:
-        """Record that a step contradicted the best map, if `broke` has a sentence on it."""
-        if broke:
-            self._broke.append((step, broke))
 
     def standing(self, maps: RivalMaps, trace: Trace, listed: Sequence[SSHMap]) -> Standing:
         """Compute how sure the mapper is now, by the rivals and the maps listed, best first."""
-        broke = tuple(sentence for _, sentence in self._broke)
+        broke = tuple(sentence for _, sentence in self.broke)
         lead = maps.lead
         if lead is None:
             said = "no map of these steps is known yet"
@@ -258,7 +255,7 @@ class Confidence:
                 said = "no map satisfies the axioms"
             return Standing(False, broke, (PossibleMap(1.0, None, said),))
         rivals, shares = maps.undecided()
-        where = self._locate(lead, trace) if self._broke else None
+        where = self._locate(lead, trace) if self.broke else None
         certain = _is_decided(maps, rivals, shares) and (
             where is None or self._has_recovered(where, lead, trace)
         )
@@ -266,7 +263,7 @@ class Confidence:
         # From here on only later faults are reported.
         if certain:
             self.known, self._located = listed[0], None
-            self._broke.clear()
+            self.broke.clear()
         return standing
 
     def _has_recovered(self, where: Belief, lead: ExtendedMap, trace: Trace) -> bool:
@@ -275,7 +272,7 @@ class Confidence:
         This needs a later step, and localisation has to agree with the best map: it gives more than
         half of the probability to the dstate where this map has the robot.
         """
-        is_later = self._broke[-1][0] < len(trace) - 1
+        is_later = self.broke[-1][0] < len(trace) - 1
         return is_later and where.likeliest == lead.here and where.probability > 0.5
 
     def _hypotheses(
@@ -312,7 +309,7 @@ class Confidence:
             after = self._located.steps
         else:  # another map than at the last step
             localiser = Localiser(lead.explained(), chances=self._chances)
-            after = max(self._broke[0][0] - 1, t - REPLAYED, 0)
+            after = max(self.broke[0][0] - 1, t - REPLAYED, 0)
             there = np.zeros(len(lead.shows))
             there[lead.labels[after]] = 1.0
             belief = Belief(there, 0.0)
@@ -339,16 +336,6 @@ def _is_decided(maps: RivalMaps, rivals: Sequence[ExtendedMap], shares: Sequence
         share for rival, share in zip(rivals, shares, strict=True) if rival.future() == future
     )
     return agreeing >= CERTAIN
-
-
-@dataclass(frozen=True, slots=True)
-class StepEffect:
-    """The effect of one more step on the rivals."""
-
-    # Whether the maps are not proven minimal any more, or further minimal maps may exist.
-    lost_proof: bool = False
-    # A sentence about what the best map expected instead; None if it predicted the step.
-    broke: str | None = None
 
 
 class RivalMaps:
@@ -406,13 +393,18 @@ class RivalMaps:
             self.is_proven and (self.is_complete or len(self.minimal) == self._max_maps)
         )
 
-    def follow(self, problem: Problem) -> StepEffect:
-        """Extend the rivals by the last step of `problem`, which has all steps and the theory."""
+    def follow(self, problem: Problem) -> tuple[bool, str | None]:
+        """Extend the rivals by the last step of `problem`, which has all steps and the theory.
+
+        Returns:
+            Whether the maps are not proven minimal any more, or further minimal maps may exist; and
+            a sentence about what the best map expected instead, None if it predicted the step.
+        """
         self._problem, trace = problem, problem.trace
         t = len(trace) - 1
         self._views.add(trace.steps[t].view)
         if self.is_impossible and self._replays:
-            return StepEffect()
+            return False, None
         done = trace.steps[t - 1].action
         assert done
         seen = observation(trace.steps[t], self._theory)
@@ -423,15 +415,15 @@ class RivalMaps:
         if not self._replays:  # the answer for fewer steps says nothing about more steps
             self.rivals, self.bound = [], Bound()
             self.is_proven = self.is_complete = self.is_impossible = False
-            return StepEffect(lost_proof=True)
+            return True, None
         lost_proof = False
         if self.is_proven and self.is_complete and has_unknown and not self._lists_links:
             self.is_complete, lost_proof = False, True
         if self.is_proven and not self.minimal:
             self.is_proven, self.is_complete, lost_proof = False, False, True
         if lead and contradicted is not None and all(r.cost > lead.cost for r in self.rivals):
-            return StepEffect(lost_proof, self._sentence(t, lead, contradicted, seen))
-        return StepEffect(lost_proof)
+            return lost_proof, self._sentence(t, lead, contradicted, seen)
+        return lost_proof, None
 
     def absorb(self, found: Solution) -> None:
         """Add the maps of a solution of all steps to the rivals, and record what is proven."""
