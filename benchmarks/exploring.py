@@ -49,8 +49,7 @@ from simulator.plans import Plan
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.online.explorer import Explorer
-from ssh_abduction.rivals.flow import shortest_flow
-from ssh_abduction.rivals.stances import StanceMove
+from ssh_abduction.rivals.tour import StanceMove, shortest_flow
 
 ROOT = Path(__file__).parent.parent
 MOVES = {name: Action.of(name) for name in ("travel", "right", "around", "left")}

@@ -31,13 +31,15 @@ from ssh_abduction.cli import solve as solving
 from ssh_abduction.cli.text import compared
 from ssh_abduction.data import MapError
 from ssh_abduction.data.maps import DState, Fault, Fit, MapPath
+from ssh_abduction.page.content import content_of
 from ssh_abduction.rivals import Comparison, Listing, difference, shared_sides
-from ssh_abduction.rivals.factors import deciding, independent
-from ssh_abduction.rivals.questions import Matter, Question
+from ssh_abduction.rivals.listing import PairInMap
+from ssh_abduction.rivals.questions import Matter, Question, deciding, independent
 from ssh_abduction.solver import find_backbone
 from ssh_abduction.solver import search as searching
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
+from ssh_abduction.solver.solution.weighed import Rival, Weighed
 
 FREE_PLACES = Theory(star="none", prefer=("dstates", "places", "paths"))
 
@@ -519,9 +521,9 @@ def edited(path: Path, change: Callable[[dict[str, object]], object]) -> Path:
     [
         (lambda d: d["maps"][1]["labels"].__setitem__(4, 0), "maps[1]: id: expected "),
         (lambda d: d["maps"][1].update(id="no"), "maps[1]: id: expected "),
-        (lambda d: d.update(maps=[]), "expected maps, got none"),
+        (lambda d: d.update(maps=[]), "count: expected 0, the number of maps listed, got 4"),
         (lambda d: d.update(maps=5), "maps: expected a list, got 5"),
-        (lambda d: d.update(steps=7), "steps: expected 23, as map 1 has, got 7"),
+        (lambda d: d.update(steps=7), "prefix: expected 0 to 7, the number of steps of the trace"),
         (lambda d: d.update(complete="yes"), "complete: expected true or false, got 'yes'"),
         (
             lambda d: d.update(backbone=[]),
@@ -544,7 +546,7 @@ def edited(path: Path, change: Callable[[dict[str, object]], object]) -> Path:
             "expected the view 'x' at step 0, as ",
         ),
         (lambda d: d["theory"].update(level="no"), "level"),
-        (lambda d: d.update(levels=[]), "levels: expected a list"),
+        (lambda d: d.update(levels=[]), "levels: expected 4 maps in all"),
     ],
 )
 def test_compare_refuses_edited_files(
@@ -644,3 +646,19 @@ def test_compare_accepts_dstates_along_no_path() -> None:
     assert cut.complete is False
     assert cut.shared.proven
     assert cut.shared.sentence == compare(solve(trace, max_maps=None)).shared.sentence
+
+
+def test_unfinished_search_gives_no_probability_of_joins() -> None:
+    trace = Trace.from_steps("abca", ["travel"] * 3)
+    ssh_map = solve(trace).maps[0]
+    at = ((0, 1, 2, 0), (0, 1, 2, 3))
+    rivals = (Rival(5.0, at[0], at[0]), Rival(6.0, at[1], at[1]))
+    for bound, told in ((5.0, True), (1.0, False)):
+        listing = Listing((ssh_map,), weighed=Weighed(bound, 3.0, rivals))
+        pair = PairInMap.of(listing, 0, 3)
+        assert pair is not None
+        assert (pair.probability is not None) == told
+        assert ("probability" in str(pair)) == told
+        content = content_of(listing)
+        assert bool(content["joins"]) == told
+        assert ("did not finish" in content["sureness"]) != told

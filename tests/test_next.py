@@ -15,9 +15,8 @@ from instances import maze, moore, rectangle
 from ssh_abduction import SSHMap, Theory, Trace, next_experiment, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import DState, MapError, MapPath, SolverError
-from ssh_abduction.rivals.consequences import Consequences
-from ssh_abduction.rivals.experiment import Experiment, ExperimentPlan
-from ssh_abduction.rivals.machines import Seen, leads_of
+from ssh_abduction.rivals.explore import Experiment, ExperimentPlan
+from ssh_abduction.rivals.machines import Consequences, Seen, leads_of
 from ssh_abduction.solver.asp.limits import Watch
 
 ROOT = Path(__file__).parent.parent
@@ -410,14 +409,14 @@ def machines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[str, s
     assert main(["solve", str(trace), "--theory", "causal", "-n", "0", "--json"]) == 0
     maps = tmp_path / "maps.json"
     maps.write_text(capsys.readouterr().out)
-    return str(trace), str(maps)
+    return str(maps), str(trace)
 
 
 def test_next_prints_the_result_of_python(
     machines: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["next", *machines, "--json"]) == 0
-    trace = Trace.load(machines[0])
+    trace = Trace.load(machines[1])
     expected: Experiment = next_experiment(solve(trace, Theory.causal(), max_maps=None), trace)
     assert json.loads(capsys.readouterr().out) == expected.to_dict()
     assert main(["next", *machines]) == 0
@@ -455,7 +454,7 @@ def test_next_warns_that_maps_may_be_missing(
 def test_next_errors_are_one_line(
     machines: tuple[str, str], tmp_path: Path, refuses: Callable[..., None]
 ) -> None:
-    trace, maps = machines
+    maps, trace = machines
     none = tmp_path / "none.json"
     none.write_text('{"maps": []}')
     for words, message in [

@@ -31,7 +31,7 @@ from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
 from ssh_abduction.explain.pair_reasons import explain_pair
 from ssh_abduction.page import html
-from ssh_abduction.page.assumed import assumptions
+from ssh_abduction.page.answers import assumptions
 from ssh_abduction.page.content import DRAWN, content_of
 from ssh_abduction.page.html import Page
 from ssh_abduction.page.replays import ALPHABET, LOST, beams_of, drawn_images

@@ -17,8 +17,8 @@ from ssh_abduction.data.schema import attributes_of
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison
+    from ssh_abduction.rivals.differences import SharedSides
     from ssh_abduction.rivals.drive_joins import DrivePair
-    from ssh_abduction.rivals.known_sides import SharedSides
     from ssh_abduction.rivals.listing import Listing
 
 # Values in run.json that differ between runs even if all settings and results are the same.
@@ -55,9 +55,8 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.cli.outcome import warn  # loads clingo
     from ssh_abduction.rivals.comparison import compare  # loads numpy
-    from ssh_abduction.rivals.differences import difference
+    from ssh_abduction.rivals.differences import difference, shared_sides
     from ssh_abduction.rivals.drive_joins import joins_of_drives
-    from ssh_abduction.rivals.known_sides import shared_sides
     from ssh_abduction.rivals.listing import Listing
 
     maps = maps_path(options.maps)
@@ -158,7 +157,7 @@ def _lines(found: Comparison) -> Iterator[str]:
     if len(found.sizes) > 1:
         yield from (
             f"  {counted(count, 'maps')} with {counted(dstates, 'dstates')}, "
-            f"{counted(places, 'places')}, {counted(paths, 'paths')}"
+            f"{counted(places, 'places')}" + (f", {counted(paths, 'paths')}" if paths else "")
             for (dstates, places, paths), count in found.sizes
         )
     if found.fits and found.fits[0] != found.fits[1]:

@@ -48,7 +48,6 @@ from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from ssh_abduction.robot_logs.log_maps import LogMap, LogMapping
-from ssh_abduction.robot_logs.log_picture import paths_mean_something
 
 GIVEN_UP = "expected time to map this log, got an interruption; map it again"
 HURRY = 0.5  # seconds for the search, after the process that mapped the log was killed
@@ -251,7 +250,7 @@ class MapQuestion(FileQuestion):
         cost, solution = done.solution.cost, done.solution
         found = "no map"
         if cost is not None:
-            names = ["places", *(["paths"] if paths_mean_something(solution) else []), "dstates"]
+            names = ["places", *(["paths"] if solution.theory.has_paths else []), "dstates"]
             found = ", ".join(counted(getattr(cost, name), name) for name in names)
         how = f"{solution.status.value}, {counted(solution.count, 'minimal maps')}"
         how += "" if solution.complete else " or more"

@@ -29,8 +29,8 @@ from ssh_abduction.solver import Watch, check_limit, stretches
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.rivals.consequences import Consequence
-    from ssh_abduction.rivals.experiment import Experiment, ExperimentPlan, Untried
+    from ssh_abduction.rivals.explore import Experiment, ExperimentPlan, Untried
+    from ssh_abduction.rivals.machines import Consequence
 
 # The largest number of columns of a table, and of lines of a plan, that are printed. --json prints
 # all.

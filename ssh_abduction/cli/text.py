@@ -96,10 +96,12 @@ def _number_of_maps(solution: Solution, count: int) -> str:
 
 
 def _counts_of(cost: Cost, theory: Theory) -> dict[str, float]:
-    """Return the counts of a cost by name. A causal map has no places and paths to count."""
+    """Return the counts of a cost by name, of what maps by the theory have."""
     counts = cost.to_dict()
     if theory.level == "causal":
-        del counts["places"], counts["paths"]
+        del counts["places"]
+    if not theory.has_paths:
+        del counts["paths"]
     return counts
 
 

@@ -138,7 +138,7 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
     `pairs` has, for each pair of steps "i,j", the indices of two of the `texts`: the cost if both
     are one dstate, and if they are different ones.
     """
-    from ssh_abduction.page.assumed import assumptions
+    from ssh_abduction.page.answers import assumptions
 
     try:
         known = assumptions(listing, trace, theory, ASSUMING)

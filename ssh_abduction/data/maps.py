@@ -84,7 +84,9 @@ class SSHMap:
     def __repr__(self) -> str:
         parts = [counted(len(self.dstates), "dstates")]
         if self.places:
-            parts += [counted(len(self.places), "places"), counted(len(self.paths), "paths")]
+            parts.append(counted(len(self.places), "places"))
+        if self.paths:
+            parts.append(counted(len(self.paths), "paths"))
         if self.faults:
             parts.append(counted(len(self.faults), "faults"))
         return f"<SSHMap: {', '.join(parts)}; {counted(len(self.dstate_at), 'steps')}>"

@@ -56,6 +56,7 @@ def table_of_dstates(ssh_map: SSHMap) -> tuple[tuple[str, ...], list[tuple[objec
         columns["place"] = [
             "" if s.place is None else ssh_map.numbered("place", s.place) for s in ssh_map.dstates
         ]
+    if any(s.path is not None for s in ssh_map.dstates):
         columns["path"] = [s.course for s in ssh_map.dstates]
     columns["links"] = [", ".join(leads.get(s.id, ())) for s in ssh_map.dstates]
     return (*columns,), [*zip(*columns.values(), strict=True)]
@@ -89,19 +90,26 @@ def paragraph(sentence: str) -> str:
     return f"<p>{html_text(sentence)}</p>"
 
 
-def html_table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "rows") -> str:
-    """Make an HTML table of at most ROWS rows, whose cells become plain text.
+def html_table(
+    head: Sequence[str],
+    rows: Iterable[Iterable[object]],
+    more: str = "rows",
+    *,
+    is_whole: bool = False,
+) -> str:
+    """Make an HTML table, whose cells become plain text.
 
-    If rows are left out, a sentence below says how many. `more` is the word for rows in
-    that sentence.
+    Unless it `is_whole`, it has at most ROWS rows and short cells. If rows are left out, a sentence
+    below says how many. `more` is the word for rows in that sentence.
     """
     listed = list(rows)
+    shown = listed if is_whole else [map(_cut, map(str, row)) for row in listed[:ROWS]]
     names = "".join(f"<th>{html_text(name)}</th>" for name in head)
     body = "".join(
-        f"<tr>{''.join(f'<td>{html_text(_cut(str(cell)))}</td>' for cell in row)}</tr>"
-        for row in listed[:ROWS]
+        f"<tr>{''.join(f'<td>{html_text(str(cell))}</td>' for cell in row)}</tr>" for row in shown
     )
-    left = paragraph(f"and {len(listed) - ROWS} more {more}") if len(listed) > ROWS else ""
+    missing = len(listed) - len(shown)
+    left = paragraph(f"and {missing} more {more}") if missing else ""
     return f"<table><thead><tr>{names}</tr></thead><tbody>{body}</tbody></table>{left}"
 
 

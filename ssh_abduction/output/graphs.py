@@ -41,7 +41,8 @@ def to_networkx(
       dstates, and floor if there are floors. Each pair of neighbours on a path gives an edge with
       the path's id as its key. The attributes of the edge are path; order, the index of the first
       neighbour; travelled, whether the robot went from one to the other; and metres, if the map has
-      poses. `graph.graph["metric"]` says whether positions are metres.
+      poses. In a map without paths, each pair of places that a travel connects gives an edge.
+      `graph.graph["metric"]` says whether positions are metres.
 
     In the last two kinds, the attribute name has the name that a person gave to a place or path. If
     the map lists regions, `graph.graph["regions"]` has them as dicts, and the nodes of dstates and
@@ -177,6 +178,15 @@ def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
             more = only_known(metres=metres) | _named(ssh_map, "path", path.id)
             went = (min(p, q), max(p, q)) in streets
             graph.add_edge(p, q, key=path.id, path=path.id, order=index, travelled=went, **more)
+    if not ssh_map.paths:
+        at = [s.place for s in ssh_map.dstates]
+        ends = [(at[s], at[x]) for s, _, x in ssh_map.links]
+        pairs = {
+            (min(a, b), max(a, b)) for a, b in ends if a is not None and b is not None and a != b
+        }
+        for p, q in sorted(pairs):
+            metres = math.dist(found.places[p], found.places[q]) if found.metric else None
+            graph.add_edge(p, q, travelled=True, **only_known(metres=metres))
     return graph
 
 

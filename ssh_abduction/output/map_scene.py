@@ -10,7 +10,7 @@ A site is a place, or a dstate that has none: see `DState.site`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from statistics import median
 
@@ -98,10 +98,8 @@ class _Drawing:
         bands, regions = self.bands()
         lines = (self.paths() or self.edges()) if has_places else self.links()
         marks: list[Mark] = [*bands, *self.lifts(), *lines, *self.ellipses(), *dstates, *dots]
-        # 3. Labels, where there is room; the important ones first.
-        marks += [*self.place_labels(), *self.dstate_labels()]
-        marks += self.path_labels() if has_places else self.link_labels()
-        marks += [*regions, *self.floor_labels(), *self.faults()]
+        # 3. Labels, where there is room.
+        marks += [*self.labels(), *regions, *self.floor_labels(), *self.faults()]
         if self.metric:
             marks += self.scale_bar(marks)
         return Scene(tuple(marks), self.scale, self.metric)
@@ -150,7 +148,7 @@ class _Drawing:
         return Titled(title, (Disc(self.spots[site], (dot, dot), fill, "#222", 1.8 * self.unit),))
 
     def dstate(self, s: DState) -> Mark:
-        """Draw the arrow of a dstate along its heading; without a heading, a circle.
+        """Draw the arrow of a dstate along its heading; without a heading, a circle and its view.
 
         The arrow of the first dstate is black.
         """
@@ -158,7 +156,12 @@ class _Drawing:
         title = f"dstate {s.id}: {s.shown}"
         if heading is None:
             self.keep_clear((x, y), self.far(RADIUS), self.far(RADIUS))
-            return Titled(title, (Disc((x, y), (RADIUS, RADIUS), "white", COLOURS[0]),))
+            view = str(s.shown)
+            view = view if len(view) <= LONGEST_LABEL else f"…{view[1 - LONGEST_LABEL :]}"
+            name = Label((x, y), f"x{s.id}", is_bold=True)
+            below = Label((x, y - self.far(RADIUS + 12)), view)
+            circle = Disc((x, y), (RADIUS, RADIUS), "white", COLOURS[0])
+            return Titled(title, (circle, name, below))
         if self.metric:
             title += f", at {x:.1f}, {y:.1f} m, heading {math.degrees(heading):.0f}°"
         colour = "#000" if s.id == self.first else self._colour(s)
@@ -201,6 +204,7 @@ class _Drawing:
                 (ax, ay), (bx, by) = (self.spots[p] for p in streets[0])
                 middle, way = ((ax + bx) / 2, (ay + by) / 2), math.atan2(by - ay, bx - ax)
                 heads.append(self.head(middle, way, colour, 7, 6))
+                self.keep_clear(middle, self.far(6), self.far(6))
         return [*orders, *travels, *heads]
 
     def edges(self) -> list[Mark]:
@@ -318,29 +322,56 @@ class _Drawing:
 
     # Labels.
 
-    def label(
-        self,
-        text: str,
-        spots: Iterable[Point],
-        colour: str,
-        size: float,
-        *,
-        is_bold: bool = False,
-        always: bool = False,
-    ) -> list[Mark]:
-        """Draw a label at the first point where it overlaps nothing, if there is one.
+    def labels(self) -> Iterator[Mark]:
+        """Draw each label at the first point where it overlaps nothing, if there is one.
 
-        Otherwise, draw it at the first point if it must be drawn `always`. A font is smaller if
-        there is little room, but at least 9.
+        Names of places are always drawn, and so are all labels of a map without poses. A font is
+        smaller if there is little room, but at least 9.
         """
-        w, h = self.half(text, size)
-        points = list(spots)
-        free = (p for p in points if self._is_free(p, w, h))
-        at = next(free, points[0] if always and points else None)
-        if at is None:
-            return []
-        self.keep_clear(at, w, h)
-        return [Label(at, text, colour, max(size * self.unit, 9.0), is_bold)]
+        for text, spots, gap, colour, size, is_bold in self._wanted():
+            w, h = self.half(text, size)
+            around = [
+                p for spot in spots for p in (self._around(spot, w, h, gap) if gap else spots)
+            ]
+            free = (p for p in around if self._is_free(p, w, h))
+            must = around and (not self.metric or (is_bold and not text.isdecimal()))
+            if at := next(free, around[0] if must else None):
+                self.keep_clear(at, w, h)
+                yield Label(at, text, colour, max(size * self.unit, 9.0), is_bold)
+
+    def _wanted(self) -> Iterator[tuple[str, list[Point], float, str, float, bool]]:
+        """Yield all labels the important ones first.
+
+        Each has its text, the points around which it may be, the distance from these points (0 to
+        be at a point), its colour, its size, and whether it is bold.
+        """
+        for place in self.map.places:
+            name = self.map.name_of("place", place)
+            text = str(place) if name is None else f"{place} {name}"
+            yield text, [self.spots[place]], 9, "#000", 15, True
+        for s in sorted(self.map.dstates, key=lambda s: s.id != self.first):
+            if self.at[s.id][2] is not None:
+                text, colour = (f"x{s.id}", "#444") if s.id != self.first else ("x0 start", "#000")
+                beside = [self.along(s, ahead) for ahead in (END, 17)]
+                yield text, beside, 7, colour, 11, s.id == self.first
+        for path in self.map.paths:
+            streets = [[self.spots[p] for p in ends] for ends in self.streets_along(path)]
+            beside = [
+                (a[0] + (b[0] - a[0]) * share, a[1] + (b[1] - a[1]) * share)
+                for a, b in streets
+                for share in (0.5, 0.6, 0.4)
+            ]
+            yield self.map.called("path", path.id), beside, 6, colour_of(path.id), 12, False
+        if not self.map.places:
+            for chain, names in self.curves():
+                yield names, [chain[BENT // 2]], 0, "#777", 10, False
+
+    def _around(self, at: Point, w: float, h: float, gap: float) -> Iterator[Point]:
+        """Yield points near a point for a label of this half width and height."""
+        for far in (self.far(gap * times) for times in (1, 1.5, 2.5)):
+            for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1), (0, -1), (0, 1), (1, 0), (-1, 0)):
+                share = far / math.hypot(x, y)
+                yield at[0] + x * (share + w), at[1] + y * (share + h)
 
     def _is_free(self, at: Point, w: float, h: float) -> bool:
         x, y = at
@@ -353,73 +384,6 @@ class _Drawing:
         """Estimate half the width and height of a label, in units of the map."""
         w, h = half_size(text, max(size * self.unit, 9.0))
         return w / self.scale, h / self.scale
-
-    def place_labels(self) -> list[Mark]:
-        """Draw the numbers of places beside their dots, where there is room, and names always."""
-        marks: list[Mark] = []
-        bearings = [k * math.pi / 4 for k in (1, -1, -3, -5, 0, -2, -4, -6)]
-        ways = [(self.far(size), bearing) for size in (17, 22, 30) for bearing in bearings]
-        for place in self.map.places:
-            x, y = self.spots[place]
-            name = self.map.name_of("place", place)
-            text = str(place) if name is None else f"{place} {name}"
-            wide = 0.0 if name is None else self.half(f" {name}", 15)[0]
-            around = [
-                (x + (far + wide) * math.cos(angle), y + far * math.sin(angle))
-                for far, angle in ways
-            ]
-            must = name is not None or not self.metric
-            marks += self.label(text, around, "#000", 15, is_bold=True, always=must)
-        return marks
-
-    def dstate_labels(self) -> list[Mark]:
-        """Draw the numbers of dstates beside or ahead of their arrows, the first dstate first."""
-        marks: list[Mark] = []
-        for s in sorted(self.map.dstates, key=lambda s: s.id != self.first):
-            is_first, (x, y, heading) = s.id == self.first, self.at[s.id]
-            if heading is None:
-                below = (x, y - self.far(RADIUS + 12))
-                view = str(s.shown)
-                view = view if len(view) <= LONGEST_LABEL else f"…{view[1 - LONGEST_LABEL :]}"
-                marks += [Label((x, y), f"x{s.id}", is_bold=True), Label(below, view)]
-                continue
-            text = f"x{s.id} start" if is_first else f"x{s.id}"
-            w, h = (size / self.far(1) for size in self.half(text, 11))
-            sin, cos = abs(math.sin(heading)), abs(math.cos(heading))
-            aside, beyond = 4.5 + w * sin + h * cos, END + 5 + w * cos + h * sin
-            sides = [(far, side * aside) for far in (20.0, 27.0, 34.0) for side in (-1, 1)]
-            ahead = [(beyond, side * h) for side in (0, -1, 1)]
-            order = sides + ahead if self.map.places else ahead + sides
-            spots = [self.along(s, *spot) for spot in order]
-            colour = "#000" if is_first else "#444"
-            must = not self.metric
-            marks += self.label(text, spots, colour, 11, is_bold=is_first, always=must)
-        return marks
-
-    def path_labels(self) -> list[Mark]:
-        """Draw the names of paths beside their longest travelled streets, where there is room."""
-        marks: list[Mark] = []
-        for path in self.map.paths:
-            beside = []
-            for ends in self.streets_along(path):
-                (ax, ay), (bx, by) = (self.spots[p] for p in ends)
-                far = math.dist((ax, ay), (bx, by)) or 1.0
-                ux, uy = (bx - ax) / far, (by - ay) / far
-                for share in (0.5, 0.6, 0.4):
-                    x, y = ax + (bx - ax) * share, ay + (by - ay) * share
-                    for side in (1, -1):
-                        away = side * self.far(12 + 18 * abs(uy))
-                        beside.append((x + uy * away, y - ux * away))
-            name, colour = self.map.called("path", path.id), colour_of(path.id)
-            marks += self.label(name, beside, colour, 12, always=not self.metric)
-        return marks
-
-    def link_labels(self) -> list[Mark]:
-        """Draw the actions of links at the middle of their curves, where there is room."""
-        marks: list[Mark] = []
-        for chain, names in self.curves():
-            marks += self.label(names, [chain[BENT // 2]], "#777", 10, always=not self.metric)
-        return marks
 
     def floor_labels(self) -> list[Mark]:
         """Draw the names of floors above their dstates on the left."""

@@ -4,30 +4,34 @@ A labeling gives each step its dstate (distinctive state: a place and a heading)
 trace have much in common. Therefore each labeling, set of places and order of paths is listed once,
 and maps refer to it by number. Only some maps have their own drawing. In all others, a place or
 dstate is drawn where its steps are in the first map, so that the reader sees what stays the same.
+
+The overview has everything that any map has, and in how many maps it occurs. A street is a line
+between two neighbours. Dstates, places and streets of two maps count as the same if they have the
+same steps.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import count, pairwise
-from statistics import median
-from typing import Any
+from statistics import fmean, median
+from typing import Any, TypeAlias
 
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.output.layout import Layout, layout
 from ssh_abduction.output.map_scene import axes
-from ssh_abduction.page.overview import Spot, overview
 from ssh_abduction.page.replays import Run, replays
 from ssh_abduction.rivals.comparison import Choice, compare
 from ssh_abduction.rivals.drive_joins import DrivePair, joins_of_drives
-from ssh_abduction.rivals.listing import Listing, Maps
+from ssh_abduction.rivals.listing import Listing, Maps, trusted
 from ssh_abduction.solver import probability_in_words
 
 DRAWING = 3.0  # processor seconds for the drawings of all maps except the first
@@ -148,12 +152,13 @@ def _shared(listing: Listing) -> dict[str, Any] | None:
 def _joins(listing: Listing) -> list[tuple[int, int, str | None]]:
     """List the joins of the first map that a reader may doubt, the most doubtful ones first.
 
-    Each has two steps and the probability of their join. If costs in nats are unknown, the joins
-    are those that no axiom and no observation forces, and the probability is None.
+    Each has two steps and the probability of their join. If probabilities are unknown, the joins
+    are those that no axiom and no observation forces, each with None.
     """
-    if listing.weighed is None or listing.weighed.doubt:
+    weighed = trusted(listing.weighed)
+    if weighed is None:
         return [(join.first, join.second, None) for join in listing.by_minimality[:JOINS]]
-    doubted = [join for join in listing.weighed.joins if join[2] < DOUBTED]
+    doubted = [join for join in weighed.joins if join[2] < DOUBTED]
     return [(i, j, probability_in_words(share)) for i, j, share in doubted[:JOINS]]
 
 
@@ -251,46 +256,40 @@ def _unit(found: Layout) -> float:
 def _numbers(found: Layout, ssh_map: SSHMap) -> dict[str, Any]:
     """Make a dict of a drawing. Positions are in units of the distance between neighbours."""
     unit = _unit(found)
-    numbers: dict[str, Any] = {
+
+    def at(*numbers: float) -> list[float]:
+        return [round(number / unit, 2) for number in numbers]
+
+    drawing: dict[str, Any] = {
         "metric": found.metric,
         "unit": round(unit, 3),
-        "places": [
-            [p, round(x / unit, 2), round(y / unit, 2)] for p, (x, y) in found.places.items()
-        ],
-        "dstates": [
-            [round(x / unit, 2), round(y / unit, 2), None if h is None else round(h, 2)]
-            for x, y, h in found.dstates
-        ],
+        "places": [[p, *at(*spot)] for p, spot in found.places.items()],
+        "dstates": [[*at(x, y), None if h is None else round(h, 2)] for x, y, h in found.dstates],
     }
     if ssh_map.floors:
-        numbers["floors"] = _corners(found, ssh_map, unit)
-        numbers["lifts"] = _lifts(found, ssh_map, unit)
+        # The name of a floor is at its upper left corner.
+        xs, ys, _ = zip(*found.dstates, strict=True)
+        drawing["floors"] = [
+            at(min(xs[s] for s in floor), max(ys[s] for s in floor)) for floor in ssh_map.floors
+        ]
+        drawing["lifts"] = [
+            [*at(*found.places[p], *found.places[q]), ", ".join(sorted(names))]
+            for (p, q), names in sorted(_lifts(ssh_map).items())
+        ]
     if found.metric:
-        numbers["ellipses"] = _ellipses(found, ssh_map, unit)
-    return numbers
+        drawing["ellipses"] = _ellipses(found, ssh_map, unit)
+    return drawing
 
 
-def _corners(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
-    """Find where the name of each floor is drawn: x and y of the upper left corner of the floor."""
-    points = [[found.dstates[s] for s in floor] for floor in ssh_map.floors]
-    return [
-        [round(min(x for x, _, _ in at) / unit, 2), round(max(y for _, y, _ in at) / unit, 2)]
-        for at in points
-    ]
-
-
-def _lifts(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[Any]]:
-    """List each lift between two places: x and y of both ends, and the names of its actions."""
-    floor = [s.floor for s in ssh_map.dstates]
+def _lifts(ssh_map: SSHMap) -> dict[tuple[int, int], set[str]]:
+    """Find the names of the actions of the lifts between each two places."""
     actions: dict[tuple[int, int], set[str]] = {}
     for source, action, target in ssh_map.links:
-        p, q = (ssh_map.dstates[s].place for s in (source, target))
-        if p is not None and q is not None and floor[source] != floor[target]:
-            actions.setdefault((min(p, q), max(p, q)), set()).add(action)
-    return [
-        [*(round(v / unit, 2) for end in ends for v in found.places[end]), ", ".join(sorted(names))]
-        for ends, names in sorted(actions.items())
-    ]
+        one, other = ssh_map.dstates[source], ssh_map.dstates[target]
+        if one.place is not None and other.place is not None and one.floor != other.floor:
+            ends = min(one.place, other.place), max(one.place, other.place)
+            actions.setdefault(ends, set()).add(action)
+    return actions
 
 
 def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
@@ -326,3 +325,99 @@ def _spots(first: SSHMap, found: Layout) -> list[Spot]:
             x, y = found.places[place]
         spots.append((x / unit, y / unit, heading))
     return spots
+
+
+Steps: TypeAlias = tuple[int, ...]
+Spot: TypeAlias = tuple[float, float, float | None]
+Pair: TypeAlias = frozenset[Steps]
+
+
+class _Counts:
+    """Counts the maps that have each dstate, place and street, given by its steps.
+
+    `along` counts the maps in which a dstate or street is on a path with certain steps. Its keys
+    are pairs: the dstate or street, and the steps of the path.
+    """
+
+    def __init__(self) -> None:
+        self.dstates: Counter[Steps] = Counter()
+        self.places: Counter[Steps] = Counter()
+        self.streets: Counter[Pair] = Counter()
+        self.along: Counter[tuple[Steps | Pair, Steps]] = Counter()
+
+    def add(self, ssh_map: SSHMap) -> None:
+        """Count what a map has."""
+        at = [ssh_map.dstates[label] for label in ssh_map.dstate_at]
+        of_dstate = _members(ssh_map.dstate_at)
+        of_place = _members([s.place for s in at])
+        of_path = _members([s.path for s in at])
+        self.dstates.update(of_dstate.values())
+        self.places.update(of_place.values())
+        paths = ((steps, at[steps[0]].path) for steps in of_dstate.values())
+        self.along.update((steps, of_path[h]) for steps, h in paths if h is not None)
+        # Only streets that the robot travelled count: it went between two places along one path, or
+        # in a map without paths. The order of other places on a path is one of many possible ones.
+        streets: dict[Pair, Steps | None] = {}
+        for s, _, x in ssh_map.links:
+            a, b = ssh_map.dstates[s], ssh_map.dstates[x]
+            if None in (a.place, b.place) or a.place == b.place or a.path != b.path:
+                continue
+            if a.floor == b.floor and a.place in of_place and b.place in of_place:
+                pair = frozenset((of_place[a.place], of_place[b.place]))
+                streets[pair] = None if a.path is None else of_path[a.path]
+        if not ssh_map.places:
+            streets = {
+                frozenset((of_dstate[s], of_dstate[x])): None
+                for s, _, x in ssh_map.links
+                if s != x and s in of_dstate and x in of_dstate
+            }
+        self.streets.update(streets.keys())
+        self.along.update((pair, path) for pair, path in streets.items() if path is not None)
+
+
+def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
+    """Collect all dstates, places and travelled streets that any map has, for JSON.
+
+    `spots` has the position and heading of each step. In the result, `nodes` are places, or dstates
+    if there are no places. `dstates` is empty if there are no places. Each node and dstate has its
+    `steps`, position and heading, and `maps`, the number of maps with it. `path` of a dstate is the
+    largest number of maps that agree on all steps along its path. `streets` are lists [node, node,
+    maps, path].
+    """
+    counts = _Counts()
+    for ssh_map in maps:
+        counts.add(ssh_map)
+    agreed: dict[Any, int] = {}
+    for (thing, _), maps_with in counts.along.items():
+        agreed[thing] = max(maps_with, agreed.get(thing, 0))
+    nodes = counts.places or counts.dstates
+    number = {steps: i for i, steps in enumerate(nodes)}
+    return {
+        "nodes": [{"steps": s, "maps": n, **_middle(s, spots)} for s, n in nodes.items()],
+        "dstates": [
+            {"steps": s, "maps": count, "path": agreed.get(s, count), **_middle(s, spots)}
+            for s, count in counts.dstates.items()
+            if counts.places
+        ],
+        "streets": [
+            [*sorted(number[steps] for steps in pair), count, agreed.get(pair, count)]
+            for pair, count in counts.streets.items()
+            if len(pair) == 2
+        ],
+    }
+
+
+def _members(names: Sequence[int | None]) -> dict[int | None, Steps]:
+    """For each number, list the steps that have it. Steps with None are left out."""
+    found = gathered((name, t) for t, name in enumerate(names) if name is not None)
+    return {name: tuple(steps) for name, steps in found.items()}
+
+
+def _middle(steps: Steps, spots: Sequence[Spot]) -> dict[str, Any]:
+    """Compute the mean position of steps as `x` and `y`, with the `heading` of the first step."""
+    at = list(dict.fromkeys(spots[t][:2] for t in steps))
+    return {
+        "x": round(fmean(x for x, _ in at), 3),
+        "y": round(fmean(y for _, y in at), 3),
+        "heading": spots[steps[0]][2],
+    }

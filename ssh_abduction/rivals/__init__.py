@@ -8,13 +8,13 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison as Comparison
     from ssh_abduction.rivals.comparison import compare as compare
     from ssh_abduction.rivals.differences import Difference as Difference
+    from ssh_abduction.rivals.differences import SharedSides as SharedSides
     from ssh_abduction.rivals.differences import difference as difference
+    from ssh_abduction.rivals.differences import shared_sides as shared_sides
     from ssh_abduction.rivals.drive_joins import DrivePair as DrivePair
     from ssh_abduction.rivals.drive_joins import joins_of_drives as joins_of_drives
-    from ssh_abduction.rivals.experiment import Experiment as Experiment
+    from ssh_abduction.rivals.explore import Experiment as Experiment
     from ssh_abduction.rivals.explore import next_experiment as next_experiment
-    from ssh_abduction.rivals.known_sides import SharedSides as SharedSides
-    from ssh_abduction.rivals.known_sides import shared_sides as shared_sides
     from ssh_abduction.rivals.listing import Listing as Listing
 
 __getattr__, __dir__ = lazy_names(__name__)

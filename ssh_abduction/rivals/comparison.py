@@ -14,7 +14,7 @@ the paths of steps 18–22 differ
 steps 17–18 and 21 are at the place of step 14
 
 Questions distinguish maps, for example: are steps 3 and 7 one dstate? (`rivals/questions.py`). A
-few questions decide: their answers fix the answers to all others (`rivals/factors.py`). Deciding
+few questions decide: their answers fix the answers to all others (`rivals/questions.py`). Deciding
 questions are asked so that causes come first: faults, dstates, places, paths, directions. A choice
 is a set of deciding questions that depend on each other. Its options are the ways to answer them.
 Each combination of one option per choice is a map.
@@ -35,16 +35,18 @@ from ssh_abduction.data.groups import indices_of
 from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.differences import Difference, difference
-from ssh_abduction.rivals.factors import deciding, independent, options_of
 from ssh_abduction.rivals.listing import Listing, Maps
 from ssh_abduction.rivals.questions import (
     MATTERS,
     AnsweredQuestion,
     Matter,
     Question,
+    Table,
+    deciding,
+    independent,
+    options_of,
     questions_of,
 )
-from ssh_abduction.rivals.table import Table
 from ssh_abduction.solver import Backbone, Shared, Sharing
 
 

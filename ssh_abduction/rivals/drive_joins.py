@@ -24,7 +24,7 @@ from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.schema import PlainData
 from ssh_abduction.data.words import counted
-from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.rivals.listing import Listing, trusted
 from ssh_abduction.solver import probability_in_words
 
 ALMOST = 1 - 1e-9  # the largest share of a join that some map lacks
@@ -122,8 +122,7 @@ def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
     """
     an_instance("listing", listing, Listing, MapError, mend="make one with Listing.of")
     placings, weights, proven = _placings(listing)
-    is_probable = listing.weighed is not None and listing.weighed.doubt is None
-    count = None if is_probable else len(placings)
+    count = None if trusted(listing.weighed) else len(placings)
     of = "place" if listing.maps[0].places else "dstate"
     return tuple(
         _pair(one, other, placings, weights, of, proven, count)
@@ -136,7 +135,7 @@ def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
     weighed = listing.weighed
     if weighed is not None:
         at: list[_Placing] = [rival.places or rival.dstates for rival in weighed.rivals]
-        weights = weighed.weights if weighed.doubt is None else [1 / len(at)] * len(at)
+        weights = weighed.weights if trusted(weighed) else [1 / len(at)] * len(at)
         return at, [*weights], weighed.within > 0
     placings: list[_Placing] = [
         [s if (place := ssh_map.dstates[s].place) is None else place for s in ssh_map.dstate_at]

@@ -16,29 +16,26 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
-from ssh_abduction.data.checks import a_flag, a_path, a_text, a_whole_number, an_instance, one_of
+from ssh_abduction.data.checks import a_path, a_text, an_instance
 from ssh_abduction.data.corrections_file import named_beside
-from ssh_abduction.data.drives import Drive, pieces_in_words, with_named_faults
-from ssh_abduction.data.errors import MapError, brief, is_whole, named
+from ssh_abduction.data.drives import Drive, pieces_in_words
+from ssh_abduction.data.errors import MapError, brief, named
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.map_parts import Fault
 from ssh_abduction.data.maps import ID_LENGTH, SSHMap, checked_maps, maps_of
-from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.data.trace import View
 from ssh_abduction.solver import (
     Backbone,
     Solution,
     Status,
     Weighed,
-    drives_in,
-    joins_in,
     probability_in_words,
-    theory_in,
-    warnings_in,
 )
 from ssh_abduction.theory.joins import Join, joins_in_words
 from ssh_abduction.theory.theory import Theory
 
+# The fields by which the file of a solution is known. Other files have only maps.
+OF_SOLUTION = {"maps", "theory", "steps", "status", "complete"}
 # How to mend maps that show different views at a step.
 ONE_TRACE = "compare maps of one trace (if it has unknown views, give solutions, not their maps)"
 
@@ -112,20 +109,7 @@ class Listing:
         if isinstance(source, Listing):
             return source
         if isinstance(source, Solution):
-            minimal = source.levels[0].count if source.levels else source.count
-            listing = cls(
-                source.maps,
-                minimal if source.status is Status.OPTIMAL else None,
-                source.minimal_listed,
-                source.stopped,
-                source.backbone if source.maps else None,
-                weighed=source.weighed,
-                by_minimality=source.by_minimality,
-                drives=source.drives,
-                warnings=source.warnings,
-                one_view=_has_one_view(source.theory),
-            )
-            return listing.checked()
+            return cls._of(source)
         if isinstance(source, SSHMap):
             source = [source]
         if isinstance(source, str | os.PathLike | Mapping) or not isinstance(source, Iterable):
@@ -134,6 +118,25 @@ class Listing:
                 "Listing.load"
             )
         return cls(checked_maps(source)).checked()
+
+    @classmethod
+    def _of(cls, solution: Solution, where: str = "maps") -> Listing:
+        """Make a listing from a solution. `where` is its name in messages."""
+        minimal = solution.levels[0].count if solution.levels else solution.count
+        listing = cls(
+            solution.maps,
+            minimal if solution.status is Status.OPTIMAL else None,
+            solution.minimal_listed,
+            solution.stopped,
+            solution.backbone if solution.maps else None,
+            where,
+            solution.weighed,
+            solution.by_minimality,
+            solution.drives,
+            solution.warnings,
+            _has_one_view(solution.theory),
+        )
+        return listing.checked()
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Listing:
@@ -174,46 +177,19 @@ class Listing:
             MapError: A field is wrong. The message names the field.
         """
         a_text("where", where, MapError)
-        maps = tuple(ssh_map.renumbered() for ssh_map in maps_of(data, where))
-        # A file with a single map has no fields of an answer.
-        answer: Mapping[str, Any] = data if isinstance(data, Mapping) and "maps" in data else {}
-        _check_listed(maps, answer.get("maps", [data]), answer, where)
-        theory = theory_in(answer["theory"], where) if "theory" in answer else None
-        status, count = answer.get("status"), answer.get("count", len(maps))
-        if status is not None:
-            every = [status.value for status in Status]
-            one_of(f"{where}: status", status, every, MapError, mend="solve again")
-        what = "the number of minimal maps"
-        a_whole_number(f"{where}: count", count, MapError, what=what, mend="solve again")
-        minimal = _count_minimal(answer.get("levels"), len(maps), where)
-        complete = answer.get("complete")
-        if complete is not None:
-            a_flag(f"{where}: complete", complete, MapError)
-        steps, backbone = len(maps[0].dstate_at) if maps else 0, None
-        if maps and "backbone" in answer:
-            backbone = Backbone.from_dict(answer["backbone"], steps, f"{where}: backbone")
-        # If larger maps follow the minimal ones of an optimal answer, all minimal ones are listed.
-        is_optimal = status == Status.OPTIMAL.value
-        listed = complete or (minimal < len(maps)) if is_optimal else complete
-        read = FieldReader(where)
-        drives = drives_in(read, answer if maps else {}, steps)
-        weighed = None
-        if maps and answer.get("weighed"):
-            weighed = Weighed.from_dict(read, answer["weighed"], steps, drives)
-        listing = cls(
-            tuple(with_named_faults(ssh_map, drives) for ssh_map in maps),
-            minimal if is_optimal else None,
-            listed,
-            answer.get("stopped"),
-            backbone,
-            where,
-            weighed,
-            joins_in(read, answer if maps else {}, steps, drives),
-            drives,
-            warnings_in(read, answer),
-            theory is None or _has_one_view(theory),
-        )
-        return listing.checked()
+        if not (isinstance(data, Mapping) and data.keys() >= OF_SOLUTION):
+            maps = tuple(ssh_map.renumbered() for ssh_map in maps_of(data, where))
+            return cls(maps, source=where).checked()
+        solution = Solution.from_dict(data, where)
+        maps = tuple(ssh_map.renumbered() for ssh_map in solution.maps)
+        for i, (record, ssh_map) in enumerate(zip(data["maps"], maps, strict=True)):
+            if "id" in record and record["id"] != ssh_map.id:
+                mend = "the map was changed by hand: solve again, or leave the id out"
+                raise MapError(
+                    f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got "
+                    f"{brief(record['id'])}; {mend}"
+                )
+        return cls._of(replace(solution, maps=maps), where)
 
     def checked(self) -> Listing:
         """Return the listing if its maps can be those of one trace.
@@ -282,45 +258,6 @@ class Listing:
 Maps: TypeAlias = Solution | Listing | SSHMap | Iterable[SSHMap]
 
 
-def _check_listed(
-    maps: tuple[SSHMap, ...], records: list[Any], answer: Mapping[str, Any], where: str
-) -> None:
-    """Raise MapError if ids or steps in a file are not those of its maps, or a map comes twice."""
-    for i, (record, ssh_map) in enumerate(zip(records, maps, strict=True)):
-        if "id" in record and record["id"] != ssh_map.id:
-            mend = "the map was changed by hand: solve again, or leave the id out"
-            raise MapError(
-                f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got "
-                f"{brief(record['id'])}; {mend}"
-            )
-    if maps and "steps" in answer and answer["steps"] != len(maps[0].dstate_at):
-        raise MapError(
-            f"{where}: steps: expected {len(maps[0].dstate_at)}, as map 1 has, got "
-            f"{brief(answer['steps'])}; solve the trace again"
-        )
-    first_with: dict[str, int] = {}
-    for i, ssh_map in enumerate(maps):
-        if (known := first_with.setdefault(ssh_map.id, i)) != i:
-            raise MapError(
-                f"{where}: maps[{i}]: expected another map, got the same map as maps[{known}] "
-                "again; leave it out"
-            )
-
-
-def _count_minimal(levels: Any, listed: int, where: str) -> int:
-    """Count the minimal maps of a list. If it has levels, only maps of the first are minimal."""
-    if levels is None:
-        return listed
-    first = levels[0] if isinstance(levels, list) and levels else None
-    count = first.get("count") if isinstance(first, Mapping) else None
-    if is_whole(count) and 0 < count <= listed:
-        return int(count)
-    raise MapError(
-        f"{where}: levels: expected a list whose first entry counts the minimal maps, got "
-        f"{brief(levels)}; solve again"
-    )
-
-
 def _has_one_view(theory: Theory) -> bool:
     """Tell whether each dstate has one view by this theory, and all views are known."""
     return "functional_view" not in theory.without and not theory.unknown_views
@@ -348,12 +285,21 @@ def _seen(ssh_map: SSHMap) -> tuple[View | None, ...]:
     return tuple(seen)
 
 
+def trusted(weighed: Weighed | None) -> Weighed | None:
+    """Return the costs of maps if probabilities follow from them, else None.
+
+    None follow if the search did not finish, or if there is a reason to doubt the costs.
+    """
+    return None if weighed is None or weighed.confidence is None else weighed
+
+
 @dataclass(frozen=True, slots=True)
 class PairInMap:
     """What the first map of a list says about the places of two steps."""
 
     is_one_place: bool  # whether the two steps are at one place
-    # The probability that they are; None if it is unknown, as without costs in nats.
+    # The probability that they are; None if it is unknown, as without costs in nats, or if the
+    # search did not finish.
     probability: float | None
 
     @classmethod
@@ -362,10 +308,9 @@ class PairInMap:
         at = [listing.maps[0].place_of(step) for step in (first, second)]
         if None in at:
             return None
-        weighed = listing.weighed
-        if weighed is None or weighed.doubt is not None:
-            return cls(at[0] == at[1], None)
-        return cls(at[0] == at[1], weighed.probability(first, second, "place"))
+        weighed = trusted(listing.weighed)
+        share = None if weighed is None else weighed.probability(first, second, "place")
+        return cls(at[0] == at[1], share)
 
     def __str__(self) -> str:
         text = f"in map 1, the steps are at {'one place' if self.is_one_place else 'two places'}"

@@ -1,10 +1,23 @@
-"""Maps as finite-state machines: the predictions of each map from the current dstate on.
+"""Maps as finite-state machines: what each map predicts, from the current dstate on.
 
-Rivals are minimal maps of one trace. Rivals with equal machines predict the same for all actions,
-so they share one machine. For example, 780 rivals that differ only in paths have one machine.
+A star is all openings or gateways that are seen at a step. Rivals are minimal maps of one trace.
+Rivals with equal machines predict the same for all actions, so they share one machine. For example,
+780 rivals that differ only in paths have one machine.
 
 A robot that follows links of all rivals is at one dstate in each of them. These dstates are a
 *joint state*: a row of numbers, one for each machine. numpy moves many rows at once.
+
+If the action was tried at a dstate, its link is known. Otherwise the axioms, or the order of a
+path, may still tell where the action leads:
+
+- A turn, if places have frames (four directions, the slots 0 to 3): it leads to the slot one, two
+  or three quarters further clockwise (axiom turn_rotates). At most one dstate has that slot as its
+  heading (one_dstate_per_heading). If the map has none, the star there is still known: the star of
+  another dstate at the place, rotated by the turns between the two.
+- A turn around at a dstate along a path: it leads back along the path (turn_around_reverses), and
+  at most one dstate is there (one_dstate_per_course).
+- A travel along a path: it leads to the next place in the order of the path. This is only expected,
+  because the order of a map is one of several, and an unseen place may lie between.
 """
 
 from __future__ import annotations
@@ -12,16 +25,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.groups import firsts, reached
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import Star, star_to_json
-from ssh_abduction.data.trace import Trace, View
+from ssh_abduction.data.trace import Action, Trace, View
 from ssh_abduction.data.words import counted
 from ssh_abduction.solver import Watch, observation
 from ssh_abduction.theory.evidence.of_steps import are_alike
@@ -100,51 +114,42 @@ class Observations:
         self.of = [[number[key] for key in of_map] for of_map in keys]
 
 
-class _StarReader:
-    """Reads the star of a step, with a key that stars share if they cannot be distinguished."""
-
-    def __init__(self, trace: Trace, theory: Theory, steps: Sequence[int] = ()) -> None:
-        self._trace, self._theory = trace, theory
-        self._classes = _classes(trace, steps) if theory.star in IN_TOLERANCE else {}
-
-    def __call__(self, step: int) -> tuple[object, tuple[Any, ...] | None]:
-        """Return a key of the star of a step, and the star."""
-        if self._theory.star in IN_TOLERANCE:
-            return self._classes[step], self._trace.steps[step].star
-        _, key = observation(self._trace.steps[step], self._theory)
-        return key, self._trace.steps[step].openings
+# A function from a step to a key of its star, and to the star. Stars that cannot be distinguished
+# share a key.
+_Reading: TypeAlias = Callable[[int], tuple[object, tuple[Any, ...] | None]]
 
 
-def _reading(
-    maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None
-) -> _StarReader | None:
+def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> _Reading | None:
     """Make the function that reads stars; None if stars are not used."""
     if trace is None or not trace.has_stars:
         return None
-    steps = sorted({t for ssh_map in maps for t in _first_steps(ssh_map).values()})
     if theory is not None:
         settled = settle(trace, theory).theory
-        if settled.star == "none":
-            return None
-        return _StarReader(trace, settled, steps)
-    # without a theory, stars are read as frames if each dstate has one star in each map
-    if trace.in_quarters:
-        reading = _StarReader(trace, Theory(star="frame"))
-        looks = [reading(t)[0] for t in range(len(trace))]
-        is_read = all(
-            len({(label, looks[t]) for t, label in _sound(m)})
-            == len({label for _, label in _sound(m)})
-            for m in maps
-        )
-        return reading if is_read else None
+        return None if settled.star == "none" else _reading_by(settled, maps, trace)
+    # without a theory, stars are used if each dstate has one star in each map
+    read = _reading_by(Theory(star="frame" if trace.in_quarters else "alike"), maps, trace)
     stars = [step.gateways or Star(()) for step in trace.steps]
-    if any(
-        not are_alike(stars[_first_steps(m)[label]], stars[t])
-        for m in maps
-        for t, label in _sound(m)
-    ):
-        return None
-    return _StarReader(trace, Theory(star="alike"), steps)
+    for ssh_map in maps:
+        first = _first_steps(ssh_map)
+        for t, label in _sound(ssh_map):
+            one, other = first[label], t
+            is_same = (
+                read(one)[0] == read(other)[0]
+                if trace.in_quarters
+                else are_alike(stars[one], stars[other])
+            )
+            if not is_same:
+                return None
+    return read
+
+
+def _reading_by(theory: Theory, maps: Sequence[SSHMap], trace: Trace) -> _Reading:
+    """Make the function that reads stars as a theory compares them."""
+    if theory.star in IN_TOLERANCE:
+        steps = sorted({t for ssh_map in maps for t in _first_steps(ssh_map).values()})
+        classes = _classes(trace, steps)
+        return lambda t: (classes[t], trace.steps[t].star)
+    return lambda t: (observation(trace.steps[t], theory)[1], trace.steps[t].openings)
 
 
 def _sound(ssh_map: SSHMap) -> list[tuple[int, int]]:
@@ -327,3 +332,161 @@ class Walk:
             row, action = self._came[row]
             found.append(action)
         return found[::-1]
+
+
+How: TypeAlias = Literal["link", "implied", "expected", "open"]
+OF_FRAMES = frozenset({"turn_rotates", "one_dstate_per_heading", "one_heading"})
+_OF_COURSES = frozenset({"turn_around_reverses", "one_dstate_per_course"})
+
+
+@dataclass(frozen=True, slots=True)
+class Consequence:
+    """The prediction of a map for an action at a dstate."""
+
+    # "link" if the action was tried; "implied" if the axioms imply where it leads; "expected" if
+    # the order of a path suggests it; "open" if nothing is known.
+    how: How
+    dstate: int | None = None  # the dstate that the action leads to; None if unknown
+    # The view and star there, as far as they are known; None if nothing is known.
+    seen: Seen | None = None
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether any other outcome of the action refutes the map."""
+        return self.how in ("link", "implied")
+
+    def clashes(self, other: Consequence) -> bool:
+        """Tell whether every outcome refutes at least one of the two predicting maps."""
+        if not (self.is_sure and other.is_sure and self.seen and other.seen):
+            return False
+        one, two = self.seen, other.seen
+        both = ((one.view, two.view), (one.star, two.star))
+        return any(None not in pair and pair[0] != pair[1] for pair in both)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the prediction as plain data, as `next --json` prints it."""
+        return {"how": self.how, "dstate": self.dstate} | (
+            self.seen.to_dict() if self.seen else {"view": None}
+        )
+
+
+OPEN = Consequence("open")
+
+
+class Consequences:
+    """The predictions of one map.
+
+    Args:
+        links: For each dstate, a dict from each action tried there to the dstate it leads to.
+        looks: The view and star of each dstate.
+        theory: The theory, whose axioms may imply where actions lead; None to use all axioms.
+    """
+
+    def __init__(
+        self,
+        ssh_map: SSHMap,
+        links: dict[int, dict[str, int]],
+        looks: Sequence[Seen],
+        theory: Theory | None,
+    ) -> None:
+        self._dstates, self._links, self._looks = ssh_map.dstates, links, looks
+        headed = [s for s in ssh_map.dstates if s.heading is not None and s.place is not None]
+        has_frames = all((s.heading or 0) < 4 for s in headed)
+        if theory is not None:
+            has_frames = theory.star == "frame" and theory.hard >= OF_FRAMES
+        self._framed = {(s.place, s.heading): s.id for s in headed} if has_frames else {}
+        self._seen_at = {s.place: s for s in headed} if has_frames else {}  # a dstate at each place
+        self._at: dict[tuple[int | None, int | None, int | None], int] = {
+            (s.place, s.path, s.direction): s.id
+            for s in ssh_map.dstates
+            if s.path is not None and s.place is not None
+        }
+        self._turns_back = theory is None or theory.hard >= _OF_COURSES
+        self._orders = {path.id: path.order for path in ssh_map.paths}
+
+    def of(self, dstate: int, action: Action) -> Consequence:
+        """Predict where an action leads from a dstate, and what is seen there."""
+        there = self._links[dstate].get(action.name)
+        if there is not None:
+            return self._to(there, "link")
+        s = self._dstates[dstate]
+        if action.kind == "turn" and action.turn is not None:
+            return self._turned(s, action)
+        if action.kind == "travel" and s.path is not None:
+            return self._travelled(s)
+        return OPEN
+
+    def sure_ends(self, actions: Sequence[Action]) -> tuple[tuple[int, str, int], ...]:
+        """List the untried turns whose end the axioms imply: (dstate, action, dstate reached)."""
+        turns = [action for action in actions if action.kind == "turn"]
+        if not (self._framed or (self._turns_back and self._at)):
+            return ()
+        found = (
+            (s.id, action.name, self._turned(s, action))
+            for s in self._dstates
+            for action in turns
+            if action.name not in self._links[s.id]
+        )
+        return tuple(
+            (s, action, says.dstate) for s, action, says in found if says.dstate is not None
+        )
+
+    def _turned(self, s: DState, action: Action) -> Consequence:
+        """Predict where a turn leads from a dstate that has no link for it."""
+        assert action.turn is not None
+        if s.place in self._seen_at and s.heading is not None and action.in_quarters:
+            slot = (s.heading + QUARTERS[action.turn]) % 4
+            if (faced := self._framed.get((s.place, slot))) is not None:
+                return self._to(faced, "implied")
+            known = self._seen_at[s.place]
+            if not _is_four(self._looks[known.id]):
+                return OPEN
+            openings = self._looks[known.id].star or ()
+            turned = (slot - (known.heading or 0)) % 4
+            return Consequence("implied", None, Seen(None, openings[turned:] + openings[:turned]))
+        if action.turn == "around" and s.path is not None and self._turns_back:
+            back = self._at.get((s.place, s.path, -(s.direction or 0)))
+            if back is not None:
+                return self._to(back, "implied")
+        return OPEN
+
+    def _travelled(self, s: DState) -> Consequence:
+        """Predict a travel from a dstate that has no link for it: to the next place of its path."""
+        order = self._orders.get(s.path or 0, ())
+        if s.place not in order:
+            return OPEN
+        next_one = order.index(s.place) + (s.direction or 0)
+        if not 0 <= next_one < len(order):
+            return OPEN
+        there = self._at.get((order[next_one], s.path, s.direction))
+        return OPEN if there is None else self._to(there, "expected")
+
+    def _to(self, dstate: int, how: How) -> Consequence:
+        """Predict that an action leads to this dstate."""
+        return Consequence(how, dstate, self._looks[dstate])
+
+
+def _is_four(seen: Seen) -> bool:
+    """Tell whether a star is given as four openings: ahead, right, back and left."""
+    return (
+        seen.star is not None
+        and len(seen.star) == 4
+        and all(isinstance(entry, bool) for entry in seen.star)
+    )
+
+
+def is_possible(action: Action, seen: Seen) -> bool:
+    """Tell whether a star (the openings seen at a place) allows an action; None allows any.
+
+    A travel needs an opening ahead. A turn to a numbered gateway needs that gateway.
+    """
+    if seen.star is None:
+        return True
+    if _is_four(seen):
+        return action.kind != "travel" or bool(seen.star[0])
+    frames = Star.of(seen.star).frames
+    if action.kind == "travel":
+        return any(frame.faces(slot) for frame in frames for slot in range(frame.slots))
+    if action.gateway is not None:
+        return any(frame.nth(action.turn, action.gateway) is not None for frame in frames)
+    return True

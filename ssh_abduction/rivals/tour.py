@@ -9,7 +9,7 @@
 
 A robot that always does the nearest untried action looks around at each place, although it comes
 back to most places later and could do so then. So the tour plans ahead, in a graph of stances
-(places and headings) and moves (`rivals/stances.py`). The tour is the shortest walk that makes each
+(places and headings) and moves (`rivals/tour.py`). The tour is the shortest walk that makes each
 unknown move and each expected travel, and visits each stance. After that, expected turns are tried
 one by one. Expected ends of moves are guesses for the plan only. No conclusion is drawn from them,
 and the robot plans again after each surprise.
@@ -20,21 +20,30 @@ place. Then the plan treats the end of the move as a new place. The robot explor
 until it has seen more than `margin` dstates there and at the doubted places beside it. If the new
 place is not the earlier one, the robot sees something new. Otherwise, it confirms the return. A
 travel back to where the robot came from is not doubted.
+
+The shortest walk is a flow of least cost on the graph of moves. A stance is a place and a heading
+where the robot may stand. A move is an action that leads from one stance to another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
-from dataclasses import replace
+from collections import deque
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TypeAlias
+from typing import Literal, TypeAlias, TypeVar
 
-from ssh_abduction.data.groups import numbered
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import coo_array
+
+from ssh_abduction.data.action import QUARTERS
+from ssh_abduction.data.groups import firsts, gathered, numbered, parts, reached
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.star import Frame, Star, angle_between
 from ssh_abduction.data.trace import Action, Trace
-from ssh_abduction.rivals.flow import followed_from, nearest_of, reached_from, shortest_walk
-from ssh_abduction.rivals.machines import Can
-from ssh_abduction.rivals.stances import Stances
+from ssh_abduction.rivals.machines import OF_FRAMES, Can, Seen, is_possible, leads_of
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
@@ -155,3 +164,371 @@ def _copies(ssh_map: SSHMap, trace: Trace, believed: Collection[int]) -> list[Co
         came.setdefault(there, []).append(here)
         at.append(there)
     return at
+
+
+How: TypeAlias = Literal["known", "implied", "expected", "unknown"]
+# The cost of an unknown move in actions: go there, turn around, and come back.
+THERE_AND_BACK = 3
+AROUND = Action.of("around")
+
+
+@dataclass(frozen=True, slots=True)
+class StanceMove:
+    """An action that leads from one stance to another."""
+
+    source: int  # the number of the stance before the action
+    action: Action
+    # The number of the stance after the action. If `how` is "unknown", this is a guess: a travel
+    # comes back through the same gateway, and any other action changes nothing.
+    target: int
+    # How the target is known. "known": the action was tried. "implied": the axioms imply it, for a
+    # turn at a place with a frame. "expected": a turn by the angle that the star shows, or a travel
+    # back the way that the robot came. "unknown": anything else.
+    how: How
+
+    @property
+    def cost(self) -> int:
+        """The cost as a number of actions."""
+        return THERE_AND_BACK if self.how == "unknown" else 1
+
+    @property
+    def is_untried(self) -> bool:
+        """Whether a tour has to make the move: it is unknown, or a travel expected to lead back."""
+        return self.how == "unknown" or (self.how == "expected" and self.action.kind != "turn")
+
+
+class Stances:
+    """The stances of a map: places and headings where a robot may stand.
+
+    The first stances are the dstates of the map, with the same numbers. The robot was never in the
+    others: turns lead there from dstates. Parameters as in `next_tour`.
+    """
+
+    def __init__(
+        self,
+        ssh_map: SSHMap,
+        trace: Trace,
+        theory: Theory,
+        actions: Sequence[Action],
+        can: Can | None,
+    ) -> None:
+        self._links = leads_of(ssh_map, 0)
+        known = (*actions, *trace.actions)
+        self._actions = {action.name: action for action in known if not action.starts}
+        self._can = can
+        self._implies = theory.star == "frame" and theory.hard >= OF_FRAMES
+        first = firsts(zip(ssh_map.dstate_at, trace.steps, strict=True))
+        self._looks = [first[s.id] for s in ssh_map.dstates]
+        self._stars = [
+            Star.of(step.star) if step.star is not None and theory.star != "none" else None
+            for step in self._looks
+        ]
+        self._frames = [_frame(star) for star in self._stars]
+        # for each stance its room, and the heading in the room in degrees clockwise
+        self._at: list[tuple[int, float]] = [
+            (s.place or 0, 90.0 * (s.heading or 0)) for s in ssh_map.dstates
+        ]
+        if not self._implies or any(s.heading is None for s in ssh_map.dstates):
+            self._at = self._rooms()
+        # the stances in each room
+        self._in = gathered((room, n) for n, (room, _) in enumerate(self._at))
+        self._back: dict[int, int] = {}  # where a travel from a stance leads if it leads back
+
+    def moves(self) -> list[StanceMove]:
+        """List all moves from all stances (place, heading). This adds stances never seen before."""
+        for source, tried in self._links.items():
+            for name, target in tried.items():
+                has_stars = self._frames[source] and self._frames[target]
+                if self._actions[name].kind == "travel" and has_stars:
+                    self._back.setdefault(self._around(target), self._around(source))
+        found: list[StanceMove] = []
+        for n, _ in enumerate(self._at):  # the list grows
+            found += (self._move(n, action) for action in self._possible(n))
+        return found
+
+    def _rooms(self) -> list[tuple[int, float]]:
+        """Return the room and the heading, in degrees clockwise, of each dstate.
+
+        Dstates that are linked by turns are one room. Their headings differ by the angles of the
+        turns. The first dstate of a room faces 0 degrees.
+        """
+        turns: dict[int, list[tuple[int, float]]] = {n: [] for n in self._links}
+        for n, tried in self._links.items():
+            for name, target in tried.items():
+                action = self._actions[name]
+                degrees = _degrees(action, self._frames[n]) if action.kind == "turn" else None
+                if degrees is not None:
+                    turns[n].append((target, degrees))
+                    turns[target].append((n, -degrees))
+        # each connected group of dstates is a room, in which the first one faces 0 degrees
+        at: dict[int, tuple[int, float]] = {}
+        for n in turns:
+            if n in at:
+                continue
+            at[n] = n, 0.0
+            queue = [n]
+            for source in queue:
+                for target, degrees in turns[source]:
+                    if target not in at:
+                        at[target] = n, (at[source][1] + degrees) % 360
+                        queue.append(target)
+        return [at[n] for n in sorted(at)]
+
+    def _possible(self, n: int) -> list[Action]:
+        """List the possible actions in stance n. If it was never seen, its star is predicted."""
+        if n < len(self._looks):
+            step = self._looks[n]
+            seen = Seen(step.view, step.star if self._stars[n] else None)
+            can = {*self._actions} if self._can is None else {*self._can(seen)}
+            return [
+                action
+                for name, action in self._actions.items()
+                if name in self._links[n] or (name in can and is_possible(action, seen))
+            ]
+        frame = self._frames[n]
+        assert frame is not None
+        return [
+            action
+            for action in self._actions.values()
+            if (action.kind == "travel" and _faces(frame) is not None)
+            or (action.kind == "turn" and _degrees(action, frame) is not None)
+        ]
+
+    def _move(self, n: int, action: Action) -> StanceMove:
+        """Make the move for an action in stance n."""
+        if n < len(self._links) and action.name in self._links[n]:
+            return StanceMove(n, action, self._links[n][action.name], "known")
+        frame = self._frames[n]
+        if frame is not None and action.kind == "travel":
+            if n in self._back:
+                return StanceMove(n, action, self._back[n], "expected")
+            return StanceMove(n, action, self._around(n), "unknown")
+        degrees = _degrees(action, frame) if action.kind == "turn" else None
+        if degrees is None:
+            return StanceMove(n, action, n, "unknown")
+        how: How = "implied" if self._implies and action.in_quarters else "expected"
+        return StanceMove(n, action, self._turned(n, degrees), how)
+
+    def _around(self, n: int) -> int:
+        """Find the stance (place and heading) that a turn around leads to from stance n."""
+        degrees = _degrees(AROUND, self._frames[n])
+        assert degrees is not None
+        return self._turned(n, degrees)
+
+    def _turned(self, n: int, degrees: float) -> int:
+        """Find the stance after a clockwise turn of this many degrees from stance n.
+
+        If all stances of the room differ from that heading by more than the spread of bearings in
+        the star, a new stance is added.
+        """
+        (room, before), star, frame = self._at[n], self._stars[n], self._frames[n]
+        assert star is not None
+        assert frame is not None
+        goal = (before + degrees) % 360
+        near = min(self._in[room], key=lambda m: angle_between(self._at[m][1], goal))
+        if angle_between(self._at[near][1], goal) <= max(frame.spreads, default=0):
+            return near
+        self._at.append((room, goal))
+        self._in[room].append(len(self._at) - 1)
+        turned = Star(tuple(replace(g, bearing=(g.bearing - degrees) % 360) for g in star.gateways))
+        self._stars.append(turned)
+        self._frames.append(_frame(turned))
+        return len(self._at) - 1
+
+
+def _frame(star: Star | None) -> Frame | None:
+    """Return the first frame (reading of the gateways) of a star; None without a star."""
+    return None if star is None else star.frames[0]
+
+
+def _faces(frame: Frame) -> int | None:
+    """Find the slot (direction of a place) that the robot faces; None if it faces none."""
+    return next((slot for slot in range(frame.slots) if frame.faces(slot)), None)
+
+
+def _degrees(action: Action, frame: Frame | None) -> float | None:
+    """Find by how many degrees clockwise a turn goes; None if the star does not show it."""
+    if frame is None or action.bearing is not None:
+        return action.bearing
+    if action.gateway is not None:
+        slot = frame.nth(action.turn, action.gateway)
+        return None if slot is None else frame.bearings[slot]
+    if action.turn == "around":
+        faced = _faces(frame)
+        opposite = None if faced is None else frame.opposite[faced]
+        behind = next((slot for slot in range(frame.slots) if frame.has_behind(slot)), opposite)
+        return 180.0 if behind is None else frame.bearings[behind if opposite is None else opposite]
+    return 90.0 * QUARTERS[action.turn or "right"]
+
+
+T = TypeVar("T")
+# Seconds for the search for one flow. If it takes longer, the robot goes to the nearest untried
+# move instead.
+PATIENCE = 2.0
+# The greatest number of flows to seek. Later plans visit the parts that the last flow cuts off.
+ROUNDS = 8
+
+
+def shortest_walk(
+    moves: Sequence[StanceMove], start: int, due: set[int], unseen: set[int]
+) -> tuple[str, ...]:
+    """Find the shortest walk that makes the moves `due` and visits the stances `unseen`.
+
+    Return the names of the actions up to the first move with an unknown end. Empty if there is
+    no such walk, or none is found in time. The order of the moves is found by Fleury's
+    algorithm: each move must not cut off the rest of the walk. Among such moves, one with an
+    unknown end comes first, as it is most informative.
+    """
+    times = shortest_flow(moves, start, due, unseen)
+    if times is None:
+        return ()
+    left = {k: n for k, n in enumerate(times) if n}
+    actions: list[str] = []
+    at = start
+    while left:
+        choices = sorted(
+            (k for k in left if moves[k].source == at),
+            key=lambda k: (moves[k].how != "unknown", k not in due, k),
+        )
+        # take a move unless the rest of the walk would be cut off
+        for k in choices:
+            after = {j: n - (j == k) for j, n in left.items() if n > (j == k)}
+            if {moves[j].source for j in after} <= reached_from(
+                [moves[j] for j in after], moves[k].target
+            ):
+                break
+        else:
+            return ()
+        actions.append(moves[k].action.name)
+        if moves[k].how == "unknown":
+            break
+        left, at = after, moves[k].target
+    return tuple(actions)
+
+
+def shortest_flow(
+    moves: Sequence[StanceMove],
+    start: int,
+    due: set[int],
+    unseen: set[int],
+    rounds: int = ROUNDS,
+    patience: float = PATIENCE,
+) -> list[int] | None:
+    """Count how often the shortest walk makes each move.
+
+    A walk is a flow on the graph of moves: each stance is entered as often as it is left, except
+    for the first and the last one. `milp` of scipy finds a flow of least cost. A part of the flow
+    may not be connected to the start. Then a constraint that the part is entered is added, and the
+    flow is solved again, as Dantzig, Fulkerson & Johnson (1954) did for the travelling salesman.
+
+    Args:
+        moves: The moves that the robot can make between stances.
+        start: The number of the stance where the robot is.
+        due: Indices of the moves that the walk has to make.
+        unseen: Numbers of the stances that the walk has to visit.
+        rounds: The greatest number of flows to seek. After the last one, the result is the part of
+            the flow that is connected to the start.
+        patience: Seconds for each flow. At the limit the best flow so far is used. It may not be
+            the shortest.
+
+    Returns:
+        A count for each move; None if there is no walk, or none was found in time.
+    """
+    costs, bounds, rules = _program(moves, start, due, unseen)
+    for _ in range(rounds):
+        found = milp(
+            costs,
+            constraints=rules,
+            integrality=np.ones(len(costs)),
+            bounds=bounds,
+            options={"time_limit": patience},
+        )
+        if found.x is None:
+            return None
+        times = np.round(found.x[: len(moves)]).astype(int)
+        used = [move for move, n in zip(moves, times, strict=True) if n]
+        if not (cut_off := _parts_cut_off(used, start)):
+            break
+        for part in cut_off:
+            entering = [float(x.target in part and x.source not in part) for x in moves]
+            entering += [0.0] * (len(costs) - len(moves))
+            rules.append(LinearConstraint(np.array([entering]), 1, np.inf))
+    near = reached_from(used, start)
+    return [int(n) if move.source in near else 0 for move, n in zip(moves, times, strict=True)]
+
+
+def _program(
+    moves: Sequence[StanceMove], start: int, due: set[int], unseen: set[int]
+) -> tuple[NDArray[np.float64], Bounds, list[LinearConstraint]]:
+    """Make the integer program of a flow: costs, bounds and constraints of its variables.
+
+    The variables are the count of each move, and for each stance whether it is the last one.
+    """
+    number = {n: i for i, n in enumerate(sorted(reached_from(moves, start)))}
+    m, size = len(moves), len(number)
+    sources, targets = (
+        np.array([number[n] for n in ends])
+        for ends in ([x.source for x in moves], [x.target for x in moves])
+    )
+    # Balance: a stance is entered as often as it is left, but for the start and the last one.
+    signs = np.r_[np.ones(m), -np.ones(m), -np.ones(size)]
+    at = np.r_[targets, sources, :size], np.r_[:m, :m, m : m + size]
+    balance = coo_array((signs, at), (size, m + size)).tocsr()
+    enters = coo_array((np.ones(m), (targets, np.arange(m))), (size, m + size)).tocsr()
+    begins = -1.0 * (np.arange(size) == number[start])
+    rows = sorted(number[n] for n in unseen - {start})
+    rules = [
+        LinearConstraint(balance, begins, begins),
+        LinearConstraint(np.r_[np.zeros(m), np.ones(size)][None], 1, 1),
+        *([LinearConstraint(enters[rows], 1, np.inf)] if rows else []),
+    ]
+    costs = np.r_[[float(move.cost) for move in moves], np.zeros(size)]
+    bounds = Bounds(
+        np.r_[[float(k in due) for k in range(m)], np.zeros(size)],
+        np.r_[np.full(m, float(size)), np.ones(size)],
+    )
+    return costs, bounds, rules
+
+
+def _parts_cut_off(used: Sequence[StanceMove], start: int) -> list[set[int]]:
+    """Find the parts of a flow that `start` is not connected to, as sets of stances."""
+    near = reached_from(used, start)
+    left = [(move.source, move.target) for move in used if move.source not in near]
+    beside = gathered([*left, *((target, source) for source, target in left)])
+    return [set(part) for part in parts(beside, beside.__getitem__)]
+
+
+def nearest_of(
+    moves: Sequence[StanceMove], start: int, due: set[int], unseen: set[int]
+) -> tuple[str, ...]:
+    """Find the shortest way to one required move or stance (a place and a heading).
+
+    Parameters as in `shortest_walk`. Return the names of the actions; empty if there is no way.
+    """
+    after = gathered(
+        (move.source, k)
+        for k, move in sorted(enumerate(moves), key=lambda pair: pair[0] not in due)
+    )
+    ways: dict[int, tuple[str, ...]] = {start: ()}
+    queue = deque([start])
+    while queue:
+        n = queue.popleft()
+        for k in after.get(n, ()):
+            way = (*ways[n], moves[k].action.name)
+            if k in due or moves[k].target in unseen:
+                return way
+            if moves[k].target not in ways and moves[k].how != "unknown":
+                ways[moves[k].target] = way
+                queue.append(moves[k].target)
+    return ()
+
+
+def reached_from(moves: Iterable[StanceMove], start: int) -> set[int]:
+    """Find all stances (place, heading) that moves from `start` reach, including `start`."""
+    return followed_from(((move.source, move.target) for move in moves), start)
+
+
+def followed_from(links: Iterable[tuple[T, T]], start: T) -> set[T]:
+    """Find all nodes that links (pairs of source and target) reach, including `start`."""
+    after = gathered(links)
+    return set(reached([start], lambda n: after.get(n, ())))

@@ -6,8 +6,7 @@ gateways. Places that the robot only passed, always between the same two neighbo
 dots. Each of several drives has its colour.
 
 The first dstate faces right, as in all drawings of a map. Each drive of a joint map has a frame of
-its own. It is moved and turned so that the places that it shares with earlier drives coincide. A
-drive that shares no place is put beside the others.
+its own. It is moved and turned to where the map has its steps.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from scipy.spatial import cKDTree
 from perception.places.importing import Imported
 from perception.readers.scans import RobotLog, Scan, in_turn
 from ssh_abduction.data.drives import Drive, drives_of
-from ssh_abduction.data.groups import firsts, gathered
+from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Pose, moved
 from ssh_abduction.data.star import Star
-from ssh_abduction.output.layout import fitted_motion
+from ssh_abduction.output.layout import drawable_poses, fitted_motion
 from ssh_abduction.output.map_scene import band, banded
 from ssh_abduction.output.roads import place_of_steps, undecided_places
 from ssh_abduction.output.scene import (
@@ -47,6 +46,7 @@ from ssh_abduction.output.scene import (
     escaped,
 )
 from ssh_abduction.output.svg import svg_of
+from ssh_abduction.rivals.listing import trusted
 from ssh_abduction.robot_logs.edges import STEP, edges_of, resampled
 from ssh_abduction.solver import Solution
 
@@ -70,7 +70,7 @@ BROAD = 2.0
 SURE = 0.95
 # The colour of edges that belong to no meaningful path, of walls, and of the robot's way.
 EDGE, WALL, WAY = "#0072b2", "#8a8a8a", "#c9d4df"
-ASIDE = 5.0  # metres between drives that share no place
+ASIDE = 5.0  # metres between drives that no map joins
 
 
 def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
@@ -93,7 +93,7 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
     if not solution.maps:
         caption = f"The visits over the scans, at {poses}."
     else:
-        colours = "Colours are paths. " if paths_mean_something(solution) else ""
+        colours = "Colours are paths. " if solution.maps[0].paths else ""
         if len(drives) > 1:
             colours = f"Colours are drives: {legend(drives)}. "
         caption = (
@@ -101,7 +101,11 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
             "and lines the edges along the robot's course, drawn once where several run together. "
             f"{colours}North, in corrections, is up. Dots are places at which the robot only "
             "passed through. Bands are regions that, as far as known, have only one entrance. "
-            "Red shows the probability of a doubtful join."
+            + (
+                "Red shows the probability of a doubtful join."
+                if trusted(solution.weighed) or not solution.weighed
+                else "Which joins are doubtful is unknown."
+            )
         )
     return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
@@ -114,18 +118,12 @@ def legend(drives: Sequence[Drive]) -> str:
     )
 
 
-def paths_mean_something(solution: Solution) -> bool:
-    """Whether stars, sides or planarity say which edges are one path."""
-    theory = solution.theory
-    return theory.star != "none" or theory.boundary != "none" or bool(theory.planar)
-
-
 def doubtful_joins(solution: Solution) -> list[tuple[int, int, float]]:
     """List the joins of the first map with a probability below SURE, least first.
 
-    Each has two steps and its probability. There are none if the costs are in doubt.
+    Each has two steps and its probability. There are none if probabilities are unknown.
     """
-    weighed = solution.weighed
+    weighed = trusted(solution.weighed)
     joins = weighed.joins if weighed else ()
     return sorted((join for join in joins if join[2] < SURE), key=lambda join: join[2])
 
@@ -188,14 +186,12 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     )
     hidden = undecided_places(ssh_map) - doubts.keys()
     shown = {place: middle for place, middle in middles.items() if place not in hidden}
-    path_of = {state.id: state.path for state in ssh_map.dstates}
-    colourful = paths_mean_something(solution)
     edges = list(_edges(sheet, imported, ssh_map, visit_of, middles))
     yield from _bands(sheet, ssh_map, middles, [(places[t], places[t + 1], c) for t, c in edges])
     lines: dict[str, list[Array]] = defaultdict(list)
     for step, course in edges:
-        path = path_of[ssh_map.dstate_at[step]] or 0
-        colour = colour_of(path) if colourful else EDGE
+        path = ssh_map.dstates[ssh_map.dstate_at[step]].path
+        colour = EDGE if path is None else colour_of(path)
         if len(sheet.bounds) > 2:
             colour = colour_of(sheet.drive_of(imported.visits[visit_of[step]].scan))
         lines[colour].append(course)
@@ -341,33 +337,43 @@ def _ends(scan: Scan, pose: Pose) -> Array:
 
 
 def laid_over(poses: Sequence[Pose], imported: Imported, ssh_map: SSHMap | None) -> list[Pose]:
-    """Move the poses of each drive into the frame of the first one, by the places that they share.
+    """Move the poses of each drive to where the map has its steps.
 
-    At its first step, a drive faces along x, unless it is laid over others. Without a map, no
-    places are shared.
+    Without a map with poses, a drive faces along x at its first step, and each drive is beside the
+    one before.
     """
-    drives = drives_of(imported.trace)
-    own = [np.array(poses[a:b]) for a, b in pairwise([0, *imported.starts, len(poses)])]
-    spots = _spots(poses, imported)
-
-    def move(k: int, by: Pose) -> None:
-        own[k] = np.array([moved(by, pose) for pose in own[k].tolist()])
-        for t in range(drives[k].first, drives[k].stop):
-            spots[t] = moved(by, spots[t])
-
-    for k, drive in enumerate(drives):
-        move(k, (0.0, 0.0, -spots[drive.first][2]))
-    laid = [0]
-    while len(laid) < len(drives):
-        k, pairs = _next(drives, ssh_map, laid)
-        if pairs:
-            move(k, _fitted(spots, pairs, ssh_map))
+    at = drawable_poses(ssh_map) if ssh_map else None
+    spots, right, lowest = _spots(poses, imported), -ASIDE, 0.0
+    laid: list[Pose] = []
+    bounds = pairwise([0, *imported.starts, len(poses)])
+    for drive, (begin, stop) in zip(drives_of(imported.trace), bounds, strict=True):
+        steps = range(drive.first, drive.stop)
+        if at and ssh_map:
+            there = [at[ssh_map.dstate_at[t]] for t in steps]
+            by = _fitted([spots[t] for t in steps], [(p.x, p.y, p.heading) for p in there])
+            part = [moved(by, pose) for pose in poses[begin:stop]]
         else:
-            right = max(own[other][:, 0].max() for other in laid) + ASIDE
-            lowest = min(own[other][:, 1].min() for other in laid)
-            move(k, (right - own[k][:, 0].min(), lowest - own[k][:, 1].min(), 0.0))
-        laid.append(k)
-    return [(x, y, heading) for part in own for x, y, heading in part.tolist()]
+            part = [moved((0.0, 0.0, -spots[drive.first][2]), pose) for pose in poses[begin:stop]]
+            xs, ys = [x for x, _, _ in part], [y for _, y, _ in part]
+            if laid:
+                by = right + ASIDE - min(xs), lowest - min(ys), 0.0
+                part = [moved(by, pose) for pose in part]
+            right, lowest = max(x for x, _, _ in part), min(y for _, y, _ in part)
+        laid += part
+    return laid
+
+
+def _fitted(here: Sequence[Pose], there: Sequence[Pose]) -> Pose:
+    """Fit the rigid motion that moves poses to other poses, by least squares.
+
+    Besides the positions, it fits the points a metre ahead of them.
+    """
+    ends = [
+        [complex(x, y) + ahead for x, y, heading in some for ahead in (0, cmath.rect(1.0, heading))]
+        for some in (here, there)
+    ]
+    turn, shift = fitted_motion(*ends)
+    return shift.real, shift.imag, cmath.phase(turn)
 
 
 def _visit_of(imported: Imported) -> list[int]:
@@ -383,53 +389,3 @@ def _spots(poses: Sequence[Pose], imported: Imported) -> list[Pose]:
         x, y, heading = step.extra["seen"]
         spots.append(moved(poses[visit.scan], (float(x), float(y), float(heading))))
     return spots
-
-
-def _next(
-    drives: Sequence[Drive], ssh_map: SSHMap | None, laid: Sequence[int]
-) -> tuple[int, list[tuple[int, int]]]:
-    """Choose the drive that shares most places with the `laid` ones.
-
-    Also return pairs of steps at one place: one of a laid drive, and one of the chosen drive.
-    """
-    steps = [range(drive.first, drive.stop) for drive in drives]
-    known = gathered((_station(ssh_map, t), t) for k in laid for t in steps[k])
-    pairs = {
-        k: [(other, t) for t in steps[k] for other in known.get(_station(ssh_map, t), ())]
-        for k in range(len(drives))
-        if k not in laid
-    }
-    chosen = max(pairs, key=lambda k: len({_station(ssh_map, t) for _, t in pairs[k]}))
-    return chosen, pairs[chosen]
-
-
-def _station(ssh_map: SSHMap | None, step: int) -> object:
-    """The place of a step; the step itself if it is unknown."""
-    place = None if ssh_map is None else ssh_map.place_of(step)
-    return ("step", step) if place is None else place
-
-
-def _fitted(
-    spots: Sequence[Pose], pairs: Sequence[tuple[int, int]], ssh_map: SSHMap | None
-) -> Pose:
-    """Fit the rigid motion that moves the second step of each pair to the pose of the first."""
-    # The points as complex numbers, and points a metre ahead of them.
-    here: list[complex] = []
-    there: list[complex] = []
-    for first, second in pairs:
-        for ends, (x, y, heading), more in (
-            (there, spots[first], _turned(ssh_map, first, second)),
-            (here, spots[second], 0.0),
-        ):
-            ends += [complex(x, y), complex(x, y) + cmath.rect(1.0, heading + more)]
-    turn, shift = fitted_motion(here, there)
-    return shift.real, shift.imag, cmath.phase(turn)
-
-
-def _turned(ssh_map: SSHMap | None, first: int, second: int) -> float:
-    """The heading at `second` minus that at `first`, radians counterclockwise; 0 without poses."""
-    assert ssh_map is not None
-    if ssh_map.fit is None or not ssh_map.fit.poses:
-        return 0.0
-    one, other = (ssh_map.fit.poses[ssh_map.dstate_at[step]] for step in (first, second))
-    return other.heading - one.heading

@@ -8,7 +8,8 @@ the log has them. The map itself was made without corrected poses.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,15 @@ from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.files import filled
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.rungs import Rung
+from ssh_abduction.output.cards import html_table, html_text, paragraph
 from ssh_abduction.output.roads import place_of_steps
-from ssh_abduction.output.scene import escaped
 from ssh_abduction.rivals.drive_joins import joins_of_drives
-from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.robot_logs.log_picture import SURE, doubtful_joins, figure, paths_mean_something
+from ssh_abduction.rivals.listing import Listing, trusted
+from ssh_abduction.robot_logs.log_picture import SURE, doubtful_joins, figure
 from ssh_abduction.solver import Solution, Status
 from ssh_abduction.theory.joins import joins_in_words
 
+_table = partial(html_table, is_whole=True)
 TEMPLATE = Path(__file__).parent / "report.html"
 
 
@@ -44,15 +46,15 @@ def report(
     """
     name = imported.trace.name or "log"
     parts = [
-        f"<h1>{escaped(name)}</h1>",
-        *map(_paragraph, [_summary(solution, run), *run["notes"], *solution.warnings]),
+        f"<h1>{html_text(name)}</h1>",
+        *map(paragraph, [_summary(solution, run), *run["notes"], *solution.warnings]),
         figure(log, imported, solution),
         *_drives(imported, solution, run),
         "<h2>What each kind of evidence is worth</h2>" + _ladder(rungs) if rungs else "",
         "<h2>Doubtful joins</h2>" + _doubts(solution)
         if solution.weighed and not solution.weighed.doubt
         else "",
-        "<h2>Rival maps</h2>" + _paragraph(f"{solution.summary}.")
+        "<h2>Rival maps</h2>" + paragraph(f"{solution.summary}.")
         if solution.status is Status.OPTIMAL
         else "",
         _faults(solution) if solution.maps else "",
@@ -62,7 +64,7 @@ def report(
         "<h2>Visits</h2>" + _visits(imported, solution),
     ]
     body = "\n".join(part for part in parts if part)
-    return filled(TEMPLATE, name=escaped(name), body=body)
+    return filled(TEMPLATE, name=html_text(name), body=body)
 
 
 def may_misread(solution: Solution) -> bool:
@@ -94,7 +96,7 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
         proven += f"; {solution.weighed.sentence}"
     elif joins := joins_in_words(solution.by_minimality, solution.count):
         proven += f"; {joins}"
-    paths = f", {counted(cost.paths, 'paths')}" if paths_mean_something(solution) else ""
+    paths = f", {counted(cost.paths, 'paths')}" if cost.paths else ""
     dstates = counted(cost.dstates, "distinctive states")
     size = f"{counted(cost.places, 'places')}{paths}, {dstates}"
     return f"{seen} {size}: {proven}."
@@ -114,7 +116,7 @@ def _drives(imported: Imported, solution: Solution, run: Mapping[str, Any]) -> I
         rows.append((drive.name, *counts, len(at[k]), len(at[k] & others)))
     joined = solution.joined[0].upper() + solution.joined[1:]
     head = ("drive", "scans", "way", "visits", "steps", "places", "shared with other drives")
-    yield "<h2>Drives</h2>" + _table(head, rows) + _paragraph(f"{joined}.")
+    yield "<h2>Drives</h2>" + _table(head, rows) + paragraph(f"{joined}.")
     yield "<h2>Joins between drives</h2>" + _joins_of_drives(solution)
 
 
@@ -128,31 +130,32 @@ def _joins_of_drives(solution: Solution) -> str:
     ]
     alone = [str(pair) for pair in pairs if not pair.forced and not pair.possible]
     head = ("step", "and step", "how sure")
-    return (_table(head, rows) if rows else "") + "".join(_paragraph(f"{one}.") for one in alone)
+    return (_table(head, rows) if rows else "") + "".join(paragraph(f"{one}.") for one in alone)
 
 
 def _ladder(rungs: Sequence[Rung]) -> str:
     """Make the table of the ladder. Each rung is a row, with one more kind of evidence."""
+    has_paths = any(rung.solution.theory.has_paths for rung in rungs)
+    names = ("dstates", "places", *(["paths"] if has_paths else []))
     rows = []
     for rung in rungs:
         cost = rung.solution.cost
-        counts = (cost.dstates, cost.places, cost.paths) if cost else ("–", "–", "–")
+        counts = (getattr(cost, name) if cost else "–" for name in names)
         time = f"{rung.solution.seconds.total:.1f} s"
         rows.append((rung.name, rung.solution.status.value, *counts, time))
-    return _table(("evidence", "status", "dstates", "places", "paths", "time"), rows)
+    return _table(("evidence", "status", *names, "time"), rows)
 
 
 def _doubts(solution: Solution) -> str:
     """Make the table of the joins of the first map that are not sure."""
     doubts = doubtful_joins(solution)
-    weighed = solution.weighed
-    if not doubts and weighed and not (weighed.proven or weighed.searched):
-        return _paragraph(
+    if not trusted(solution.weighed):
+        return paragraph(
             "Unknown: a map that costs less may exist, with other joins. To search longer, use "
             "--time-limit."
         )
     if not doubts:
-        return _paragraph(
+        return paragraph(
             "None: each two visits that the first map puts at one place are there with a "
             f"probability of at least {SURE:g}. Which way they faced may be less sure."
         )
@@ -165,12 +168,12 @@ def _faults(solution: Solution) -> str:
     """List what changed between drives, or the steps that the first map treats as wrong."""
     faults, theory = solution.maps[0].faults, solution.theory
     rows = [(f.step, str(f), f.cost) for f in faults]
-    found = _table(("step", "what", "cost"), rows) if rows else _paragraph("Nothing.")
+    found = _table(("step", "what", "cost"), rows) if rows else paragraph("Nothing.")
     if theory.changed:
         return "<h2>What changed between drives</h2>" + found
     if not (theory.misread or theory.slipped or theory.jumped):
         would = " (--set misread=4 would)" if may_misread(solution) else ""
-        found = _paragraph(f"Nothing: the theory allows no faults{would}.")
+        found = paragraph(f"Nothing: the theory allows no faults{would}.")
     return "<h2>What the map treats as wrong</h2>" + found
 
 
@@ -205,7 +208,7 @@ def _time(run: Mapping[str, Any]) -> str:
     if run["drove"]:
         share = f"1/{run['drove'] / max(total, 1e-9):.0f} of the duration of the drive"
         text = f"The robot drove {run['drove']:.0f} s. {text}, which is {share}"
-    return _table(("stage", "processor", "share"), rows) + _paragraph(
+    return _table(("stage", "processor", "share"), rows) + paragraph(
         f"{text}. The search for the minimal maps had {run['limit']:g} s at most."
     )
 
@@ -218,7 +221,7 @@ def _log(log: RobotLog) -> str:
             f"Skipped: {counted(len(log.damaged), 'damaged parts')} of the log. The first ones:"
         )
         said += [f"{damage.line}: {damage.what}" for damage in log.damaged[:10]]
-    return "<ul>" + "".join(f"<li>{escaped(line)}</li>" for line in said) + "</ul>"
+    return "<ul>" + "".join(f"<li>{html_text(line)}</li>" for line in said) + "</ul>"
 
 
 def _visits(imported: Imported, solution: Solution) -> str:
@@ -242,15 +245,3 @@ def _visits(imported: Imported, solution: Solution) -> str:
         action = step.action.name if step.action else ""
         rows.append((t, *seen, star, action, state.id if state else "–", place))
     return _table(("step", "visit", "scan", "view", "star", "action", "dstate", "place"), rows)
-
-
-def _table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
-    titles = "".join(f"<th>{escaped(str(cell))}</th>" for cell in head)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{escaped(str(cell))}</td>" for cell in row) + "</tr>" for row in rows
-    )
-    return f"<table><tr>{titles}</tr>{body}</table>"
-
-
-def _paragraph(text: str) -> str:
-    return f"<p>{escaped(text)}</p>"

@@ -46,10 +46,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.obeying import with_names as with_names
     from ssh_abduction.solver.search import Search as Search
     from ssh_abduction.solver.solution.recorded import drives_in as drives_in
-    from ssh_abduction.solver.solution.recorded import joins_in as joins_in
-    from ssh_abduction.solver.solution.recorded import theory_in as theory_in
     from ssh_abduction.solver.solution.recorded import trace_in as trace_in
-    from ssh_abduction.solver.solution.recorded import warnings_in as warnings_in
     from ssh_abduction.solver.solution.result import Solution as Solution
     from ssh_abduction.solver.solution.result import ending as ending
     from ssh_abduction.solver.solution.result import opening as opening
@@ -61,6 +58,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.solution.sharing import Sharing as Sharing
     from ssh_abduction.solver.solution.sharing import Sort as Sort
     from ssh_abduction.solver.solution.sharing import key_of as key_of
+    from ssh_abduction.solver.solution.sharing import sorts_of as sorts_of
     from ssh_abduction.solver.solution.sharing import stretches as stretches
     from ssh_abduction.solver.solution.weighed import EQUAL as EQUAL
     from ssh_abduction.solver.solution.weighed import Weighed as Weighed

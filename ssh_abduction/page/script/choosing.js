@@ -25,6 +25,7 @@ function draw(keep = true) {
   $("back").disabled = state.map === 0;
   $("next").disabled = state.map === last;
   $("labels").disabled = nextMap((one, now) => one.labeling !== now.labeling) === null;
+  $("paths").hidden = !data.orders.some((order) => order.length);
   $("paths").disabled = nextMap((one, now) => one.labeling === now.labeling) === null;
   about();
   tellRegions();
@@ -140,7 +141,8 @@ function about() {
     const ssh = mapOf(i);
     const paths = data.orders[data.maps[i].orders].length;
     const counts = [counted(ssh.dstates.length, "dstate")];
-    if (ssh.places.size) counts.push(counted(ssh.places.size, "place"), counted(paths, "path"));
+    if (ssh.places.size) counts.push(counted(ssh.places.size, "place"));
+    if (paths) counts.push(counted(paths, "path"));
     element("p", {}, `Map ${i + 1}: ${counts.join(", ")}`, $("about"));
     for (const [, text, kind] of ssh.faults)
       element("p", {}, `${faultWord(kind)}: ${text}`, $("about"));

@@ -226,9 +226,8 @@ class Sharing:
         self.maps += 1
         if ssh_map.dstate_at != self._labels:
             self._split_by(ssh_map.dstate_at)
-        if not self._kept:  # the first map decides whether there are places
-            has_places = any(s.place is not None for s in ssh_map.dstates)
-            sorts = SORTS if has_places else SORTS[:1]
+        if not self._kept:  # the first map decides whether there are places and paths
+            sorts = sorts_of([ssh_map])
             self._kept = {sort: Kept(len(self._label_of)) for sort in sorts}
         for sort, kept in self._kept.items():
             names = tuple(key_of(ssh_map.dstates[label], sort) for label in self._label_of)
@@ -366,6 +365,14 @@ def _split(together: Iterable[Pair], parts: Mapping[int, Sequence[int]]) -> Iter
         for a in parts[i]:
             for b in parts[j]:
                 yield (a, b) if a <= b else (b, a)
+
+
+def sorts_of(maps: Iterable[SSHMap]) -> tuple[Sort, ...]:
+    """Return what maps have: dstates, places if all have some, and paths if any has some."""
+    dstates = [ssh_map.dstates for ssh_map in maps]
+    if not all(any(s.place is not None for s in of_map) for of_map in dstates):
+        return SORTS[:1]
+    return SORTS if any(s.path is not None for of_map in dstates for s in of_map) else SORTS[:2]
 
 
 def key_of(dstate: DState, sort: Sort) -> Hashable:
