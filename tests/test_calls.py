@@ -94,6 +94,7 @@ ANYTHING = {"truth", "y"}
 # Which of these are right, by the kind of parameter. A parameter with default None also takes None.
 RIGHT_BY_NAME: dict[str, set[str]] = {
     "time_limit": {"None", "3.5", "inf", "huge"},
+    "work_limit": {"None", "3.5", "inf", "huge"},
     "memory_limit": {"None", "3.5", "inf", "huge"},
     "max_maps": {"None", "huge"},
     "maps": {"huge", *EMPTY},

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import random
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -487,3 +489,30 @@ def test_equal_steps_give_equal_answers() -> None:
         [(a.maps, a.cost, a.effort.prefix) for a in follow(trace, Theory())[1]] for _ in range(2)
     )
     assert first == second
+
+
+@pytest.mark.parametrize("theory", [Theory(), Theory.causal().replace(misread=1.5)], ids=str)
+def test_one_work_limit_of_steps_gives_one_answer(
+    theory: Theory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clock of seconds runs at random, and some searches are too long for their work."""
+    trace = drive(*TOURS["plus"], stars=False)
+
+    def answers(seed: int) -> list[object]:
+        jumps, shown = random.Random(seed), [0.0]
+
+        def seconds() -> float:
+            shown[0] += jumps.expovariate(1.0)
+            return shown[0]
+
+        with monkeypatch.context() as patch:
+            patch.setattr(time, "perf_counter", seconds)
+            mapper = OnlineMapper(
+                trace.steps[0].view or "", theory, time_limit=None, work_limit=0.002
+            )
+            found = [mapper.solution, *explore(trace, mapper)]
+        return [(a.maps, a.status, a.bound, a.complete, a.stopped) for a in found]
+
+    first, *others = (answers(seed) for seed in range(3))
+    assert others == [first, first]
+    assert any(answer[4] == "work limit" for answer in first)  # type: ignore[index]

@@ -57,6 +57,7 @@ class StepOptions:
 
     # Seconds for each step. A step may take a little longer. None waits for the exact answer.
     time_limit: float | None
+    work_limit: float | None  # units of work for each step; None for no limit
     max_maps: int | None  # keep at most this many minimal maps; None keeps all
     speedups: Speedups  # flags that say which speed-ups of the solver to use
 
@@ -113,7 +114,7 @@ class Keeper(ABC):
         """The solution so far: the minimal maps, else the best map known, else none."""
 
     def _judge(self, maps: Sequence[SSHMap], began: float) -> None:
-        """Test the first map by evidence about whole maps, unless that takes too long."""
+        """Let the checker check the first map, unless that takes too long."""
         trace = self._problem.trace
         self._spent += time.perf_counter() - began
         if maps and self._judging.has_time_for(len(trace), self._spent):
@@ -183,6 +184,7 @@ class MapKeeper(Keeper):
             trace,
             self._problem.theory,
             time_limit=options.time_limit,
+            work_limit=options.work_limit,
             max_maps=options.max_maps,
             speedups=options.speedups,
             minimal=self.minimal.maps[0].explained() if is_proven else None,

@@ -100,6 +100,9 @@ class OnlineMapper:
             the default one.
         time_limit: Seconds for each step. A step may take a little longer, as clingo cannot be
             stopped while it grounds. None waits for the exact answer.
+        work_limit: Units of work for each step, each about a second of a quiet core; None for no
+            limit. With a work limit and without a time limit, equal steps give equal answers on
+            each machine and under each load.
         max_maps: Keep at most this many maps; None keeps all.
         speedups: Flags that say which speed-ups to use. None of them changes the answer.
 
@@ -118,6 +121,7 @@ class OnlineMapper:
         confidence: float | None = None,
         odometry: Odometry | Mapping[str, Any] | None = None,
         time_limit: float | None = 0.5,
+        work_limit: float | None = None,
         max_maps: int | None = 100,
         speedups: Speedups = ALL,
     ) -> None:
@@ -130,6 +134,7 @@ class OnlineMapper:
                 "the odometry is lost"
             )
         check_limit("time_limit", "seconds", time_limit)
+        check_limit("work_limit", "units of work", work_limit)
         checked_speedups(speedups)
         self._odometry = None if odometry is None else Odometry.of(odometry)
         self._steps = [first]
@@ -137,7 +142,7 @@ class OnlineMapper:
         self.trace = Trace((first,), odometry=self._odometry)
         self._settler = TheorySettler(theory, self.trace)
         self._problem = self._settler.settled(self.trace)
-        options = StepOptions(time_limit, max_maps, speedups)
+        options = StepOptions(time_limit, work_limit, max_maps, speedups)
         self._keeper: MapKeeper | Recovery
         if theory.has_faults:
             from ssh_abduction.online.recovery import Recovery  # loads numpy

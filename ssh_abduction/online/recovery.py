@@ -124,6 +124,7 @@ class Recovery(Keeper):
             trace,
             self._problem.theory.of_steps(0, len(trace)),
             time_limit=options.time_limit,
+            work_limit=options.work_limit,
             max_maps=options.max_maps,
             speedups=options.speedups,
         )

@@ -160,6 +160,7 @@ class Search:
         *,
         time_limit: float | None,
         max_maps: int | None,
+        work_limit: float | None = None,
         speedups: Speedups = ALL,
         minimal: SSHMap | None = None,
     ) -> Search:
@@ -170,6 +171,7 @@ class Search:
             trace: The trace that has grown.
             theory: The axioms and the preference, as in the search `after`.
             time_limit: Seconds of wall-clock time; None for no limit.
+            work_limit: Units of work, as in `solve`; None for no limit.
             max_maps: List at most this many maps; None lists all.
             speedups: The speed-ups that are on.
             minimal: A map of the trace that costs what `after` proved to be minimal, if there is
@@ -183,6 +185,7 @@ class Search:
             theory,
             time_limit=time_limit,
             max_maps=max_maps,
+            work_limit=work_limit,
             speedups=speedups,
             _start=Start(after=after._parts if after else None, minimal=minimal),
         )

@@ -26,6 +26,8 @@ TICK = 0.5
 WAITING = 4.0
 # The work for the first map may wait this many times as long: without a map there is no answer.
 STARVED = 30.0
+# More conflicts of clasp than this count as no limit: they take days, and clasp reads no huge number.
+MOST_CONFLICTS = 2**31 - 1
 
 Stop: TypeAlias = Literal[
     "work limit", "time limit", "memory limit", "interrupted", "maps limit", "no proof"
@@ -241,9 +243,11 @@ class Watch:
         """
         if not self.counts_work:
             return -1
-        reserved = RESERVE * self._limit if self._limit and self.lacks_map() else 0.0
-        left = min(self.left() - reserved, self.stage_ends - self.elapsed())
-        least = -1 if left == math.inf else max(int(left / CONFLICT) + 1, 1)
+        left = self.left()
+        if self._limit and left < math.inf and self.lacks_map():
+            left -= RESERVE * self._limit
+        conflicts = min(left, self.stage_ends - self.elapsed()) / CONFLICT
+        least = -1 if conflicts > MOST_CONFLICTS else max(int(conflicts) + 1, 1)
         around = self._around.conflicts_left() if self._around is not None else -1
         return min((n for n in (least, around) if n >= 0), default=-1)
 
