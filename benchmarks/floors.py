@@ -30,7 +30,7 @@ from simulator.tours import simulate
 from simulator.world import TrueDState, World
 from ssh_abduction import SSHMap, Theory, solve
 from ssh_abduction.data import Action
-from ssh_abduction.data.floors import with_floors
+from ssh_abduction.data.drives import with_floors
 from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.output import to_svg
 

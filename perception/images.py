@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from perception.errors import PerceptionError
 from ssh_abduction.data.files import save_file
-from ssh_abduction.data.sidecar import images_file
-from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.trace import Trace, images_file
 
 # Limit in bytes of an unpacked file, since a small archive may unpack to more than the memory.
 LARGEST = 4 * 2**30

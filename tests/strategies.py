@@ -10,8 +10,7 @@ from typing import Any
 from brute_force import Key
 from hypothesis import strategies as st
 
-from ssh_abduction.data.closure import Closure
-from ssh_abduction.data.odometry import Covariance, Odometry, displacement_between
+from ssh_abduction.data.odometry import Closure, Covariance, Odometry, displacement_between
 from ssh_abduction.data.odometry import moved as moved_pose
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
 from ssh_abduction.theory import encodings

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from worlds import written
 
 from ssh_abduction.checker.checker import AXIOMS, COHERENCE, Violation, check
-from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
+from ssh_abduction.data.odometry import Closure
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.settle import settle

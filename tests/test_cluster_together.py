@@ -14,7 +14,7 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Solution, Trace
 from ssh_abduction.cli import main
-from ssh_abduction.data.sidecar import images_file
+from ssh_abduction.data.trace import images_file
 
 NAMES = ("monday.jsonl", "tuesday.jsonl")
 

@@ -24,10 +24,9 @@ from ssh_abduction.data import (
     save_corrections,
     together,
 )
-from ssh_abduction.data.corrections_file import from_yaml, to_yaml
+from ssh_abduction.data.corrections import from_yaml, to_yaml
 from ssh_abduction.data.drives import fingerprints_of
-from ssh_abduction.data.map_parts import Name
-from ssh_abduction.data.regions import Region
+from ssh_abduction.data.map_parts import Name, Region
 from ssh_abduction.data.star import Gateway, with_gateway
 from ssh_abduction.output import to_dot, to_networkx, to_svg
 from ssh_abduction.output.cards import map_card

@@ -24,7 +24,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.dead_reckoning import ErrorFilter
 from ssh_abduction.checker.geometry import _square_together
 from ssh_abduction.data import DState, Odometry, TheoryError
-from ssh_abduction.data.closure import Closure
+from ssh_abduction.data.odometry import Closure
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.facts import causal_map
 from ssh_abduction.solver.geometry.fit import Poses, fit

@@ -17,7 +17,7 @@ from worlds import written
 
 from ssh_abduction import SSHMap, Theory, Trace, check, solve
 from ssh_abduction.data import Action, MapError
-from ssh_abduction.data.regions import Region, right_of
+from ssh_abduction.data.map_parts import Region, right_of
 from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solver import find_regions, with_regions
 from ssh_abduction.solver.derived_regions import UNITS, axioms_for_regions, derived

@@ -13,7 +13,7 @@ from worlds import written
 from ssh_abduction import SSHMap, Theory, Trace, export_map, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, together
-from ssh_abduction.data.regions import Region
+from ssh_abduction.data.map_parts import Region
 from ssh_abduction.explain import explain_place
 from ssh_abduction.rivals import Listing, difference, shared_sides
 

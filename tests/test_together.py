@@ -43,8 +43,8 @@ from ssh_abduction.data import (
     drives_of,
     together,
 )
-from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.drives import fingerprints_of, named_steps, pieces_in_words
+from ssh_abduction.data.odometry import Closure
 from ssh_abduction.explain import explain_trace
 from ssh_abduction.rivals import DrivePair, Listing, compare, difference, joins_of_drives
 from ssh_abduction.rivals.drive_joins import DriveJoin

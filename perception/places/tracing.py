@@ -23,8 +23,8 @@ from perception.places.local_map import CELL, PackedPatch
 from perception.places.track import Array, Track, covariance_turned, points_turned, wrapped
 from perception.places.visits import Visit, Way, patches_of
 from perception.readers.scans import RobotLog
-from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.odometry import (
+    Closure,
     Covariance,
     Odometry,
     Pose,

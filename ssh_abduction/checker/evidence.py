@@ -12,9 +12,8 @@ from ssh_abduction.checker.crossings import Edges
 from ssh_abduction.checker.moves import MapLink, heading_of
 from ssh_abduction.checker.reading import Found, Reading
 from ssh_abduction.checker.stars import stars_of
-from ssh_abduction.data.closure import Closure, match_in_words
 from ssh_abduction.data.groups import minimal_part, parts
-from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.odometry import Closure, Odometry, match_in_words
 from ssh_abduction.data.star import Star
 
 _LIFTS = ("lift", "stairs")

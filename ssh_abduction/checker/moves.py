@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from ssh_abduction.data.map_parts import course_named
 from ssh_abduction.data.maps import DState
-from ssh_abduction.data.regions import course_named
 from ssh_abduction.data.trace import Action
 
 # A path and a direction, +1 or -1.

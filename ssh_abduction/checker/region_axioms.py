@@ -14,7 +14,7 @@ from ssh_abduction.checker.moves import Course, course_of, opposite
 from ssh_abduction.checker.reading import Check, Found, Reading
 from ssh_abduction.checker.side_axioms import RightBranch, branches_right_of
 from ssh_abduction.data.groups import reached
-from ssh_abduction.data.regions import Region, course_named, list_in_words
+from ssh_abduction.data.map_parts import Region, course_named, list_in_words
 
 _Places: TypeAlias = frozenset[int]
 # ("place", its id), or ("path", its id, its floor); paths are links on one floor only.

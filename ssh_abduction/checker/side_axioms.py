@@ -15,7 +15,7 @@ from functools import partial
 
 from ssh_abduction.checker.moves import Course, MapLink, course_of, opposite
 from ssh_abduction.checker.reading import Found, Reading
-from ssh_abduction.data.regions import course_named
+from ssh_abduction.data.map_parts import course_named
 
 
 @dataclass(frozen=True)

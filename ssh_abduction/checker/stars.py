@@ -12,8 +12,8 @@ from ssh_abduction.checker.moves import Course, course_of, heading_of, opposite
 from ssh_abduction.checker.reading import Found, Reading
 from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.drives import ALONE
+from ssh_abduction.data.map_parts import course_named
 from ssh_abduction.data.maps import DState
-from ssh_abduction.data.regions import course_named
 from ssh_abduction.data.star import Openings
 
 

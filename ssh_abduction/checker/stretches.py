@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.data.closure import Closure
+from ssh_abduction.data.odometry import Closure
 
 # The direction from one place to another is too uncertain to use if they are closer than this many
 # metres.

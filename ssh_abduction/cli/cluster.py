@@ -16,8 +16,7 @@ from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.run_folders import check_folder
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import AbductionError, named
-from ssh_abduction.data.sidecar import with_images_named_from
-from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.learning.runner_up import SECONDS, runner_up, second_map
 from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory

@@ -36,8 +36,13 @@ from ssh_abduction.cli.run_folders import (
     written_elsewhere,
 )
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.corrections import ASSERTIONS, Corrections
-from ssh_abduction.data.corrections_file import beside, load_corrections, to_yaml
+from ssh_abduction.data.corrections import (
+    ASSERTIONS,
+    Corrections,
+    beside,
+    load_corrections,
+    to_yaml,
+)
 from ssh_abduction.data.errors import AbductionError, MapError, brief, named
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import attributes_of

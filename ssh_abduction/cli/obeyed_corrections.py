@@ -13,8 +13,16 @@ from typing import Any
 
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.saved_map import sentences_of
-from ssh_abduction.data.corrections import ASSERTIONS, Corrections, Passage, Said
-from ssh_abduction.data.corrections_file import FILE, beside, load_corrections, save_corrections
+from ssh_abduction.data.corrections import (
+    ASSERTIONS,
+    FILE,
+    Corrections,
+    Passage,
+    Said,
+    beside,
+    load_corrections,
+    save_corrections,
+)
 from ssh_abduction.data.drives import drives_of, fingerprints_of, step_of, together
 from ssh_abduction.data.errors import MapError, TheoryError, named, printable
 from ssh_abduction.data.maps import SSHMap

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ssh_abduction.cli.parsing import Parser, true_or_false
-from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS
-from ssh_abduction.data.corrections_file import load_corrections
+from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS, load_corrections
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
 from ssh_abduction.data.map_file import read_json

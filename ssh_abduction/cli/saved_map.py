@@ -11,19 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli.options import maps_path, read_maps, trace_beside, trace_of_maps
-from ssh_abduction.data.corrections import Corrections, Naming, number_at
-from ssh_abduction.data.corrections_file import (
+from ssh_abduction.data.corrections import (
     FILE,
+    Corrections,
+    Naming,
     beside,
     direction,
     load_corrections,
+    number_at,
     save_corrections,
 )
 from ssh_abduction.data.drives import Drive, step_name, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, named
-from ssh_abduction.data.map_parts import NAMED, thing_named
+from ssh_abduction.data.map_parts import NAMED, region_of, thing_named
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import region_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
 from ssh_abduction.rivals.listing import Listing

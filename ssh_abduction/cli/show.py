@@ -9,10 +9,10 @@ from typing import Any
 from ssh_abduction.cli.options import add_maps, check_number
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import describe
-from ssh_abduction.data.corrections_file import named_beside
+from ssh_abduction.data.corrections import named_beside
 from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.map_parts import described
 from ssh_abduction.data.maps import SSHMap, maps_of
-from ssh_abduction.data.regions import described
 from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.solver import drives_in
 

@@ -53,8 +53,7 @@ from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.sidecar import with_images_named_from
-from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.loggers import PROGRESS
 from ssh_abduction.solver import (

@@ -10,9 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from textwrap import indent
 from typing import TYPE_CHECKING
 
-from ssh_abduction.data.drives import drives_of, named_steps
+from ssh_abduction.data.drives import drives_of, floors_in_words, named_steps
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.floors import floors_in_words
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace

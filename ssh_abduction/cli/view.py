@@ -78,7 +78,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.cli.obeyed_corrections import as_corrected
-    from ssh_abduction.data.corrections_file import beside
+    from ssh_abduction.data.corrections import beside
     from ssh_abduction.data.map_file import read_json
     from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.content import Called, content_of  # loads numpy

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
-from ssh_abduction.data.checks import a_whole_number, an_object, one_of
+from ssh_abduction.data.checks import a_whole_number, an_object, one_of, plain_number, plain_text
 from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole, is_writable
-from ssh_abduction.data.observation import plain_number, plain_text
 from ssh_abduction.data.star import SPREAD, near_quarter
 
 Kind: TypeAlias = Literal["travel", "turn", "lift", "stairs", "start"]

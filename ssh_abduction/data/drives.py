@@ -11,6 +11,18 @@ another drive.
 >>> joint = together([monday, tuesday])
 >>> joint.views, starts_of(joint), [drive.name for drive in drives_of(joint)]
 (('a', 'b', 'b', 'a'), (2,), ['monday', 'tuesday'])
+
+Lifts and stairs divide a drive. A *stretch* is the steps of a drive between two lifts. All steps
+of a stretch are on one floor. Two stretches with a dstate or a place in common are on one floor.
+
+>>> from ssh_abduction import Trace, solve
+>>> from ssh_abduction.data import Action
+>>> up = Action("up", "lift")
+>>> trace = Trace.from_steps("abab", ["travel", up, "travel"])
+>>> stretches_of(trace)
+(0, 0, 2, 2)
+>>> solve(trace).maps[0].floors
+((0, 1), (2, 3))
 """
 
 from __future__ import annotations
@@ -26,18 +38,20 @@ from functools import partial
 from itertools import accumulate, pairwise
 from pathlib import Path
 from statistics import median
+from typing import overload
 
 from ssh_abduction.data.action import Action
 from ssh_abduction.data.checks import a_list, a_text, all_instances
-from ssh_abduction.data.errors import TraceError, brief
+from ssh_abduction.data.errors import TraceError, brief, checked_index
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.groups import NodeClasses
+from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.schema import SparseData
-from ssh_abduction.data.sidecar import images_file
 from ssh_abduction.data.star import is_four
 from ssh_abduction.data.step import Step
-from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.data.trace import Trace, checked_trace, images_file
+from ssh_abduction.data.words import counted
 
 # The fields of a step that its fingerprint covers. Covariances are left out, as `together` adds
 # them if drives differ in their odometry.
@@ -479,3 +493,82 @@ _RECORDED: tuple[tuple[str, Callable[[Trace], object], str], ...] = (
     ("beams", partial(_header, "beams"), "take images of one laser"),
     ("panorama", partial(_header, "panorama"), "take images of one camera"),
 )
+
+
+def stretches_of(trace: Trace) -> tuple[int, ...]:
+    """Return for each step the first step of its stretch."""
+    begins = set(frames_of(trace))
+    return tuple(accumulate(range(len(trace)), lambda last, t: t if t in begins else last))
+
+
+def floors_in_words(ssh_map: SSHMap) -> str:
+    """Say how many floors a map has, and how large they are. Empty if the trace has no lifts."""
+    floors = checked_map(ssh_map).floors
+    at = [{ssh_map.dstates[s].place for s in floor} - {None} for floor in floors]
+    what = "places" if ssh_map.places else "dstates"
+    sizes = map(len, at if ssh_map.places else floors)
+    listed = ", ".join(f"floor {i} with {counted(size, what)}" for i, size in enumerate(sizes))
+    return f"the map has {counted(len(floors), 'floors')}: {listed}" if floors else ""
+
+
+def with_floors(ssh_map: SSHMap, trace: Trace) -> SSHMap:
+    """Return a map with the floor of each dstate, numbered by first visit.
+
+    Without lifts in the trace, the map is returned as it is.
+    """
+    if not any(action.changes_floor for action in checked_trace(trace).actions):
+        return ssh_map
+    stretches = stretches_of(trace)
+    floor = NodeClasses[int]()
+    first: dict[tuple[str, int], int] = {}  # the first stretch at each dstate and place
+    for label, stretch in zip(checked_map(ssh_map).dstate_at, stretches, strict=False):
+        place = ssh_map.dstates[label].place
+        for spot in (("dstate", label), *(() if place is None else (("place", place),))):
+            floor.merge(first.setdefault(spot, stretch), stretch)
+    number: dict[int, int] = {}
+    found: dict[int, int] = {}
+    for label, stretch in zip(ssh_map.dstate_at, stretches, strict=False):
+        found.setdefault(label, number.setdefault(floor.of(stretch), len(number)))
+    return replace(
+        ssh_map, dstates=tuple(replace(s, floor=found.get(s.id)) for s in ssh_map.dstates)
+    )
+
+
+class MapSequence:
+    """Makes a value with the attributes `maps` and `drives` a sequence of its maps."""
+
+    __slots__ = ()
+    maps: tuple[SSHMap, ...]
+
+    @property
+    def drives(self) -> tuple[Drive, ...]:
+        """The drives of the trace; empty if they are unknown."""
+        raise NotImplementedError
+
+    @property
+    def joined(self) -> str:
+        """Which drives the first map joins, in words; empty for one drive or without a map."""
+        return pieces_in_words(self.drives, self.maps[0]) if self.maps else ""
+
+    def __len__(self) -> int:
+        """The number of maps."""
+        return len(self.maps)
+
+    def __bool__(self) -> bool:
+        """True, even without a map. Ask `len` or `status` whether there are maps."""
+        return True
+
+    def __iter__(self) -> Iterator[SSHMap]:
+        return iter(self.maps)
+
+    @overload
+    def __getitem__(self, index: int) -> SSHMap: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[SSHMap, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> SSHMap | tuple[SSHMap, ...]:
+        """The map at a position, or a tuple of maps for a slice. Raises RangeError."""
+        if isinstance(index, slice):
+            return self.maps[index]
+        return self.maps[checked_index(index, len(self.maps), "maps")]

@@ -16,8 +16,17 @@ from typing import Any
 from ssh_abduction.data.checks import a_path
 from ssh_abduction.data.errors import MapError, brief, is_writable, named
 from ssh_abduction.data.files import HalfCharacter, NotFinite, parse_json, save_file
-from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
-from ssh_abduction.data.regions import Region
+from ssh_abduction.data.map_parts import (
+    FAULTS,
+    NAMED,
+    DState,
+    Fault,
+    Fit,
+    MapPath,
+    Name,
+    Pose,
+    Region,
+)
 from ssh_abduction.data.schema import FieldReader, Shape
 
 # What files of solutions and of single maps begin with.

@@ -34,8 +34,19 @@ from ssh_abduction.data.map_file import (
     read_json,
     write_map,
 )
-from ssh_abduction.data.map_parts import FAULTS, NAMED, DState, Fault, Fit, MapPath, Name, Pose
-from ssh_abduction.data.regions import Region, renumbered, right_of
+from ssh_abduction.data.map_parts import (
+    FAULTS,
+    NAMED,
+    DState,
+    Fault,
+    Fit,
+    MapPath,
+    Name,
+    Pose,
+    Region,
+    renumbered,
+    right_of,
+)
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted

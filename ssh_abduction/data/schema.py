@@ -18,9 +18,8 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, fields
 from typing import Any, ClassVar, TypeAlias, TypeVar
 
-from ssh_abduction.data.checks import a_text
+from ssh_abduction.data.checks import View, a_text
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_finite, is_writable
-from ssh_abduction.data.observation import View
 
 T = TypeVar("T")
 Shape: TypeAlias = Callable[[Any, str], T]

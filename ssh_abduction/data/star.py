@@ -22,9 +22,8 @@ from functools import lru_cache
 from itertools import combinations, combinations_with_replacement
 from typing import Any, TypeAlias
 
-from ssh_abduction.data.checks import a_number
+from ssh_abduction.data.checks import a_number, finite, numbers_listed, plain_number
 from ssh_abduction.data.errors import TraceError, brief, is_whole
-from ssh_abduction.data.observation import finite, numbers_listed, plain_number
 
 Openings: TypeAlias = tuple[bool, bool, bool, bool]
 Entry: TypeAlias = "float | Gateway | None"

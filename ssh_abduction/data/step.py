@@ -7,14 +7,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ssh_abduction.data.action import Action
-from ssh_abduction.data.checks import a_text, an_instance, an_object
-from ssh_abduction.data.errors import TraceError, brief, said_of
-from ssh_abduction.data.observation import (
+from ssh_abduction.data.checks import (
     View,
+    a_text,
+    an_instance,
+    an_object,
     checked_probability,
     checked_view,
     frozen_image,
 )
+from ssh_abduction.data.errors import TraceError, brief, said_of
 from ssh_abduction.data.odometry import (
     Covariance,
     Displacement,

@@ -7,6 +7,8 @@
 
 A trace file has JSON lines: a header, and then one line for each step, with what was observed and
 the action taken next. See docs/reference/formats.md.
+
+A sidecar file beside it may hold the images as one table.
 """
 
 from __future__ import annotations
@@ -22,12 +24,27 @@ from pathlib import Path
 from typing import Any, overload
 
 from ssh_abduction.data.action import STANDARD_ACTIONS, Action, Kind, TurnDirection
-from ssh_abduction.data.checks import a_list, a_path, a_text, a_whole_number, an_instance, an_object
-from ssh_abduction.data.closure import Closure, checked_closures, closures_among
+from ssh_abduction.data.checks import (
+    View,
+    a_list,
+    a_path,
+    a_text,
+    a_whole_number,
+    an_instance,
+    an_object,
+    checked_probability,
+    checked_view,
+    plain_text,
+)
 from ssh_abduction.data.errors import RangeError, TraceError, brief, checked_index, named
 from ssh_abduction.data.files import json_line, save_file
-from ssh_abduction.data.observation import View, checked_probability, checked_view, plain_text
-from ssh_abduction.data.odometry import Covariance, Odometry
+from ssh_abduction.data.odometry import (
+    Closure,
+    Covariance,
+    Odometry,
+    checked_closures,
+    closures_among,
+)
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.step import Step, as_list, of_actions
 from ssh_abduction.data.trace_file import FORMAT, VERSION, read_trace
@@ -465,3 +482,17 @@ def _dump(value: Mapping[str, Any]) -> str:
             f"trace: expected values that JSON can hold, got {brief(dict(value))} ({error}); "
             f"mend the field"
         ) from None
+
+
+def images_file(trace: Trace) -> Path | None:
+    """Return the path of the sidecar file; None if the trace names none.
+
+    A trace names it relative to its own file, or to the working folder if it has no file.
+    """
+    return Path(trace.source or ".").parent / trace.images if trace.images else None
+
+
+def with_images_named_from(trace: Trace, folder: str | os.PathLike[str]) -> Trace:
+    """Copy a trace that will be saved in another folder, so that it still names its images."""
+    path = images_file(trace)
+    return trace if path is None else replace(trace, images=os.path.relpath(path, folder))

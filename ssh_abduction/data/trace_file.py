@@ -11,10 +11,9 @@ from dataclasses import fields
 from typing import Any, BinaryIO
 
 from ssh_abduction.data.action import Action, parse_action
-from ssh_abduction.data.closure import parse_closures
 from ssh_abduction.data.errors import TraceError, brief, said_of
 from ssh_abduction.data.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, parse_json
-from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.odometry import Odometry, parse_closures
 from ssh_abduction.data.step import Step
 
 FORMAT, VERSION = "ssh-trace", 1

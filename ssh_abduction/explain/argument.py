@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import clingo
 
 from ssh_abduction.checker.checker import check, unchecked
-from ssh_abduction.data.closure import match_in_words
 from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.odometry import match_in_words
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Assumption, Axioms, Piece
 from ssh_abduction.explain.no_map import clashes_of, why_apart

@@ -8,10 +8,10 @@ from typing import NamedTuple, TypeAlias
 
 import clingo
 
-from ssh_abduction.data.closure import closures_among
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.odometry import closures_among
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.solver import POLL, Control, facts
 from ssh_abduction.theory import encodings

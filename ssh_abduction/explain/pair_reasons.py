@@ -23,10 +23,10 @@ from itertools import islice
 from typing import Unpack
 
 from ssh_abduction.data.checks import a_count_of_maps
-from ssh_abduction.data.closure import match_in_words
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.odometry import match_in_words
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.argument import Argument
 from ssh_abduction.explain.axioms import Axioms, Piece

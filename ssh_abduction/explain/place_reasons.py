@@ -22,8 +22,8 @@ from ssh_abduction.checker.region_axioms import known_sides
 from ssh_abduction.checker.side_axioms import RightBranch
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.map_parts import course_named, list_in_words, regions_at
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import course_named, list_in_words, regions_at
 from ssh_abduction.data.schema import PlainData
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits

@@ -40,9 +40,14 @@ from typing import Any, Literal, NoReturn
 
 from ssh_abduction.data.checks import a_list, one_of
 from ssh_abduction.data.errors import MapError, printable
-from ssh_abduction.data.map_parts import signed_path
+from ssh_abduction.data.map_parts import (
+    Region,
+    course_named,
+    named_by_number,
+    right_of,
+    signed_path,
+)
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import Region, course_named, named_by_number, right_of
 from ssh_abduction.data.schema import attributes_of, only_known
 from ssh_abduction.data.trace import View
 from ssh_abduction.data.words import counted

@@ -11,8 +11,8 @@ import networkx as nx
 
 from ssh_abduction.data.checks import needed, one_of
 from ssh_abduction.data.errors import MapError, printable, xml_text
+from ssh_abduction.data.map_parts import course_named, ids_at, list_in_words
 from ssh_abduction.data.maps import DState, SSHMap, checked_map
-from ssh_abduction.data.regions import course_named, ids_at, list_in_words
 from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.headings import Turns, degrees_of

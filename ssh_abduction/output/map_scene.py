@@ -15,8 +15,8 @@ from itertools import pairwise
 from statistics import median
 
 from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.map_parts import Region, course_named, list_in_words
 from ssh_abduction.data.maps import DState, MapPath, SSHMap, checked_map
-from ssh_abduction.data.regions import Region, course_named, list_in_words
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.output.headings import Turns

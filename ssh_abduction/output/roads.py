@@ -14,8 +14,8 @@ from typing import TypeAlias
 
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.map_parts import ids_at
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.regions import ids_at
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.output.headings import Turns
 from ssh_abduction.output.layout import Layout, layout, travelled

@@ -39,8 +39,8 @@ from ssh_abduction.data.checks import a_list, a_text, all_instances, an_instance
 from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.groups import firsts, gathered, indices_of
+from ssh_abduction.data.map_parts import right_of
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
-from ssh_abduction.data.regions import right_of
 from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.words import counted, noun_of
 from ssh_abduction.rivals.listing import Listing

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 from ssh_abduction.data.checks import a_path, a_text, an_instance
-from ssh_abduction.data.corrections_file import named_beside
+from ssh_abduction.data.corrections import named_beside
 from ssh_abduction.data.drives import Drive, pieces_in_words
 from ssh_abduction.data.errors import MapError, brief, named
 from ssh_abduction.data.map_file import read_json

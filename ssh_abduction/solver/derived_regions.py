@@ -20,8 +20,8 @@ from typing import TypeAlias
 
 from clingo import Control, Symbol
 
+from ssh_abduction.data.map_parts import Reason, Region, of_members
 from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_map
-from ssh_abduction.data.regions import Reason, Region, of_members
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.asp.control import new_control

@@ -17,9 +17,8 @@ from itertools import groupby
 from typing import TYPE_CHECKING, get_args
 
 from ssh_abduction.data.checks import an_instance, one_of
-from ssh_abduction.data.drives import Drive, drives_of, with_named_faults
+from ssh_abduction.data.drives import Drive, drives_of, with_floors, with_named_faults
 from ssh_abduction.data.errors import SolverError, TheoryError, brief
-from ssh_abduction.data.floors import with_floors
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted

@@ -17,8 +17,7 @@ from itertools import product
 
 from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
 
-from ssh_abduction.data.drives import starts_of
-from ssh_abduction.data.floors import stretches_of
+from ssh_abduction.data.drives import starts_of, stretches_of
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import FAULTS, DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Action, Trace, View

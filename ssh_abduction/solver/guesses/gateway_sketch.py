@@ -30,9 +30,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Self
 
-from ssh_abduction.data.gateways import Sight, allowed_headings, are_opposite, frames_that_fit
+from ssh_abduction.data.gateways import (
+    Sight,
+    allowed_headings,
+    are_opposite,
+    frames_that_fit,
+    leads,
+)
 from ssh_abduction.data.maps import DState, SSHMap
-from ssh_abduction.data.rotations import leads
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.solver.guesses.sketch import Contradiction, Sketch

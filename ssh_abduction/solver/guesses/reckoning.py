@@ -17,10 +17,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.data.closure import Closure
 from ssh_abduction.data.drives import frames_of
 from ssh_abduction.data.groups import gathered
-from ssh_abduction.data.odometry import Displacement, Odometry
+from ssh_abduction.data.odometry import Closure, Displacement, Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.geometry.equations import noises, spreads_of

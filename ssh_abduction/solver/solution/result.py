@@ -13,11 +13,16 @@ from typing import Any
 
 from ssh_abduction.checker.claims import contradictions
 from ssh_abduction.data.checks import a_whole_number, one_of
-from ssh_abduction.data.drives import Drive, drives_of, with_fingerprints, with_named_faults
+from ssh_abduction.data.drives import (
+    Drive,
+    MapSequence,
+    drives_of,
+    with_fingerprints,
+    with_named_faults,
+)
 from ssh_abduction.data.errors import MapError, SolverError, brief, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import SOLUTION_FORMAT, VERSION, check_format, read_json, write_map
-from ssh_abduction.data.map_sequence import MapSequence
 from ssh_abduction.data.maps import SSHMap, check_of_trace, maps_of
 from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.data.trace import Trace, checked_trace

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 from typing import ClassVar
 
-from ssh_abduction.data.floors import stretches_of
+from ssh_abduction.data.drives import stretches_of
 from ssh_abduction.data.groups import gathered, way
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace

@@ -19,8 +19,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, ClassVar
 
-from ssh_abduction.data.closure import Closure
-from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.odometry import Closure, Odometry
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.protocol import Evidence, remembered

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from clingo import Control, Model
 
-from ssh_abduction.data.floors import stretches_of
+from ssh_abduction.data.drives import stretches_of
 from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.solver.asp.facts import preferred, read_atom
 from ssh_abduction.solver.steps.chart import FramedChart
