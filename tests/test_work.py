@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import time
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.cli import main
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.runtime.clock import counting, look_at_clock, now, work_done
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
@@ -47,6 +49,30 @@ def test_one_work_limit_gives_one_answer(work: float, theory: Theory) -> None:
 def test_work_limit_out_of_range_is_refused(work: Any) -> None:
     with pytest.raises(SolverError, match=r"^work_limit \(--work-limit\): expected a number"):
         solve(Trace.load(ROUTE), work_limit=work)
+
+
+@pytest.mark.parametrize("limits", [["--work-limit", "0.05"], ["--work-limit", "0.3"]], ids=str)
+def test_command_prints_one_answer_for_one_work_limit(
+    limits: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Alone, and in a batch."""
+    assert main(["solve", str(ROUTE), "--json", *limits]) in (0, 10)
+    alone = json.loads(capsys.readouterr().out)
+    assert main(["solve", str(ROUTE), str(ROUTE), "--jobs", "2", "--json", *limits]) in (0, 10)
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    untimed = [{k: v for k, v in line.items() if k not in ("seconds", "trace")} for line in lines]
+    del alone["seconds"]
+    assert 0 < alone["work"] < 1
+    for answer in (alone, *untimed):
+        # A batch does not prove what all maps share, so it does less work.
+        for name in ("work", "backbone", "summary"):
+            answer.pop(name, None)
+    assert untimed == [alone, alone]
+
+
+def test_work_limit_of_a_front_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", str(ROUTE), "--front", "1", "--work-limit", "1"]) == 1
+    assert "--work-limit: expected none with --front" in capsys.readouterr().err
 
 
 def test_work_is_counted_inside_counting_only() -> None:

@@ -76,6 +76,7 @@ class SolveQuestion(FileQuestion):
 
     theory: Theory
     limit: float | None  # seconds for each trace; None for no limit
+    work: float | None  # units of work for each trace; None for no limit
     maps: int  # the largest number of maps to list; 0 for all
     memory: int | None  # MiB that the process may use; None for no limit
     speedups: Speedups  # flags that say which speed-ups to use
@@ -131,6 +132,7 @@ class SolveQuestion(FileQuestion):
             trace,
             self.theory,
             time_limit=self.limit,
+            work_limit=self.work,
             max_maps=self.maps or None,
             within=self.within,
             _start=Start(reasons=self.json),
@@ -190,7 +192,7 @@ class SolveQuestion(FileQuestion):
 
     def hurried(self, known: Known | None) -> SolveQuestion:
         """Implement `FileQuestion.hurried`: give the search little time."""
-        return replace(self, limit=min(self.limit or HURRY, HURRY))
+        return replace(self, limit=min(self.limit or HURRY, HURRY), work=None)
 
     def warned(self, answer: FileAnswer, path: str, warning: str) -> FileAnswer:
         return replace(answer, warnings=(*answer.warnings, f"{named(path)}: {warning}"))
@@ -236,6 +238,7 @@ def run(options: argparse.Namespace) -> int:
     question = SolveQuestion(
         theory_of(options),
         limit=options.time_limit,
+        work=options.work_limit,
         maps=options.maps,
         memory=options.memory_limit,
         speedups=Speedups.without(options.without_speedups),

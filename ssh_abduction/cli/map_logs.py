@@ -31,15 +31,17 @@ def add_parser(verbs: Verbs) -> None:
     parser.add("-o --output FOLDER", said, type=output, required=True)
     add_max_maps(parser, "minimal maps", 300)
     parser.add(
-        "--time-limit S",
-        "seconds for the search (default: a twentieth of the time that the robot drove, less the "
-        "time for the import, and less a quarter of the rest for the ladder; at least 30). Without "
-        "this option, a search that has no map after this time goes on for up to 64 times as long",
+        "--work-limit W",
+        "units of work for the search, each about a second of a quiet core; the same map on each "
+        "machine (default: the time limit or, without one, a unit for 20 seconds that the robot "
+        "drove, less a quarter for the ladder, and at least 30; a search that has no map then goes "
+        "on for up to 64 times as long)",
         type=float,
     )
+    parser.add("--time-limit S", "end the search after S seconds in any case", type=float)
     said = (
         "whether to compute how much each kind of evidence helps; this takes up to a quarter of "
-        "--time-limit after the search, or a few seconds if that is more (default: true)"
+        "the work limit after the search, or a few units if that is more (default: true)"
     )
     parser.add_setting("ladder", said, default=True)
     parser.add_setting(

@@ -71,8 +71,9 @@ class MapQuestion(FileQuestion):
     choices: dict[str, Any]  # the fields of the theory that the user set, by name
     reading: dict[str, Any]  # the arguments of `read_log`, by name
     width: float  # the width of the robot, in metres
-    # Seconds for the search for minimal maps; None for the default of `map_log`.
-    limit: float | None
+    limit: float | None  # seconds after which the search ends in any case; None for no limit
+    # Units of work for the search for minimal maps; None for the default of `map_log`.
+    work: float | None
     maps: int  # the largest number of maps to list; 0 for all
     ladder: bool  # whether to compute what each kind of evidence contributes
     # Names and corrections of a person, to be obeyed; None for none.
@@ -92,7 +93,7 @@ class MapQuestion(FileQuestion):
         The run counts as interrupted, so that the next call maps the log again.
         """
         maps = () if known is None else (known,)
-        return replace(self, limit=HURRY, ladder=False, known=maps)
+        return replace(self, limit=HURRY, work=HURRY, ladder=False, known=maps)
 
     def obeying(self, folder: Path) -> MapQuestion:
         """Return this question with the corrections in a folder, if any. Raises MapError."""
@@ -106,7 +107,7 @@ class MapQuestion(FileQuestion):
         return {
             "theory": self.theory.to_dict() if self.theory else None,
             "choices": {name: laid_over[name] for name in self.choices},
-            **attributes_of(self, "reading", "width", "limit", "maps", "ladder"),
+            **attributes_of(self, "reading", "width", "limit", "work", "maps", "ladder"),
             **({} if self.corrections is None else {"corrections": to_yaml(self.corrections)}),
         }
 
@@ -216,6 +217,7 @@ class MapQuestion(FileQuestion):
                 width=self.width,
                 name=names if len(logs) > 1 else names[0],
                 time_limit=self.limit,
+                work_limit=self.work,
                 max_maps=self.maps or None,
                 with_ladder=self.ladder,
                 corrections=self.corrections,
@@ -300,12 +302,14 @@ def run(options: argparse.Namespace) -> int:
             "; leave it out for 300"
         )
     check_limit("--time-limit", "seconds", options.time_limit)
+    check_limit("--work-limit", "units of work", options.work_limit)
     check_folder(Path(options.output))
     question = MapQuestion(
         *_theory(options),
         reading=reading_of(options),
         width=options.width or WIDTH,
         limit=options.time_limit,
+        work=options.work_limit,
         maps=options.maps,
         ladder=options.ladder,
     )

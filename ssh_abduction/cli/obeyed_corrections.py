@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -30,6 +31,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.solver import (
+    Limits,
     Solution,
     Status,
     obeyed,
@@ -116,13 +118,18 @@ class Obeying:
         """Return a solution whose maps have the names that a person gave."""
         return with_names(self.corrections, solution, self.trace)
 
-    def finished(self, solution: Solution, limit: float | None) -> Solution:
+    def finished(self, solution: Solution, limits: Limits) -> Solution:
         """Add names, and warn of drives that share no place because of a corrected gateway."""
+        counts = limits.work_limit is not None
+        limit = limits.work_limit if counts else limits.time_limit
+        spent = solution.effort.work if counts else solution.seconds.total
+        left = math.inf if limit is None else limit - (spent or 0.0)
 
-        def find(trace: Trace, theory: Theory, seconds: float) -> Solution:
-            return solve(trace, theory, max_maps=1, time_limit=seconds)
+        def find(trace: Trace, theory: Theory, most: float) -> Solution:
+            limited: dict[str, Any] = {"work_limit" if counts else "time_limit": most}
+            return solve(trace, theory, max_maps=1, **limited)
 
-        return with_correction_warnings(self.corrections, self.with_names(solution), limit, find)
+        return with_correction_warnings(self.corrections, self.with_names(solution), left, find)
 
     def blamed(self, solution: Solution, explanation: Explanation | None) -> list[str]:
         """List the corrections that may be the reason why the trace has no map.

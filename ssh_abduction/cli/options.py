@@ -104,14 +104,22 @@ def helps() -> dict[str, str]:
     return {name: text[0].lower() + text[1:] for name, text in words.items()}
 
 
-def add_limits(parser: Parser, printed: str, seconds: float | None = None) -> None:
+def add_limits(
+    parser: Parser, printed: str, seconds: float | None = None, work: bool = False
+) -> None:
     """Add the options that limit a search. The command prints `printed` at a limit.
 
-    `seconds` is the default time limit; None for no limit.
+    `seconds` is the default time limit; None for no limit. `work` says whether work can be limited.
     """
     default = "" if seconds is None else f" (default: {seconds:g}; inf for no limit)"
     said = f"stop after S seconds and print {printed}{default}"
     parser.add("--time-limit S", said, type=float, default=seconds)
+    if work:
+        said = (
+            "stop after W units of work, each about a second of a quiet core; the same answer on "
+            "each machine and under each load"
+        )
+        parser.add("--work-limit W", said, type=float)
     said = f"stop when the process has used this many MiB, and print {printed}"
     parser.add("--memory-limit MIB", said, type=int)
 

@@ -22,6 +22,7 @@ from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.learning.runner_up import second_map
 from ssh_abduction.runtime import program
+from ssh_abduction.runtime.clock import counting
 from ssh_abduction.solver import Backbone, Cost, Search, Solution, Status, Watch
 from ssh_abduction.solver import ending as written_ending
 from ssh_abduction.solver import opening as written_opening
@@ -52,14 +53,16 @@ def why_no_map(search: Search) -> Explanation | None:
     """
     if search.status is not Status.UNSATISFIABLE or search.theory.jumped:
         return None
-    watch = Watch(EXPLAINING, clock=time.thread_time)
+    counts = search.limits.work_limit is not None
+    watch = Watch(work=EXPLAINING) if counts else Watch(EXPLAINING, clock=time.thread_time)
     watch.start()
 
     def over() -> bool:
         return search.over() and not watch.allows(0)
 
     try:
-        return explain(search.trace, search.theory, over, search.clash)
+        with counting(counts):
+            return explain(search.trace, search.theory, over, search.clash)
     except Interrupted:
         clash = search.clash
         return Explanation(clash.start, clash.stop - 1, ()) if clash else None
@@ -118,14 +121,14 @@ class Warnings:
         """Warn if the runner-up's views give another map, if there is time to solve it."""
         if self._second is None:
             search, limits = self._search, self._search.limits
-            limit = limits.time_limit
+            limit, work = limits.time_limit, limits.work_limit
             left = None if limit is None else limit - solution.seconds.total
-            if solution.stopped not in (None, "maps limit") or (
-                left is not None and left < LEAST_LEFT
-            ):
+            rest = None if work is None else work - (solution.effort.work or 0.0)
+            is_over = any(x is not None and x < LEAST_LEFT for x in (left, rest))
+            if solution.stopped not in (None, "maps limit") or is_over:
                 return []
             known = [*solution.maps, *([search.best] if search.best else [])]
-            found = second_map(search.trace, known, search.theory, left, limits.memory_limit)
+            found = second_map(search.trace, known, search.theory, left, limits.memory_limit, rest)
             self._second = [found.sentence] if found else []
         return self._second
 

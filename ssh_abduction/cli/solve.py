@@ -108,7 +108,7 @@ def add_parser(verbs: Verbs) -> None:
         "further faults save few dstates",
         type=int,
     )
-    add_limits(parser, "the best answer so far")
+    add_limits(parser, "the best answer so far", work=True)
     add_jobs(
         parser,
         "solve",
@@ -153,6 +153,11 @@ def run(options: argparse.Namespace) -> int:
             "--corrections: expected one trace, or --together, got many traces, --jobs, "
             "--scheduler or --front; leave it out"
         )
+    if options.front is not None and options.work_limit is not None:
+        raise AbductionError(
+            "--work-limit: expected none with --front, which searches once for each number of "
+            "faults; give --time-limit"
+        )
     if options.front is not None:
         from ssh_abduction.cli import solve_front
 
@@ -194,6 +199,7 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
                 obeying.trace,
                 obeying.theory,
                 time_limit=options.time_limit,
+                work_limit=options.work_limit,
                 max_maps=options.maps or None,
                 within=options.within,
                 _start=Start(reasons=True),
@@ -221,7 +227,7 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
             )
             until_printed.enter_context(guard)
             explanation = printed.searched(guard.say)
-        solution = obeying.finished(search.solution(tuple(printed.kept)), options.time_limit)
+        solution = obeying.finished(search.solution(tuple(printed.kept)), search.limits)
 
         def save() -> None:
             options.json = False  # the JSON is complete: a later error must not follow it

@@ -34,6 +34,7 @@ def run(options: argparse.Namespace) -> int:
         theory_of(options, existing.theory.replace(returns=0)),
         onto=existing,
         time_limit=options.time_limit,
+        work_limit=options.work_limit,
         max_maps=options.maps or None,
         within=options.within,
         memory_limit=options.memory_limit,

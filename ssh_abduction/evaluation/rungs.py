@@ -97,12 +97,23 @@ class UnderWay:
         return self.search.snapshot("interrupted")
 
     def solve(
-        self, trace: Trace, theory: Theory, *, time_limit: float | None, max_maps: int | None
+        self,
+        trace: Trace,
+        theory: Theory,
+        *,
+        time_limit: float | None,
+        max_maps: int | None,
+        work_limit: float | None = None,
     ) -> Solution:
         """Solve a trace as `ssh_abduction.solve` does. Ctrl-C ends this and all later searches."""
         theory.check_steps(trace)
         self.search = Search(
-            trace, theory, time_limit=time_limit, max_maps=max_maps, _start=self._start
+            trace,
+            theory,
+            time_limit=time_limit,
+            work_limit=work_limit,
+            max_maps=max_maps,
+            _start=self._start,
         )
         if self.interrupted:  # perhaps before there was a search
             self.search.interrupt()
@@ -139,6 +150,7 @@ def ladder(
     theory: Theory | None = None,
     *,
     time_limit: float | None = None,
+    work_limit: float | None = None,
     max_maps: int | None = 100,
     stars: bool = True,
     known: Solution | None = None,
@@ -151,6 +163,7 @@ def ladder(
         theory: The theory to start from; Theory.topological() by default. The ladder replaces what
             it says about stars, displacements and planarity.
         time_limit: Seconds for each rung; None for no limit.
+        work_limit: Units of work for each rung, as in `solve`; None for no limit.
         max_maps: List and evaluate at most this many minimal maps on each rung; None for all.
         stars: Whether there is a rung for stars, if the trace has some.
         known: A solution of this trace. The rung with the same theory uses it and is not solved
@@ -165,6 +178,7 @@ def ladder(
     checked_trace(trace)
     start = checked_theory(theory)
     check_limit("time_limit", "seconds", time_limit)
+    check_limit("work_limit", "units of work", work_limit)
     a_count_of_maps(max_maps, SolverError)
     a_flag("stars", stars, TheoryError)
     if known is not None:
@@ -181,7 +195,13 @@ def ladder(
             solution = (
                 known
                 if known and known.theory == settle(trace, chosen).theory
-                else work.solve(trace, chosen, time_limit=time_limit, max_maps=max_maps)
+                else work.solve(
+                    trace,
+                    chosen,
+                    time_limit=time_limit,
+                    work_limit=work_limit,
+                    max_maps=max_maps,
+                )
             )
             is_judged = has_truth and solution.maps and not work.interrupted
             yield Rung(name, solution, evaluate(solution.maps, trace) if is_judged else None)

@@ -94,19 +94,26 @@ def second_map(
     theory: Theory | None = None,
     limit: float | None = None,
     memory: int | None = None,
+    work: float | None = None,
 ) -> SecondMap | None:
     """Solve the trace with the runner-up's views. Return the result if its maps differ.
 
     `maps` are the minimal maps of the chosen views. Return None if the trace has no runner-up, or
     if one of its maps puts the same steps at the same dstates and places as one of `maps`. The
-    search takes `limit` seconds, at most SECONDS. `memory` is in MiB, as in `solve`. Raises
-    TraceError if the views of the runner-up are malformed.
+    search takes `limit` seconds or, if given, `work` units of work, at most SECONDS. `memory` is in
+    MiB, as in `solve`. Raises TraceError if the views of the runner-up are malformed.
     """
     other = runner_up(trace)
     if other is None:
         return None
-    limit = SECONDS if limit is None else min(limit, SECONDS)
-    solution = solve(other, theory, time_limit=limit, memory_limit=memory)
+    most = SECONDS if limit is None else min(limit, SECONDS)
+    solution = solve(
+        other,
+        theory,
+        time_limit=most if work is None else limit,
+        work_limit=None if work is None else min(work, SECONDS),
+        memory_limit=memory,
+    )
     # The maps are the same if they put the same steps at the same dstates and places.
     if {partition(m) for m in maps} & {partition(m) for m in solution.maps}:
         return None

@@ -171,7 +171,7 @@ class LogMap:
         """Make the files of the run's folder: a dict from names to contents, run.json last."""
         trace, solution = self.imported.trace, self.solution
         if not self.interrupted:
-            shared = find_backbone(solution, trace, time_limit=self.limit)
+            shared = find_backbone(solution, trace, work_limit=self.limit)
             solution = replace(solution, shared=shared)
         found = {
             "trace.jsonl": "".join(f"{line}\n" for line in trace.to_lines()),
@@ -218,16 +218,16 @@ def seconds_driven(log: RobotLog) -> float | None:
     return math.fsum(step for step in steps if 0 < step < GAP * usual) or None
 
 
-def seconds_left(log: RobotLog, imported: Imported) -> float:
-    """Compute the seconds that remain for mapping a log; negative if the import took too long.
+def work_for(log: RobotLog, imported: Imported) -> float:
+    """Compute the units of work for mapping a log: a twentieth of the seconds that it drove.
 
-    Import and mapping together should take a twentieth of the time that the robot drove.
+    The time of the import does not count, so that a log gets the same work on each machine.
     """
     metres = float(imported.track.way[-1])
     drove = seconds_driven(log)
     if drove is None or metres < SLOWEST * drove:
         drove = metres / SPEED
-    return SHARE * drove - math.fsum(imported.seconds.values())
+    return SHARE * drove
 
 
 def how_it_ended(solution: Solution, allowed: float) -> str | None:
@@ -240,12 +240,14 @@ def how_it_ended(solution: Solution, allowed: float) -> str | None:
             f"No map satisfies the axioms. {let} why: ssh-abduction explain FOLDER, with the "
             "folder of this map."
         )
-    if solution.stopped != "time limit" or solution.status is Status.OPTIMAL:
+    if solution.stopped not in ("time limit", "work limit") or solution.status is Status.OPTIMAL:
         return None
     missing = "a proof" if solution.maps else "a map"
+    if solution.stopped == "time limit":
+        return f"The search ended at the time limit without {missing}. Give it more seconds."
     return (
-        f"The search ended after {allowed:.0f} s without {missing}. To search longer, give a limit:"
-        f" --time-limit {math.ceil(LONGER * allowed / 10) * 10}."
+        f"The search ended after {allowed:.0f} units of work without {missing}. To search longer, "
+        f"give a limit: --work-limit {math.ceil(LONGER * allowed / 10) * 10}."
     )
 
 
@@ -276,6 +278,7 @@ def map_log(
     width: float = WIDTH,
     name: str | Sequence[str] | None = None,
     time_limit: float | None = None,
+    work_limit: float | None = None,
     max_maps: int | None = MAPS,
     with_ladder: bool = True,
     corrections: Corrections | None = None,
@@ -295,10 +298,12 @@ def map_log(
         width: The width of the robot in metres. It cannot pass narrower parts of the free space.
         name: The name of the trace, or the names of the drives. None for no name, or for "drive 1",
             "drive 2" and so on.
-        time_limit: Seconds for the search for minimal maps. None takes a twentieth of the time that
-            the robot drove, minus the time of the import, but at least 30 s. If no map is found
-            then, the search may take up to 64 times as long. The ladder gets a quarter of this
-            time, but at least a second for each kind of evidence.
+        time_limit: Seconds after which the search ends in any case; None for no limit.
+        work_limit: Units of work for the search for minimal maps, each about a second of a quiet
+            core. One log and work limit give one map on each machine. None takes the time limit, or
+            a unit for 20 seconds that the robot drove, but at least 30; if no map is found then,
+            the search may do up to 64 times as much. The ladder gets a quarter of this work, but
+            at least a unit for each kind of evidence.
         max_maps: List at most this many minimal maps; None lists all.
         with_ladder: Whether to solve the trace with fewer kinds of evidence, too, to show what each
             kind contributes.
@@ -324,10 +329,10 @@ def map_log(
         imported = replace(imported, trace=trace)
     _log.info("%d visits, %d steps", len(imported.visits), len(trace))
 
-    # 2. Time as it suits the log.
-    left = seconds_left(log, imported)
-    by_drive = max(left * (1 - LADDER if with_ladder else 1), LEAST)
-    allowed = by_drive if time_limit is None else time_limit
+    # 2. Work as it suits the log.
+    by_drive = max(work_for(log, imported) * (1 - LADDER if with_ladder else 1), LEAST)
+    given = time_limit if work_limit is None else work_limit
+    allowed = by_drive if given is None else given
     climbed: list[Rung] = []
 
     def outcome(solution: Solution, interrupted: bool = True) -> LogMap:
@@ -344,31 +349,33 @@ def map_log(
     # 3. Maps: solve the trace.
     mapping.latest = lambda: outcome(mapping.snapshot())
     begin = time.process_time()
-    solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
-    tries = 0 if time_limit is not None else PATIENCE
+    limits: dict[str, Any] = {"time_limit": time_limit, "max_maps": max_maps}
+    solution = mapping.solve(trace, chosen, work_limit=allowed, **limits)
+    tries = 0 if given is not None else PATIENCE
     while solution.status is Status.UNKNOWN and tries and not mapping.interrupted:
         allowed, tries = allowed * LONGER, tries - 1
-        tell(f"No map was found yet. The search goes on for up to {allowed:.0f} s.")
-        solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
+        tell(f"No map was found yet. The search goes on for up to {allowed:.0f} units of work.")
+        solution = mapping.solve(trace, chosen, work_limit=allowed, **limits)
     mapping.latest = lambda: outcome(solution)
     if corrections is not None:
 
         def best(trace: Trace, theory: Theory, seconds: float) -> Solution:
-            return mapping.solve(trace, theory, time_limit=seconds, max_maps=1)
+            return mapping.solve(trace, theory, time_limit=None, work_limit=seconds, max_maps=1)
 
-        solution = with_correction_warnings(corrections, solution, allowed, best)
+        solution = with_correction_warnings(
+            corrections, solution, allowed - (solution.effort.work or 0.0), best
+        )
     seconds["maps"] = round(time.process_time() - begin, 3)
 
     # 4. Ladder: what each kind of evidence is worth.
     if with_ladder and not mapping.interrupted:
         begin, stars = time.process_time(), chosen.star != "none"
-        rest = left - seconds["maps"] if time_limit is None else LADDER * time_limit
-        share = rest / len(list(rungs(trace, chosen, stars)))
+        share = LADDER * allowed / len(list(rungs(trace, chosen, stars)))
         most = min(max(share, LEAST_RUNG), RUNG)
         climbed += ladder(
             trace,
             chosen,
-            time_limit=most,
+            work_limit=most,
             max_maps=1,
             stars=stars,
             known=solution,

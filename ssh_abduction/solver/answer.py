@@ -72,6 +72,7 @@ class Answer:
                 seconds,
                 asker.grounding if grounding is None else grounding,
                 said_by(kinds, task.trace, task.theory, known.refused),
+                parts.watch.elapsed() if parts.watch.counts_work else None,
             ),
             stopped=known.stopped,
             partial=None if known.best else known.partial,

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.corrections import Corrections
@@ -122,7 +123,7 @@ def solve(
     if onto is not None:
         with counting(watch.counts_work):
             solution = solve_onto(joint, onto, theory, corrections, Solving(find, speedups, watch))
-        return _with_warnings(solution, corrections, time_limit, memory_limit)
+        return _with_warnings(solution, corrections, watch, memory_limit)
     theory = checked_theory(theory)
     theory.check_steps(joint)
     if corrections is not None:
@@ -130,23 +131,24 @@ def solve(
     solution = find(joint, theory)
     if corrections is not None:
         solution = with_names(corrections, solution, joint)
-    return _with_warnings(solution, corrections, time_limit, memory_limit)
+    return _with_warnings(solution, corrections, watch, memory_limit)
 
 
 def _with_warnings(
     solution: Solution,
     corrections: Corrections | None,
-    time_limit: float | None,
+    watch: Watch,
     memory_limit: int | None,
 ) -> Solution:
     """Add warnings about drives that share no place, and log them."""
 
-    def find(trace: Trace, theory: Theory, seconds: float) -> Solution:
-        search = Search(trace, theory, time_limit=seconds, max_maps=1, memory_limit=memory_limit)
+    def find(trace: Trace, theory: Theory, left: float) -> Solution:
+        limit: dict[str, Any] = {"work_limit" if watch.counts_work else "time_limit": left}
+        search = Search(trace, theory, max_maps=1, memory_limit=memory_limit, **limit)
         return search.solution(tuple(search))
 
     if corrections is not None:
-        solution = with_correction_warnings(corrections, solution, time_limit, find)
+        solution = with_correction_warnings(corrections, solution, watch.left(), find)
     if solution.maps and len(joined_drives(solution.drives, solution.maps[0])) > 1:
         _log.warning("%s", solution.joined)
     for warning in solution.support.correction_warnings:
@@ -160,6 +162,7 @@ def find_backbone(
     *,
     time_limit: float | None = None,
     memory_limit: int | None = None,
+    work_limit: float | None = None,
 ) -> Backbone | None:
     """Find the backbone: what all minimal maps share, also those that the solution does not list.
 
@@ -178,6 +181,7 @@ def find_backbone(
             its trace.
         time_limit: Seconds of wall-clock time; None for no limit.
         memory_limit: MiB of memory that the process may use at its peak; None for no limit.
+        work_limit: Units of work, as in `solve`; None for no limit.
 
     Returns:
         The backbone; None if no minimal map is known. It is not `proven` if a limit or Ctrl-C
@@ -190,6 +194,7 @@ def find_backbone(
     an_instance("solution", solution, Solution, SolverError, mend="take what solve returned")
     check_limit("time_limit", "seconds", time_limit)
     check_limit("memory_limit", "MiB", memory_limit)
+    check_limit("work_limit", "units of work", work_limit)
     trace = solution.trace if trace is None else checked_trace(trace)
     minimal, known = solution.minimal_maps, solution.backbone
     if known is None or known.proven or not minimal or solution.theory.weigh == "cost":
@@ -199,10 +204,14 @@ def find_backbone(
     views = "functional_view" in solution.theory.hard
     check_of_trace(minimal, trace, "solution", views=views)
     sharing = Sharing(minimal)
-    watch = Watch(time_limit, memory_limit)
+    watch = Watch(time_limit, memory_limit, work=work_limit)
     watch.start()
     cost, proven = solution.costs[0].preferred_by(solution.theory), False
-    with suppress(LimitError, KeyboardInterrupt), heeding(watch.check):
+    with (
+        suppress(LimitError, KeyboardInterrupt),
+        counting(watch.counts_work),
+        heeding(watch.check),
+    ):
         task = Task.of(Problem.of(trace, solution.theory), watch)
         mends = row("mending").holds_for(task.theory) and may_name(task)
         if mends and len(task.trace) > READABLE:  # no engine finds the maps of such a search

@@ -69,7 +69,7 @@ def with_names(corrections: Corrections, solution: Solution, trace: Trace) -> So
 def with_correction_warnings(
     corrections: Corrections,
     solution: Solution,
-    limit: float | None,
+    left: float,
     find: Callable[[Trace, Theory, float], Solution],
 ) -> Solution:
     """Add warnings about drives that contradict a corrected gateway, and about unused names.
@@ -80,15 +80,15 @@ def with_correction_warnings(
     Args:
         corrections: The corrections that the solution obeys.
         solution: The solution, with its trace.
-        limit: The time limit of the search in seconds; None for none.
-        find: Finds a map of a trace and a theory in some seconds. It is called once, without
+        left: The seconds, or units of work, that are left; infinity without a limit.
+        find: Finds a map of a trace and a theory in that much time. It is called once, without
             corrections of gateways, if the correction may keep a drive from the place.
     """
     said = [*_unused_names(corrections, solution)]
     if corrections.gateways and solution.stopped != "interrupted":
-        left = DOUBTING if limit is None else min(limit - solution.seconds.total, DOUBTING)
+        most = max(min(left, DOUBTING), SHORTEST)
         said += _contradictions(
-            corrections, solution, lambda trace, theory: find(trace, theory, max(left, SHORTEST))
+            corrections, solution, lambda trace, theory: find(trace, theory, most)
         )
     return replace(solution, support=replace(solution.support, correction_warnings=tuple(said)))
 

@@ -183,8 +183,8 @@ class Search:
             trace,
             theory,
             time_limit=time_limit,
-            max_maps=max_maps,
             work_limit=work_limit,
+            max_maps=max_maps,
             speedups=speedups,
             _start=Start(after=after._parts if after else None, minimal=minimal),
         )

@@ -184,12 +184,14 @@ class Effort:
         grounding: The size of the ground program that clingo solved last.
         evidence: For each kind of evidence, by name, two numbers: "pairs" of steps that it
             excluded, and sets of equalities that it rejected ("refused").
+        work: The units of work that the search did; None if it had no work limit.
     """
 
     prefix: int
     seconds: Seconds = field(compare=False)
     grounding: Grounding = field(default=Grounding(0, 0), compare=False)
     evidence: Mapping[str, Mapping[str, int]] = field(default_factory=dict, hash=False)
+    work: float | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

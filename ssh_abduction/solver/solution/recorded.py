@@ -203,6 +203,7 @@ def effort_in(read: FieldReader, record: Mapping[str, Any]) -> Effort:
         seconds=read.record(Seconds, record.get("seconds", {}), "seconds", **times),
         grounding=read.record(Grounding, record.get("grounding", {}), "grounding", **sizes),
         evidence=counts(record.get("evidence", {}), "evidence"),
+        work=read.maybe(read.not_negative, None)(record.get("work"), "work"),
     )
 
 

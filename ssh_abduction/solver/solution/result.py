@@ -544,6 +544,8 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
             k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")
         },
     }
+    if solution.effort.work is not None:
+        end["work"] = round(solution.effort.work, 6)
     end["summary"] = summary_of(solution, count, backbone)
     recorded = solution.support.recorded
     drives = () if recorded is None else recorded.drives
