@@ -376,23 +376,25 @@ def test_search_without_a_limit_continues_until_it_has_a_map(
     found = Solution.load(runs / "hall" / "maps.json")
 
     def late(self: LogMapping, trace: Trace, theory: Theory, **given: Any) -> Solution:
-        asked.append(given["time_limit"])
+        asked.append(given["work_limit"])
         if len(asked) == 3:
             return found
-        return replace(found, status=Status.UNKNOWN, maps=(), cost=None, stopped="time limit")
+        return replace(found, status=Status.UNKNOWN, maps=(), cost=None, stopped="work limit")
 
     monkeypatch.setattr(LogMapping, "solve", late)
     told: list[str] = []
-    done = map_log(read_log(hall), time_limit=limit, with_ladder=False, tell=told.append)
+    done = map_log(read_log(hall), work_limit=limit, with_ladder=False, tell=told.append)
     assert asked == [asked[0] * 4**k for k in range(searches)]
     if limit is None:
         assert done.solution.maps
         assert (done.limit, done.notes) == (asked[-1], ())
-        assert told[-1] == f"No map was found yet. The search goes on for up to {asked[-1]:.0f} s."
+        assert told[-1] == (
+            f"No map was found yet. The search goes on for up to {asked[-1]:.0f} units of work."
+        )
     else:
         assert done.notes[-1] == (
-            "The search ended after 5 s without a map. To search longer, give a limit: "
-            "--time-limit 20."
+            "The search ended after 5 units of work without a map. To search longer, give a "
+            "limit: --work-limit 20."
         )
 
 
@@ -407,13 +409,13 @@ def test_search_without_a_limit_continues_until_it_has_a_map(
 def test_ladder_takes_a_quarter_of_the_limit(
     limit: float, rung: float, runs: Path, hall: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """There are four rungs, each with at least one second and at most ten."""
+    """There are four rungs, each with at least one unit of work and at most ten."""
     found, asked = Solution.load(runs / "hall" / "maps.json"), list[float]()
     monkeypatch.setattr(LogMapping, "solve", lambda *args, **given: found)
     monkeypatch.setattr(
-        log_maps, "ladder", lambda *args, **given: asked.append(given["time_limit"]) or []
+        log_maps, "ladder", lambda *args, **given: asked.append(given["work_limit"]) or []
     )
-    map_log(read_log(hall), time_limit=limit)
+    map_log(read_log(hall), work_limit=limit)
     assert asked == [rung]
 
 

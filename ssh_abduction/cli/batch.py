@@ -76,12 +76,12 @@ class SolveQuestion(FileQuestion):
 
     theory: Theory
     limit: float | None  # seconds for each trace; None for no limit
-    work: float | None  # units of work for each trace; None for no limit
     maps: int  # the largest number of maps to list; 0 for all
     memory: int | None  # MiB that the process may use; None for no limit
     speedups: Speedups  # flags that say which speed-ups to use
     json: bool  # whether lines are JSON
     within: int = 0  # the number of dstates by which a listed map may exceed the minimum
+    work: float | None = None  # units of work for each trace; None for no limit
 
     patience: ClassVar = 3.0
     killed: ClassVar = (

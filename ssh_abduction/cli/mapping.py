@@ -72,14 +72,14 @@ class MapQuestion(FileQuestion):
     reading: dict[str, Any]  # the arguments of `read_log`, by name
     width: float  # the width of the robot, in metres
     limit: float | None  # seconds after which the search ends in any case; None for no limit
-    # Units of work for the search for minimal maps; None for the default of `map_log`.
-    work: float | None
     maps: int  # the largest number of maps to list; 0 for all
     ladder: bool  # whether to compute what each kind of evidence contributes
     # Names and corrections of a person, to be obeyed; None for none.
     corrections: Corrections | None = None
     # The best maps of a process that mapped the log and was killed; None if none was killed.
     known: tuple[SSHMap, ...] | None = None
+    # Units of work for the search for minimal maps; None for the default of `map_log`.
+    work: float | None = None
 
     patience: ClassVar = 10.0
     killed: ClassVar = (
