@@ -258,7 +258,7 @@ def _numbered(labels: ArrayLike, count: int | None = None) -> Integers:
     return np.unique(of, return_inverse=True)[1].astype(np.intp)
 
 
-def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
+def confidence(X: ArrayLike, labels: ArrayLike) -> Floats:
     """Compute how surely each image belongs to its view.
 
     Let `own` be the distance from an image to the centre of the other images of its view, and
@@ -297,7 +297,7 @@ def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
     return sure
 
 
-def nearest_views(X: ArrayLike, labels: ArrayLike) -> NDArray[np.intp]:
+def nearest_views(X: ArrayLike, labels: ArrayLike) -> Integers:
     """Give each image without a view the view with the nearest centre.
 
     Args:
@@ -363,14 +363,12 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
         )
 
 
-def _centres(
-    images: NDArray[np.float64], number: NDArray[np.intp], views: int
-) -> NDArray[np.float64]:
+def _centres(images: Floats, number: Integers, views: int) -> Floats:
     """The mean image of each view, (views, d)."""
     return np.array([images[number == view].mean(axis=0) for view in range(views)])
 
 
-def _checked(X: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def _checked(X: ArrayLike, labels: ArrayLike) -> tuple[Floats, Integers]:
     images: Any = check_array(equal_length(X), dtype=np.float64)
     of = np.asarray(labels)
     if of.shape != (len(images),) or not np.issubdtype(of.dtype, np.integer):

@@ -34,8 +34,8 @@ OURS = (
         f"{kind.__module__}.{kind.__qualname__}"
         for kind in (PlaceRecogniser, PanoramaTransformer, ReciprocalTransformer, ViewClusterer)
     ),
-    "perception.clusterings.Predictor",
-    "perception.clusterings.Tried",
+    "perception.views.Predictor",
+    "perception.views.Tried",
 )
 
 

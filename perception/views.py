@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -20,21 +20,15 @@ from sklearn.base import BaseEstimator, ClusterMixin, clone
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import BayesianGaussianMixture, GaussianMixture
-from sklearn.neighbors import KNeighborsClassifier
+from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from perception.clusterings import (
-    Predictor,
-    Tried,
-    cluster_labels,
-    single,
-    smallest_good,
-    to_neighbour,
-)
 from perception.errors import ImageWarning, PerceptionError, equal_length
 from perception.quality import (
     NOISE,
+    Floats,
+    Integers,
     cluster_quality,
     confidence,
     sample_indices,
@@ -45,6 +39,17 @@ from ssh_abduction.data.checks import a_number, a_whole_number, one_of
 from ssh_abduction.data.errors import brief
 from ssh_abduction.runtime.threads import one_thread
 
+# There is a runner-up if trimmed M of the chosen k is below this multiple of the largest trimmed M
+# of the others. docs/measurements/reproduction.md has measurements.
+NEAR = 1.5
+# A larger k is also a runner-up if its trimmed M is at least this, because each of a few distant
+# views can hide several well-separated ones.
+APART = 2.3
+# Values of trimmed M within this factor of the largest count as equal, and the smallest k wins.
+EQUAL = 0.95
+# The distance of an image to its third nearest neighbour decides whether it is isolated. So two or
+# three images of one unusual object are isolated, too.
+NEIGHBOURS = 3
 # Up to this many images, k-means makes all of its starts on all images. Of more images, it makes
 # the starts on a random sample of this size, to limit the time.
 MANY = 5_000
@@ -56,6 +61,83 @@ MOST_STARTS = 10_000
 # The value of `isolated` that `BootstrapLearner` uses when the theory allows wrong views.
 # docs/measurements/reproduction.md has measurements.
 ISOLATED = 10.0
+
+
+@dataclass(frozen=True)
+class Tried:
+    """The clusterings that a ViewClusterer tried, and its choice."""
+
+    k: int  # the chosen number of views
+    # For each number of views k that was tried, M: the gap between clusters divided by their width
+    # (`perception.quality.cluster_quality`).
+    quality: dict[int, float]
+    # The same, but with quantiles instead of extremes (`trimmed_quality`).
+    trimmed: dict[int, float]
+    labels: dict[int, Integers]  # for each k that was tried, the view of each image, (n,)
+
+    @property
+    def runner_up(self) -> int | None:
+        """Another k whose views may make a better map; see `ViewClusterer.runner_up_`."""
+        others = {k: worth for k, worth in self.trimmed.items() if k != self.k}
+        if others and self.trimmed[self.k] < NEAR * max(others.values()):
+            return smallest_good(others)
+        finer = {k: worth for k, worth in others.items() if k > self.k and worth >= APART}
+        return max(finer, key=finer.__getitem__, default=None)
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """Gives views to new images."""
+
+    model: Any  # the fitted clusterer, or a classifier if the clusterer cannot predict
+    # (m, d) the fitted images that are not isolated; empty if the settings isolate none.
+    inside: Floats
+    # An image is isolated if its third nearest neighbour is farther than this.
+    reach: float = math.inf
+
+    def views(self, images: Floats) -> Integers:
+        """Predict the view of each image, (n,); -1 for an isolated image."""
+        views = np.asarray(self.model.predict(images), np.intp)
+        if 0 < self.reach < math.inf:
+            views[to_neighbour(images, self.inside, 0) > self.reach] = NOISE
+        return views
+
+
+def single(fitted: Any, images: Floats, trim: float) -> tuple[Any, Tried]:
+    """Return a fitted clusterer, and a `Tried` that holds its clustering alone."""
+    labels = cluster_labels(fitted, images)
+    inside = labels != NOISE
+    k = len(set(labels[inside].tolist()))
+    measures = math.nan, math.nan
+    if inside.any():
+        some = images[inside], labels[inside]
+        measures = cluster_quality(*some), trimmed_quality(*some, trim)
+    return fitted, Tried(k, {k: measures[0]}, {k: measures[1]}, {k: labels})
+
+
+def smallest_good(worth: dict[int, float]) -> int:
+    """The smallest k whose trimmed M (`worth`) is at least EQUAL times the largest."""
+    return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
+
+
+def cluster_labels(fitted: Any, images: Floats) -> Integers:
+    """The cluster of each fitted image, (n,). Mixtures have no labels_ and predict instead."""
+    return np.asarray(
+        fitted.labels_ if hasattr(fitted, "labels_") else fitted.predict(images), np.intp
+    )
+
+
+def to_neighbour(images: Floats, among: Floats, itself: int) -> Floats:
+    """The distance from each image, (n, d), to its third nearest neighbour `among` (m, d): (n,).
+
+    With fewer neighbours it is the distance to the farthest one. `itself` is 1 if `among`
+    contains the images themselves, otherwise 0.
+    """
+    number = min(NEIGHBOURS + itself, len(among))
+    distances, _ = (
+        NearestNeighbors(n_neighbors=number, algorithm="brute").fit(among).kneighbors(images)
+    )
+    return np.asarray(distances[:, -1])
 
 
 class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
@@ -145,7 +227,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         self.predictor_ = Predictor(model, images[inside] if self.isolated else images[:0], reach)
         return self
 
-    def _fitted(self, images: NDArray[np.float64]) -> tuple[Any, Tried]:
+    def _fitted(self, images: Floats) -> tuple[Any, Tried]:
         """Return the fitted clusterer, and the clusterings that were tried."""
         if (images == images[0]).all():
             warnings.warn(
@@ -163,7 +245,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             _check_distinct(self.k, images)
         return single(self._cluster(images, self.k, seed), images, self.trim)
 
-    def predict(self, X: ArrayLike) -> NDArray[np.intp]:
+    def predict(self, X: ArrayLike) -> Integers:
         """Predict the views of images.
 
         If the clusterer can predict, it does so (k-means: the view with the nearest centre).
@@ -216,7 +298,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return self.tried_.trimmed
 
     @property
-    def labels_by_k_(self) -> dict[int, NDArray[np.intp]]:
+    def labels_by_k_(self) -> dict[int, Integers]:
         """For each number of views k that was tried, the view of each image, (n,)."""
         return self.tried_.labels
 
@@ -231,16 +313,16 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return self.tried_.runner_up
 
     @property
-    def runner_up_labels_(self) -> NDArray[np.intp] | None:
+    def runner_up_labels_(self) -> Integers | None:
         """The view of each image for `runner_up_` views, (n,); None without a runner-up."""
         return None if self.runner_up_ is None else self.labels_by_k_[self.runner_up_]
 
     @property
-    def cluster_centers_(self) -> NDArray[np.float64]:
+    def cluster_centers_(self) -> Floats:
         """(k, d) centres of the views, if the clusterer has them."""
         return np.asarray(self.clusterer_.cluster_centers_)
 
-    def _search(self, images: NDArray[np.float64], seed: int) -> tuple[Any, Tried]:
+    def _search(self, images: Floats, seed: int) -> tuple[Any, Tried]:
         """Try each k. Return the clusterer of the best k, and the clusterings that were tried."""
         tree, chosen = spanning_tree(images), sample_indices(len(images))
         distances = cdist(images[chosen], images[chosen])
@@ -264,7 +346,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         )
         return fitted[best], replace(found, k=best)
 
-    def _cluster(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
+    def _cluster(self, images: Floats, k: int | None, seed: int) -> Any:
         """Fit a clusterer with k views. If k is None, the clusterer chooses the number."""
         if self.clusterer is None:
             return self._k_means(images, k, seed)
@@ -276,7 +358,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             chosen.set_params(random_state=seed)
         return chosen.fit(images)
 
-    def _k_means(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
+    def _k_means(self, images: Floats, k: int | None, seed: int) -> Any:
         """Fit k-means to all images, from the best of several starts."""
         # Rounds are short: on shared cores, two threads would wait for each other longer than they
         # work.
@@ -348,7 +430,7 @@ def as_view_clusterer(clusterer: Any) -> ViewClusterer:
     return checked if size is None else checked.set_params(k=clusterer.get_params()[size])
 
 
-def _check_distinct(k: int, images: NDArray[np.float64], distinct: int | None = None) -> None:
+def _check_distinct(k: int, images: Floats, distinct: int | None = None) -> None:
     """Raise PerceptionError if there are fewer different images than views."""
     found = len(np.unique(images, axis=0)) if distinct is None else distinct
     if found < k:
@@ -358,7 +440,7 @@ def _check_distinct(k: int, images: NDArray[np.float64], distinct: int | None = 
         )
 
 
-def _with_noise(inside: NDArray[np.bool_], labels: NDArray[np.intp]) -> NDArray[np.intp]:
+def _with_noise(inside: NDArray[np.bool_], labels: Integers) -> Integers:
     """Label all images, (n,): those in the mask `inside` by `labels`, all others as noise."""
     every = np.full(len(inside), NOISE, np.intp)
     every[inside] = labels

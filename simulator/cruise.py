@@ -3,7 +3,7 @@
 >>> from simulator.cruise import FreeSpace
 >>> walls = np.array([[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0.0]])
 >>> room = FreeSpace.of(walls, radius=0.2)
->>> way = room.way((0.5, 1.5), (3.5, 1.5))
+>>> way = room.part(walls.reshape(-1, 2)).way((0.5, 1.5), (3.5, 1.5))
 >>> [(round(float(x), 1), round(float(y), 1)) for x, y in way[[0, -1]]]
 [(0.5, 1.5), (3.5, 1.5)]
 
@@ -27,8 +27,8 @@ from skimage.graph import MCP_Geometric
 from simulator.driver import Driver
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS
+from simulator.world import Array
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.intp]
 Point = tuple[float, float]
@@ -232,14 +232,6 @@ class FreeSpace:
         )
         corner = self.corner[0] + CELL * int(columns[0]), self.corner[1] + CELL * int(rows[0])
         return FreeRectangle(corner, _clearance(occupied), self.least)
-
-    def way(self, start: Point, goal: Point, closed: Mask | None = None) -> Array | None:
-        """Find the best route, (n, 2) metres, within the part of the grid around both ends.
-
-        `closed` is as in `part`. None if there is no route. `FreeRectangle.way` says which route is
-        best.
-        """
-        return self.part(np.array([start, goal]), closed).way(start, goal)
 
 
 @dataclass(frozen=True)

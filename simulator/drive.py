@@ -12,16 +12,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.laser import Laser
 from simulator.robot import Odometer
-from simulator.world import World
+from simulator.world import Array, World
 from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
-Array = NDArray[np.float64]
 # Speed of driving in metres per second, and of turning in radians per second.
 SPEED, SPIN = 0.5, 1.0
 # Default and smallest distance between scans in metres.

@@ -28,9 +28,8 @@ from simulator.drive import Recorder
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS, Laser
 from simulator.robot import SimulatedRobot
-from simulator.world import World
+from simulator.world import Array, World
 
-Array = NDArray[np.float64]
 # Points of a wall differ by at most this many metres across it: ten times the noise of the laser.
 THICK = 0.05
 # Smallest length of a wall in metres; anything shorter is clutter, or the end of a wall.

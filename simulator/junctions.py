@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 from simulator.driver import LONGEST_TRAVEL, STILL, STRIDE, TRIES, Driver
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS
+from simulator.world import Array
 from ssh_abduction.data.odometry import radians_between
 from ssh_abduction.data.trace import Action
 
-Array = NDArray[np.float64]
 # Largest distance in metres of points from the line of their wall: six times the noise of the
 # laser.
 THICK = 0.03

@@ -8,11 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from simulator.world import World
+from simulator.world import Array, World
 
-Array = NDArray[np.float64]
 BEAMS = 180
 # Radians, counterclockwise from straight ahead.
 BEARINGS: Array = np.radians(np.arange(BEAMS) - 89.5)

@@ -146,9 +146,8 @@ class _MapFileReader:
             raise self._wrong(
                 "free_thresh", f"less than occupied_thresh ({occupied:g}) in mode scale"
             )
-        image = self.path.parent / self._text("image")
-        place = self._resolution(), self._origin()
-        return MapFile(image, *place, negate, occupied, free, mode)
+        place = self._image(), self._resolution(), self._origin()
+        return MapFile(*place, negate, occupied, free, mode)
 
     def _wrong(self, name: str, expected: str) -> SimulatorError:
         got = brief(self.fields[name]) if name in self.fields else "none"
@@ -156,22 +155,17 @@ class _MapFileReader:
             f"{named(self.path)}: {name}: expected {expected}, got {got}; mend it"
         )
 
-    def _text(self, name: str) -> str:
-        value = self.fields.get(name)
+    def _image(self) -> Path:
+        value = self.fields.get("image")
         if not isinstance(value, str) or not value:
-            raise self._wrong(
-                name,
-                "the path of an image, seen from the YAML file"
-                if name == "image"
-                else "a single value",
-            )
-        return value
+            raise self._wrong("image", "the path of an image, seen from the YAML file")
+        return self.path.parent / value
 
     def _mode(self) -> Mode:
-        for mode in MODES:
-            if self.fields.get("mode", "trinary") == mode:
-                return mode
-        raise self._wrong("mode", f"{', '.join(MODES[:-1])} or {MODES[-1]}")
+        mode = next((mode for mode in MODES if self.fields.get("mode", "trinary") == mode), None)
+        if mode is None:
+            raise self._wrong("mode", f"{', '.join(MODES[:-1])} or {MODES[-1]}")
+        return mode
 
     def _truth(self, name: str) -> bool:
         value = self.fields.get(name, "0")

@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.laser import meetings
-from simulator.world import World, checked_segments, pose_of
+from simulator.world import Array, World, checked_segments, pose_of
 from ssh_abduction.data.checks import a_flag, a_list, a_number, a_whole_number, an_instance
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.odometry import Pose
 
-Array = NDArray[np.float64]
 # Heights of the camera and of the ceiling, in metres.
 EYE, CEILING = 1.2, 2.5
 # Steepest visible slope, up and down: 45 degrees.

@@ -32,11 +32,10 @@ from simulator.errors import SimulatorError
 from simulator.laser import Laser
 from simulator.plans import Door, Plan, Room
 from simulator.robot import Body, Odometer, SimulatedRobot
-from simulator.world import World, distances_to
+from simulator.world import Array, World, distances_to
 from ssh_abduction.data.checks import a_number, a_whole_number
 from ssh_abduction.data.words import counted
 
-Array = NDArray[np.float64]
 # Width of a door, and its smallest distance from the corners of its rooms, in metres.
 DOOR, OFF = 1.0, 0.1
 # Walls within this many metres before and behind a door are removed, since they would close it.

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from simulator.cruise import FreeSpace, drive_along
 from simulator.drive import EVERY, RecordedDrive, Recorder
@@ -19,13 +18,12 @@ from simulator.laser import Laser
 from simulator.panorama import Camera
 from simulator.robot import DIGITS, Body, Odometer, Report, SimulatedRobot
 from simulator.watch import DriveWatch
-from simulator.world import World
+from simulator.world import Array, World
 from ssh_abduction.data.checks import a_flag, a_number, a_whole_number, an_instance
 from ssh_abduction.data.odometry import Covariance, Displacement, Odometry
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.data.words import counted
 
-Array = NDArray[np.float64]
 # More tours than this would take days, and all steps are kept in memory.
 MOST_TOURS = 100_000
 

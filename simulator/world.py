@@ -89,6 +89,12 @@ def pose_of(name: str, value: object) -> tuple[float, float, float]:
     return x, y, heading
 
 
+def _check_point(x: object, y: object) -> None:
+    """Raise SimulatorError unless two coordinates are metres that a world may have."""
+    for name, value in (("x", x), ("y", y)):
+        a_number(name, value, SimulatorError, -FARTHEST, FARTHEST, what="metres")
+
+
 def distances_to(walls: Array, point: Point) -> Array:
     """Measure the distance from a point to each of n walls: (n,), metres."""
     starts, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
@@ -135,11 +141,10 @@ class World:
         a_text("world.name", self.name, SimulatorError)
         checked_segments("world.segments", self.segments)
         object.__setattr__(self, "start", pose_of("world.start", self.start))
-        a_number("world.reach", self.reach, SimulatorError, NEAREST, FARTHEST, what="metres")
-        if self.own_reach is not None:
-            a_number(
-                "world.own_reach", self.own_reach, SimulatorError, NEAREST, FARTHEST, what="metres"
-            )
+        for name, reach in (("reach", self.reach), ("own_reach", self.own_reach)):
+            if reach is not None or name == "reach":
+                where = f"world.{name}"
+                a_number(where, reach, SimulatorError, NEAREST, FARTHEST, what="metres")
         one_of("world.angles", self.angles, get_args(Angles), SimulatorError)
         # The class is frozen; lists become tuples.
         for name, kind in (
@@ -176,8 +181,7 @@ class World:
 
     def holds(self, x: float, y: float) -> bool:
         """Check whether a point, in metres, is within the bounds of the walls."""
-        a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")
-        a_number("y", y, SimulatorError, -FARTHEST, FARTHEST, what="metres")
+        _check_point(x, y)
         left, bottom, right, top = self.bounds
         return left < x < right and bottom < y < top
 
@@ -195,8 +199,7 @@ class World:
 
     def clearance(self, x: float, y: float) -> float:
         """Measure the distance from a point to the nearest wall, in metres."""
-        a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")
-        a_number("y", y, SimulatorError, -FARTHEST, FARTHEST, what="metres")
+        _check_point(x, y)
         return float(distances_to(self.segments, (x, y)).min())
 
     def lift_at(self, name: str, x: float, y: float) -> Lift | None:
@@ -208,8 +211,7 @@ class World:
             y: y of the point in metres.
         """
         a_text("name", name, SimulatorError)
-        a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")
-        a_number("y", y, SimulatorError, -FARTHEST, FARTHEST, what="metres")
+        _check_point(x, y)
         near = (lift for lift in self.lifts if math.dist(lift.start, (x, y)) <= self.reach)
         return next((lift for lift in near if lift.name == name), None)
 

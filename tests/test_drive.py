@@ -28,6 +28,8 @@ from ssh_abduction.cli import main
 from ssh_abduction.data.odometry import displacement_between
 
 RECTANGLE, HALL = World.named("notched-rectangle"), World.named("taylor-hall")
+# The two ends of a corridor.
+ENDS = np.array([(1.0, 1.5), (11.0, 1.5)])
 
 
 @pytest.fixture
@@ -431,7 +433,7 @@ def test_driver_goes_around_an_unknown_obstacle() -> None:
     walls = np.array([[0, 0, 12, 0], [12, 0, 12, 3], [12, 3, 0, 3], [0, 3, 0, 0.0]])
     box = np.array([[5, 1, 6, 1], [6, 1, 6, 2], [6, 2, 5, 2], [5, 2, 5, 1.0]])
     space = FreeSpace.of(walls, 0.2)
-    way = space.way((1.0, 1.5), (11.0, 1.5))
+    way = space.part(ENDS).way((1.0, 1.5), (11.0, 1.5))
     assert way is not None
     rng = np.random.default_rng(0)
     driver = Driver(
@@ -455,7 +457,7 @@ def test_driver_goes_around_an_unknown_obstacle() -> None:
 def test_driver_refuses_a_blocked_way() -> None:
     walls = np.array([[0, 0, 12, 0], [12, 0, 12, 3], [12, 3, 0, 3], [0, 3, 0, 0.0]])
     space = FreeSpace.of(walls, 0.2)
-    way = space.way((1.0, 1.5), (11.0, 1.5))
+    way = space.part(ENDS).way((1.0, 1.5), (11.0, 1.5))
     assert way is not None
     rng = np.random.default_rng(0)
     driver = Driver(
@@ -473,7 +475,7 @@ def test_driver_refuses_a_blocked_way() -> None:
     ):
         for _ in drive_along(driver, space, way):
             pass
-    part = space.part(np.array([(1.0, 1.5), (11.0, 1.5)]), space.drawn(np.array([[6.0, 0, 6, 3]])))
+    part = space.part(ENDS, space.drawn(np.array([[6.0, 0, 6, 3]])))
     assert part.way((1.0, 1.5), (11.0, 1.5)) is None
     one, other = part.region(np.array([(1.0, 1.5), (11.0, 1.5)]))
     assert one != other

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from perception.readers.poses import RecordedTrack as Odometry
 from perception.readers.poses import sources_of
-from perception.readers.scans import RobotLog, Scan, in_turn
+from perception.readers.scans import Array, RobotLog, Scan, in_turn
 from ssh_abduction.data.odometry import Pose, displacement_between
 from ssh_abduction.data.words import counted
 
@@ -323,7 +323,7 @@ def _targets(steps: NDArray[np.bool_]) -> frozenset[int]:
 
 
 def _impossible(
-    log: RobotLog, seconds: NDArray[np.float64] | None, paused: NDArray[np.bool_]
+    log: RobotLog, seconds: Array | None, paused: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Find impossible steps and doubtful ones, (n - 1,) masks. The doubtful include the impossible.
 
@@ -424,13 +424,13 @@ def _change(first: Scan, last: Scan) -> float:
     return float(changed[valid].mean()) if valid.any() else 0.0
 
 
-def _far(log: RobotLog, steps: int) -> NDArray[np.float64]:
+def _far(log: RobotLog, steps: int) -> Array:
     """Distances in metres by odometry from each scan to the scan `steps` later, (n - steps,)."""
     positions = log.odometry[:, :2]
     return np.asarray(np.hypot(*(positions[steps:] - positions[:-steps]).T))
 
 
-def _seconds(log: RobotLog) -> NDArray[np.float64] | None:
+def _seconds(log: RobotLog) -> Array | None:
     """Seconds from each scan to the next, (n - 1,).
 
     None if times are missing, run backwards, or are all equal.

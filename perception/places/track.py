@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,17 +87,6 @@ class Track:
         steps = arms @ self.corrected(begin + 1, end + 1) @ arms.transpose(0, 2, 1)
         steps[0] += before
         return np.asarray(np.cumsum(steps, axis=0)[-1].copy())
-
-    @cached_property
-    def spans(self) -> tuple[tuple[int, int], ...]:
-        """For each unbroken part, the index of its first scan and the index after its last."""
-        return tuple(pairwise((0, *self.breaks, len(self.poses))))
-
-    def part(self, begin: int, end: int) -> Track:
-        """Copy an unbroken part, scans begin … end - 1, to a track of its own in the same frame."""
-        some = slice(begin, end)
-        cuts = tuple(cut - begin for cut in self.cuts if begin < cut < end)
-        return Track(self.poses[some], self.covariances[some], self.shares[some], cuts)
 
     def cuts_between(self, first: int, last: int) -> list[int]:
         """List the cuts after scan `first` and up to scan `last`."""

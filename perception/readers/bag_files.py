@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
@@ -41,9 +42,10 @@ NANO = 1e-9
 
 
 @dataclass
-class Files:
-    """The open files of one drive."""
+class Bag:
+    """The open files of one drive, and access to their topics and messages."""
 
+    source: str  # name of the bag, for errors
     format: str  # `ros1`, `ros2` or `mcap`
     folder: Path  # a temporary folder for links to the files, and for what is unpacked
     stack: ExitStack  # it closes the readers
@@ -162,6 +164,66 @@ class Files:
         self.stack.callback(reader.close)
         return reader
 
+    @property
+    def connections(self) -> list[Any]:
+        return [connection for reader in self.readers for connection in reader.connections]
+
+    def topics(self, *kinds: str) -> dict[str, int]:
+        """Count the messages of each topic of these kinds; without any, of all topics."""
+        counts: dict[str, int] = {}
+        for connection in self.connections:
+            if not kinds or connection.msgtype in kinds:
+                counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+        return counts
+
+    def listed(self) -> str:
+        """Name the topics with their kinds, for error messages: at most 20, or "none"."""
+        topics = dict.fromkeys(
+            f"{c.topic} ({c.msgtype.rpartition('/')[2]})" for c in self.connections
+        )
+        return first_few([*topics], 20) or "none"
+
+    def messages(self, topics: set[str]) -> Iterator[tuple[Any, int, float, Any]]:
+        """Read the messages of some topics.
+
+        Yield for each its connection, its number within the topic (from 1), the time of recording
+        in seconds, and the message. Damage takes the place of a message that cannot be read.
+        """
+        from rosbags.serde import SerdeError
+
+        numbers = dict.fromkeys(topics, 0)
+        store = typestore(self.format == "ros1")
+        deserialize = store.deserialize_ros1 if self.format == "ros1" else store.deserialize_cdr
+        for reader in self.readers:
+            connections = [c for c in reader.connections if c.topic in topics]
+            stored = reader.messages(connections=connections) if connections else iter(())
+            while True:
+                try:
+                    connection, time, raw = next(stored)
+                except StopIteration:
+                    break
+                except Exception as error:  # Damaged bytes can raise any error in the library.
+                    raise_if_disk_is_full(error, self.source)
+                    number = sum(numbers.values()) + 1
+                    where = " and ".join(sorted(topics))
+                    what = (
+                        f"{where}: expected a message, got damaged data ({cause(error)}); what "
+                        "follows was not read"
+                    )
+                    yield connections[0], number, 0.0, Damage(number, what)
+                    break
+                topic = connection.topic
+                numbers[topic] += 1
+                try:
+                    message = deserialize(raw, connection.msgtype)
+                    yield connection, numbers[topic], time * NANO, message
+                except (SerdeError, ValueError, IndexError) as error:
+                    what = (
+                        f"{topic}: expected a message {connection.msgtype.rpartition('/')[2]}, "
+                        f"got damaged data ({cause(error)})"
+                    )
+                    yield connection, numbers[topic], time * NANO, Damage(numbers[topic], what)
+
 
 def format_of(head: bytes) -> str | None:
     """Find the format (`ros1`, `ros2`, `mcap`) of a file with these first bytes.
@@ -172,11 +234,9 @@ def format_of(head: bytes) -> str | None:
 
 
 @contextmanager
-def files_opened(path: Path, format: str) -> Iterator[Files]:
-    """Open the files of a bag. Raises LogError.
-
-    The format is `ros1`, `ros2` or `mcap`. It is ignored for a folder.
-    """
+def bag_opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
+    """Open a bag of the format `ros1`, `ros2` or `mcap`, or a folder. Raises LogError."""
+    path = Path(path)
     try:
         from rosbags import rosbag1, rosbag2  # noqa: F401 - only whether they are installed
     except ImportError:
@@ -187,16 +247,16 @@ def files_opened(path: Path, format: str) -> Iterator[Files]:
     with ExitStack() as stack:
         try:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            files = Files(format, folder, stack)
+            bag = Bag(named(path), format, folder, stack)
             if path.is_dir():
-                files.open_folder(path)
+                bag.open_folder(path)
             else:
-                files.open_part(path)
+                bag.open_part(path)
                 # Other parts of the drive may lie beside the file. The user may have meant all.
-                files.notes += _beside(path)
+                bag.notes += _beside(path)
         except OSError as error:
             raise _unreadable(path, error) from None
-        yield files
+        yield bag
 
 
 def _unreadable(path: Path, error: OSError) -> LogError:
@@ -282,82 +342,7 @@ def cause(error: Exception) -> str:
     return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")[:200]
 
 
-class Bag:
-    """An open bag. `Files` explains its attributes; `source` is the name of the bag, for errors."""
-
-    def __init__(self, files: Files, store: Any, source: str) -> None:
-        self.readers, self.format, self.notes = files.readers, files.format, files.notes
-        self.source = source
-        self.deserialize = (
-            store.deserialize_ros1 if files.format == "ros1" else store.deserialize_cdr
-        )
-
-    @property
-    def connections(self) -> list[Any]:
-        return [connection for reader in self.readers for connection in reader.connections]
-
-    def topics(self, *kinds: str) -> dict[str, int]:
-        """Count the messages of each topic of these kinds; without any, of all topics."""
-        counts: dict[str, int] = {}
-        for connection in self.connections:
-            if not kinds or connection.msgtype in kinds:
-                counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
-        return counts
-
-    def listed(self) -> str:
-        """Name the topics with their kinds, for error messages: at most 20, or "none"."""
-        topics = dict.fromkeys(
-            f"{c.topic} ({c.msgtype.rpartition('/')[2]})" for c in self.connections
-        )
-        return first_few([*topics], 20) or "none"
-
-    def messages(self, topics: set[str]) -> Iterator[tuple[Any, int, float, Any]]:
-        """Read the messages of some topics.
-
-        Yield for each its connection, its number within the topic (from 1), the time of recording
-        in seconds, and the message. Damage takes the place of a message that cannot be read.
-        """
-        from rosbags.serde import SerdeError
-
-        numbers = dict.fromkeys(topics, 0)
-        for reader in self.readers:
-            connections = [c for c in reader.connections if c.topic in topics]
-            stored = reader.messages(connections=connections) if connections else iter(())
-            while True:
-                try:
-                    connection, time, raw = next(stored)
-                except StopIteration:
-                    break
-                except Exception as error:  # Damaged bytes can raise any error in the library.
-                    raise_if_disk_is_full(error, self.source)
-                    number = sum(numbers.values()) + 1
-                    where = " and ".join(sorted(topics))
-                    what = (
-                        f"{where}: expected a message, got damaged data ({cause(error)}); what "
-                        "follows was not read"
-                    )
-                    yield connections[0], number, 0.0, Damage(number, what)
-                    break
-                topic = connection.topic
-                numbers[topic] += 1
-                try:
-                    message = self.deserialize(raw, connection.msgtype)
-                    yield connection, numbers[topic], time * NANO, message
-                except (SerdeError, ValueError, IndexError) as error:
-                    what = (
-                        f"{topic}: expected a message {connection.msgtype.rpartition('/')[2]}, "
-                        f"got damaged data ({cause(error)})"
-                    )
-                    yield connection, numbers[topic], time * NANO, Damage(numbers[topic], what)
-
-
-@contextmanager
-def bag_opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
-    """Open a bag of the format `ros1`, `ros2` or `mcap`, or a folder. Raises LogError."""
-    with files_opened(Path(path), format) as files:
-        yield Bag(files, typestore(files.format == "ros1"), named(path))
-
-
+@cache
 def typestore(is_ros1: bool) -> Any:
     """Make the store of rosbags with the types of messages, including transforms."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore

@@ -26,12 +26,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.readers.bag_files import NANO, TRANSFORMS, Bag
 from perception.readers.poses import RecordedTrack, TimedPoses, clock_of, sources_of
-from perception.readers.scans import Damage, Damaged, LaserScanner, Scan, SurveyedLog, laser_of
+from perception.readers.scans import (
+    Array,
+    Damage,
+    Damaged,
+    LaserScanner,
+    Scan,
+    SurveyedLog,
+    laser_of,
+)
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
@@ -130,7 +137,7 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
     return next(iter(counts), None)
 
 
-def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float64]], Counter[str]]:
+def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, Array], Counter[str]]:
     """For each topic, list the times of its scans, (n, 2), and count the scans of each frame.
 
     The times are in seconds: from the header, and of the recording. Raises LogError.
@@ -275,9 +282,7 @@ def _scans(
             yield Damage(number, f"{connection.topic}: {damage}")
 
 
-def _measured(
-    message: Any, mount: Pose, is_flipped: bool
-) -> tuple[NDArray[np.float64], LaserScanner]:
+def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[Array, LaserScanner]:
     """Read ranges and laser of a message. The beams of a flipped laser turn clockwise."""
     first, step, nearest, reach = (
         float(v)
@@ -303,8 +308,8 @@ class FrameTransform:
     """The transform from a parent frame to a frame: the pose of the frame in its parent."""
 
     parent: str  # name of the parent frame
-    translation: NDArray[np.float64]  # (3,) translation in the last message, in metres
-    rotation: NDArray[np.float64]  # (3, 3) rotation in the last message
+    translation: Array  # (3,) translation in the last message, in metres
+    rotation: Array  # (3, 3) rotation in the last message
     first: Pose  # pose in the plane in the first message
     track: RecordedTrack | None  # poses in the plane over time; None for a static transform
     count: int = 0  # number of messages
@@ -455,7 +460,7 @@ def flat_pose(position: Any, orientation: Any) -> Pose:
     return position.x, position.y, math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
-def _rotation(q: Any) -> NDArray[np.float64]:
+def _rotation(q: Any) -> Array:
     """The rotation matrix of a quaternion, (3, 3)."""
     from scipy.spatial.transform import Rotation
 

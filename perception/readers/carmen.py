@@ -42,9 +42,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import IO
 
-import numpy as np
-from numpy.typing import NDArray
-
 from perception.errors import LogError
 from perception.readers.carmen_survey import (
     EDGES,
@@ -68,7 +65,15 @@ from perception.readers.carmen_survey import (
     words,
 )
 from perception.readers.lines import LONGEST_LINE, lines
-from perception.readers.scans import Damage, Damaged, LaserScanner, Scan, SurveyedLog, laser_of
+from perception.readers.scans import (
+    Array,
+    Damage,
+    Damaged,
+    LaserScanner,
+    Scan,
+    SurveyedLog,
+    laser_of,
+)
 from ssh_abduction.data.files import LINE_OF_A_LOG
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
@@ -256,7 +261,7 @@ class _OdometerPoses:
                     f"expected the pose of a vertex in {line.kind}, got another; the line of "
                     "its vertex is missing or damaged"
                 )
-            return self.found.graph.chain.poses[index], second if self.is_corrected else None
+            return self.found.graph.chain[0][index], second if self.is_corrected else None
         if self.meaning == "restarts":
             self.last, self.restarts, self.behind = (second, line.time), True, self.chain
             return self.chain, second
@@ -288,9 +293,7 @@ class _OdometerPoses:
         return moved(self.truth[0], displacement_between(self.truth[1], odometry))
 
 
-def _measured(
-    line: ScanLine, mount: Pose, reach: float, fov: float
-) -> tuple[NDArray[np.float64], LaserScanner]:
+def _measured(line: ScanLine, mount: Pose, reach: float, fov: float) -> tuple[Array, LaserScanner]:
     """The ranges of a scan and its laser; `reach` and `fov` hold if the line does not give them."""
     beams = len(line.ranges)
     if line.shape is None:

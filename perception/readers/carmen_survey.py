@@ -8,18 +8,18 @@ from __future__ import annotations
 import math
 import re
 from array import array
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import IO, Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.readers.lines import LONGEST_LINE, lines
-from perception.readers.scans import Damaged
+from perception.readers.scans import Array, Damaged
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.words import counted
@@ -70,7 +70,7 @@ class ScanLine:
     """A line that holds a scan."""
 
     kind: str  # first word of the line, one of KINDS
-    ranges: NDArray[np.float64]  # (n,) ranges in metres
+    ranges: Array  # (n,) ranges in metres
     # Bearing of the first beam and step between beams in radians, and reach in metres; None if the
     # line does not have them.
     shape: tuple[float, float, float] | None
@@ -137,7 +137,7 @@ def refuse_cut(tag: bytes, count: int, usual: int) -> None:
         )
 
 
-def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
+def _ranges(tokens: list[bytes], at: int) -> tuple[Array, int]:
     """Parse a count at index `at` and its ranges: metres, (n,), and the index after them."""
     count = _whole(tokens[at] if at < len(tokens) else b"", "beams")
     if count == 0:
@@ -224,16 +224,6 @@ def _quoted(word: bytes) -> str:
     return brief(word[:40].decode("utf-8", "replace"), 40)
 
 
-@dataclass(frozen=True)
-class VertexPoses:
-    """Poses by odometry at the vertices, computed by adding up the motions along the edges."""
-
-    poses: tuple[Pose, ...]  # in the order of the file; the first is (0, 0, 0)
-    # Numbers of the vertices to which no edge leads from the vertex before. There, the robot is
-    # taken to have stood still.
-    gaps: tuple[int, ...]
-
-
 @dataclass
 class PoseGraph:
     """A pose graph: vertices with poses, and edges with motions.
@@ -244,8 +234,8 @@ class PoseGraph:
         >>> graph = PoseGraph()
         >>> graph.vertices += [(0, (0.0, 0.0, 0.0)), (1, (1.1, 0.0, 0.0)), (2, (2.2, 0.0, 0.0))]
         >>> graph.edges |= {(0, 1): (1.0, 0.0, 0.0), (1, 2): (1.0, 0.0, 0.0)}
-        >>> graph.chain.poses
-        ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 0.0, 0.0))
+        >>> graph.chain
+        ([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 0.0, 0.0)], [])
         >>> graph.index_at((2.2, 0.0, 0.0))
         2
     """
@@ -256,15 +246,20 @@ class PoseGraph:
     edges: dict[tuple[int, int], Pose] = field(default_factory=dict)
 
     @cached_property
-    def chain(self) -> VertexPoses:
+    def chain(self) -> tuple[list[Pose], list[int]]:
+        """The poses by odometry at the vertices, from (0, 0, 0) on, and the gaps between them.
+
+        Poses add up the motions along the edges. Gaps are the numbers of vertices to which no edge
+        leads from the vertex before. There, the robot is taken to have stood still.
+        """
         poses: list[Pose] = [(0.0, 0.0, 0.0)]
         gaps: list[int] = []
-        for (start, _), (end, _) in zip(self.vertices, self.vertices[1:], strict=False):
+        for (start, _), (end, _) in pairwise(self.vertices):
             motion = self._motion(start, end)
             if motion is None:
                 gaps.append(end)
             poses.append(moved(poses[-1], motion or (0.0, 0.0, 0.0)))
-        return VertexPoses(tuple(poses), tuple(gaps))
+        return poses, gaps
 
     def _motion(self, start: int, end: int) -> Pose | None:
         """Find the motion between vertices by an edge or a chain of edges; None without."""
@@ -286,7 +281,7 @@ class PoseGraph:
         first = self.vertices[0][1]
         return any(
             math.dist(displacement_between(first, pose)[:2], odometry[:2]) > farthest
-            for (_, pose), odometry in zip(self.vertices, self.chain.poses, strict=True)
+            for (_, pose), odometry in zip(self.vertices, self.chain[0], strict=True)
         )
 
     def index_at(self, pose: Pose, guess: int | None = None) -> int | None:
@@ -298,7 +293,7 @@ class PoseGraph:
 
     def share_at_vertices(self, poses: Sequence[float]) -> float:
         """Compute the share of poses (flat: x, y, heading, x, …) at vertices, up to rounding."""
-        table: NDArray[np.float64] = np.reshape(poses, (-1, 3))
+        table: Array = np.reshape(poses, (-1, 3))
         last = len(self.vertices) - 1
         at = sum(
             self.index_at((x, y, heading), min(i, last)) is not None
@@ -351,13 +346,13 @@ class Findings:
     tags: Counter[str] = field(default_factory=Counter)  # number of lines of each kind
     # For each kind of line with poses, how many lines have each number of words. In lines with
     # scans, only words after the poses count.
-    lengths: dict[bytes, Counter[int]] = field(default_factory=dict)
+    lengths: dict[bytes, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
     graph: PoseGraph = field(default_factory=PoseGraph)  # vertices and edges of the log
     damage: str = ""  # description of the first scan that cannot be read; empty if there is none
 
     def usual_length(self, tag: bytes) -> int:
         """Compute the largest number of words that most lines of a kind reach."""
-        lengths = self.lengths.get(tag, Counter())
+        lengths = self.lengths[tag]
         short = (1 - MOST_SCANS) * lengths.total()
         for length in sorted(lengths):
             short -= lengths[length]
@@ -431,7 +426,7 @@ def _meaning_beside_graph(
         f"The robot's poses in {kind} and in VERTEX2 are equal, so they are corrected poses. "
         "Odometry is made by adding up the motions in EDGE2 from each vertex to the next."
     )
-    if gaps := graph.chain.gaps:
+    if gaps := graph.chain[1]:
         notes.append(
             "No EDGE2 tells how the robot moved before these vertices, so that it seems to "
             f"have stood still: {_listed(gaps)}."
@@ -439,7 +434,7 @@ def _meaning_beside_graph(
     return "edges"
 
 
-def _listed(numbers: list[int] | tuple[int, ...]) -> str:
+def _listed(numbers: list[int]) -> str:
     """List the first five numbers for a note, and say how many more there are."""
     return ", ".join(map(str, numbers[:5])) + (
         f" and {len(numbers) - 5} more" if len(numbers) > 5 else ""
@@ -513,7 +508,7 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
         tag = tokens[0]
         try:
             if tag in (b"ODOM", b"TRUEPOS"):
-                found.lengths.setdefault(tag, Counter())[len(tokens)] += 1
+                found.lengths[tag][len(tokens)] += 1
             if tag == b"ODOM":
                 pose, time = pose_at(tokens, 1), time_at(tokens, 7)
                 since = {kind: count + 1 for kind, count in since.items()}
@@ -527,13 +522,13 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
                 found.graph.vertices.append(vertex_of(tokens))
             elif tag in EDGES and with_graph:
                 ends, motion = edge_of(tokens)
-                found.lengths.setdefault(tag, Counter())[len(tokens)] += 1
+                found.lengths[tag][len(tokens)] += 1
                 if len(tokens) > written.get(ends, (b"", 0))[1]:
                     found.graph.edges[ends], written[ends] = motion, (tag, len(tokens))
             elif (line := scan_line(tokens)) is not None:
                 survey = found.kinds.setdefault(line.kind, Survey())
                 _count(survey, line)
-                found.lengths.setdefault(tag, Counter())[line.after] += 1
+                found.lengths[tag][line.after] += 1
                 # The first ODOM line after a scan only repeats the pose of the scan.
                 if since.get(line.kind, 2) < 2:
                     survey.unmoved.append(number)

@@ -22,12 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
-from perception.readers.scans import Scan, ScanTable, in_memory, in_turn, shared
+from perception.readers.scans import Array, Scan, ScanTable, in_memory, in_turn, shared
 from ssh_abduction.data.checks import a_number, numbers, one_of
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Pose, displacement_between
 
-Array = NDArray[np.float64]
 _Key = tuple[float, float, Pose]
 Bools = NDArray[np.bool_]
 

@@ -15,9 +15,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from perception.readers.scans import Array
 from ssh_abduction.data.odometry import Pose
-
-Array = NDArray[np.float64]
 
 # Seconds beyond the ends of the odometry at which a scan still gets a pose.
 BESIDE = 1.0

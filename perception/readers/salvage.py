@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any, NamedTuple
 from urllib.parse import quote
 
@@ -40,13 +41,6 @@ class Message(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Sender:
-    """What rosbags gives for the publisher of a ROS 1 connection: the name of its node."""
-
-    callerid: str
-
-
-@dataclass(frozen=True)
 class Connection:
     """The messages of one sender to one topic, with the fields of rosbags' connections."""
 
@@ -54,7 +48,7 @@ class Connection:
     topic: str
     msgtype: str
     msgcount: int
-    ext: _Sender
+    ext: SimpleNamespace  # of a ROS 1 bag: `callerid`, the name of the node that sends
 
 
 class Salvage:
@@ -73,7 +67,7 @@ class Salvage:
             counts[message.connection] += 1
             first, last = message.time if first is None else first, message.time
         self.connections = [  # those with intact messages
-            Connection(number, topic, kind, counts[number], _Sender(sender))
+            Connection(number, topic, kind, counts[number], SimpleNamespace(callerid=sender))
             for number, (topic, kind, sender) in found.items()
         ]
         self.count = counts.total()  # number of intact messages

@@ -31,11 +31,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.readers.bag_files import TRANSFORMS, typestore
-from perception.readers.scans import LaserScanner, Scan
+from perception.readers.scans import Array, LaserScanner, Scan
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import save_file
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
@@ -87,7 +86,7 @@ def write_carmen(
 def write_bag(
     path: str | os.PathLike[str],
     scans: Iterable[Scan],
-    covariances: NDArray[np.float64] | None = None,
+    covariances: Array | None = None,
 ) -> None:
     """Write scans as a ROS bag, completely or not at all.
 
@@ -171,7 +170,7 @@ def _numbers(pose: Pose) -> str:
     return " ".join(f"{value:.6f}" for value in pose)
 
 
-def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float64] | None) -> Path:
+def _write_bag(path: Path, scans: Iterable[Scan], covariances: Array | None) -> Path:
     """Write a bag to a new path; return the file or folder that is the result."""
     try:
         from rosbags import rosbag1, rosbag2
@@ -203,7 +202,7 @@ def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float6
 
 
 def _messages(
-    store: Any, scans: Iterable[Scan], covariances: NDArray[np.float64] | None, is_ros1: bool
+    store: Any, scans: Iterable[Scan], covariances: Array | None, is_ros1: bool
 ) -> Iterator[tuple[str, int, Any]]:
     """Yield topic, time in nanoseconds and message of all scans, or raise LogError."""
     types = store.types
@@ -257,7 +256,7 @@ class _Maker:
         )
         return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
 
-    def odometry(self, pose: Pose, covariance: NDArray[np.float64]) -> Any:
+    def odometry(self, pose: Pose, covariance: Array) -> Any:
         """Make an Odometry message of a pose with a (3, 3) covariance."""
         geometry, unknown = "geometry_msgs/msg/", np.zeros(36)
         # ROS has six dimensions; only three (plane) are known.
@@ -277,7 +276,7 @@ class _Maker:
             twist=self.types[geometry + "TwistWithCovariance"](twist=still, covariance=unknown),
         )
 
-    def scan(self, ranges: NDArray[np.float64], laser: LaserScanner) -> Any:
+    def scan(self, ranges: Array, laser: LaserScanner) -> Any:
         """Make a LaserScan message with ranges in metres."""
         return self.types["sensor_msgs/msg/LaserScan"](
             header=self.header(LASER),
