@@ -26,7 +26,7 @@ from perception.images import images_of
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
 from simulator.driver import Tolerance
-from simulator.laser import Laser
+from simulator.robot import Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace

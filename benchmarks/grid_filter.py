@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 from scipy.special import log_ndtr, ndtr
 
-from simulator.laser import BEARINGS
+from simulator.robot import BEARINGS
 from simulator.world import World
 
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecogniser
 from perception.views import ViewClusterer
-from simulator.laser import Laser
+from simulator.robot import Laser
 from simulator.tours import simulate
 from simulator.world import World
 

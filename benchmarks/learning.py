@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from perception.images import images_of
 from perception.recognition import recogniser
-from simulator.laser import Laser
+from simulator.robot import Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import BootstrapLearner, Theory, Trace

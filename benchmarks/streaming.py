@@ -29,8 +29,7 @@ from perception.places.importing import import_live, import_log
 from perception.readers.logs import read_log
 from perception.readers.scans import LaserScanner, Scan
 from perception.readers.writers import write_carmen
-from simulator.laser import BEARINGS, meetings
-from simulator.robot import Odometer
+from simulator.robot import BEARINGS, Odometer, meetings
 
 Array = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from skimage.graph import MCP_Geometric
 
 from simulator.driver import Driver
 from simulator.errors import SimulatorError
-from simulator.laser import BEARINGS
+from simulator.robot import BEARINGS
 from simulator.world import Array
 
 Mask = NDArray[np.bool_]

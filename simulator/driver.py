@@ -24,10 +24,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.drive import Recorder
 from simulator.errors import SimulatorError
-from simulator.laser import BEARINGS, Laser
-from simulator.robot import SimulatedRobot
+from simulator.robot import BEARINGS, Laser, Recorder, SimulatedRobot
 from simulator.world import Array, World
 
 # Points of a wall differ by at most this many metres across it: ten times the noise of the laser.

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from simulator.driver import LONGEST_TRAVEL, STILL, STRIDE, TRIES, Driver
 from simulator.errors import SimulatorError
-from simulator.laser import BEARINGS
+from simulator.robot import BEARINGS
 from simulator.world import Array
 from ssh_abduction.data.odometry import radians_between
 from ssh_abduction.data.trace import Action

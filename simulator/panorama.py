@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
-from simulator.laser import meetings
+from simulator.robot import meetings
 from simulator.world import Array, World, checked_segments, pose_of
 from ssh_abduction.data.checks import a_flag, a_list, a_number, a_whole_number, an_instance
 from ssh_abduction.data.errors import brief

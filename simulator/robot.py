@@ -1,35 +1,56 @@
-"""A robot that drives and turns (a unicycle), and its odometer. Motions and odometry have errors.
+"""A robot that drives and turns (a unicycle), its odometer and laser, and the drive it records.
 
 >>> from simulator.robot import Odometer
 >>> exact = Odometer(along=0, across=0, heading=0, turning=0)
 >>> exact.reading(np.array([[1.0, 2.0, 0.0], [3.0, 2.0, 0.5]]), np.random.default_rng(0)).tolist()
 [[0.0, 0.0, 0.0], [2.0, 0.0, 0.5]]
 
-Errors of an odometer are systematic, or random and growing with the distance.
+Motions and odometry have errors. Those of an odometer are systematic, or random and growing with
+the distance. The laser range finder has 180 beams, one for each degree of the half circle ahead.
+The first beam is on the right, the last on the left.
+
+While the robot drives, a Recorder records its pose after each motion. After the drive, all scans
+are computed at once, and the odometry is computed from the poses.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
+from simulator.world import Array, World
 from ssh_abduction.data.checks import a_number
-from ssh_abduction.data.odometry import Displacement, Odometry, Pose, displacement_between
+from ssh_abduction.data.odometry import Displacement, Odometry, Pose, displacement_between, moved
 
 # Largest errors of the odometry that the robot drives by, as a share and in radians per metre. With
 # larger ones, the robot does not notice that it left a place.
 DRIVABLE = 0.5
 # Options of `simulate` for these errors.
 OPTIONS = {"odometry": "odometry-noise", "scale": "scale-error", "bend": "bend-error"}
-Array = NDArray[np.float64]
 # Largest value of a field; a worse odometer would be useless.
 WORST = 1.0
 # Reported displacements are rounded to this many decimals, as in a log.
 DIGITS = 5
+BEAMS = 180
+# Radians, counterclockwise from straight ahead.
+BEARINGS: Array = np.radians(np.arange(BEAMS) - 89.5)
+# Largest number of intersections of beams and walls that are computed at once: 32 MB. A single
+# image may need more.
+_BLOCK = 4_000_000
+# Speed of driving in metres per second, and of turning in radians per second.
+SPEED, SPIN = 0.5, 1.0
+# Default and smallest distance between scans in metres.
+EVERY, CLOSEST = 0.25, 0.01
+# A motion is recorded in parts, so that scans are evenly spaced. There are about this many parts
+# from one scan to the next.
+FINE = 5
+TINY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -162,12 +183,11 @@ class Odometer:
     bend: float = 0.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            name, value = f"odometer.{field.name}", getattr(self, field.name)
-            least = -WORST if field.name in ("scale", "bend") else 0.0
-            option = f" (--{OPTIONS[field.name]})" if field.name in OPTIONS else ""
+        for name, value in asdict(self).items():
+            least = -WORST if name in ("scale", "bend") else 0.0
+            option = f" (--{OPTIONS[name]})" if name in OPTIONS else ""
             mend = f"choose a smaller error{option}"
-            a_number(name, value, SimulatorError, least, WORST, mend=mend)
+            a_number(f"odometer.{name}", value, SimulatorError, least, WORST, mend=mend)
 
     def as_noisy_as(self, along: float) -> Odometer:
         """Copy the odometer, with noise of the default proportions, scaled to a value of `along`.
@@ -261,3 +281,205 @@ def reported(
     noise = np.linalg.cholesky(np.array(odometry.covariance(displacement))) @ rng.normal(size=3)
     x, y, heading = np.array([cos * dx - sin * dy, sin * dx + cos * dy, turned + drift]) + noise
     return round(float(x), DIGITS), round(float(y), DIGITS), round(float(heading), DIGITS)
+
+
+@dataclass(frozen=True)
+class Laser:
+    """A laser range finder with the noise and range of a common scanner of the paper's time.
+
+    Attributes:
+        noise: Standard deviation of a range in metres.
+        reach: Largest range in metres. A beam that meets nothing nearer reads this range.
+        dropouts: Probability that a beam is lost and reads the largest range.
+    """
+
+    noise: float = 0.005
+    reach: float = 8.0
+    dropouts: float = 0.001
+
+    def exact(self, world: World, poses: Array) -> Array:
+        """Compute the ranges without noise, (m, 180) metres from right to left, at some poses.
+
+        Poses are (m, 3) x and y in metres, heading in radians. One call for many poses is
+        faster than many calls.
+        """
+        poses = np.atleast_2d(poses)
+        rows = max(1, _BLOCK // (BEAMS * len(world.segments)))
+        return np.vstack(
+            [self._cast(world.segments, poses[i : i + rows]) for i in range(0, len(poses), rows)]
+        )
+
+    def scan(self, world: World, poses: Array, rng: np.random.Generator) -> Array:
+        """Compute the ranges with noise at some poses, as `exact`."""
+        ranges = self.exact(world, poses)
+        ranges = ranges + rng.normal(0, self.noise, ranges.shape) * (ranges < self.reach)
+        ranges[rng.random(ranges.shape) < self.dropouts] = self.reach
+        return np.clip(ranges, 0.01, self.reach)
+
+    def _cast(self, segments: Array, poses: Array) -> Array:
+        """The distance from each pose to the nearest wall along each beam: (m, 180), metres."""
+        near = _near(segments, poses, self.reach)
+        return np.asarray(meetings(near, poses, BEARINGS).min(axis=2, initial=self.reach))
+
+
+def _near(segments: Array, poses: Array, reach: float) -> Array:
+    """The walls whose bounding box is within `reach` of the bounding box of the poses."""
+    low, high = poses[:, :2].min(0) - reach, poses[:, :2].max(0) + reach
+    ends, others = segments[:, :2], segments[:, 2:]
+    is_near = (np.minimum(ends, others) <= high) & (np.maximum(ends, others) >= low)
+    return np.asarray(segments[is_near.all(1)])
+
+
+def meetings(segments: Array, poses: Array, bearings: Array) -> Array:
+    """Compute the distances in metres, (m, b, w), from poses to walls along rays.
+
+    Walls are (w, 4) metres, poses (m, 3) x and y in metres and heading in radians, and bearings
+    (b,) radians from the heading. A distance is infinite if the ray misses the wall.
+    """
+    angles = poses[:, 2, None] + bearings
+    dx, dy = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]
+    ax = segments[:, 0] - poses[:, 0, None]
+    ay = segments[:, 1] - poses[:, 1, None]
+    ex, ey = segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]
+    # The ray r (dx, dy) meets the wall a + s e, 0 <= s <= 1, where both are equal. Cross products
+    # with e and with (dx, dy) give r and s.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / (dx * ey - dy * ex)
+        r = (ax * ey - ay * ex)[:, None, :] * inverse
+        s = (ax[:, None, :] * dy - ay[:, None, :] * dx) * inverse
+        hit = (r > 0) & (s >= 0) & (s <= 1)
+    return np.where(hit, r, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedDrive:
+    """A completed drive of a simulated robot: its scans, its odometry and its true poses."""
+
+    name: str  # name of the drive
+    # (n, beams) metres; infinite if the laser saw nothing within its reach.
+    ranges: Array = field(repr=False)
+    # (n, 3) pose by the odometer at each scan: x and y in metres, heading in radians. It begins at
+    # (0, 0, 0).
+    odometry: Array = field(repr=False)
+    poses: Array = field(repr=False)  # (n, 3) true pose at each scan
+    times: Array = field(repr=False)  # (n,) seconds since the beginning
+    metres: float  # length of the drive
+    odometer: Odometer  # noise of the odometry
+    laser: Laser  # the scanner that took the scans
+    # True places and poses, as JSON-like data for evaluation only; empty until `judged` adds it.
+    truth: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.ranges)
+
+    def judged(
+        self, places: Mapping[str, Sequence[float]], scans: Sequence[str | None], **more: object
+    ) -> RecordedDrive:
+        """Copy the drive, with the truth by which its maps are evaluated.
+
+        `places` has (x, y) in metres of each place, by name, and `scans` the name of the
+        place of each scan; None between places.
+        """
+        visits: list[dict[str, Any]] = []
+        # Consecutive scans at a place form a visit.
+        for number, place in enumerate(scans):
+            if place is not None:
+                if not visits or visits[-1]["place"] != place:
+                    visits.append({"place": place, "first": number, "last": number})
+                visits[-1]["last"] = number
+        truth = {
+            "format": "ssh-drive",
+            "version": 1,
+            "name": self.name,
+            "metres": round(self.metres, 2),
+            "odometer": self.odometer.parameters(),
+            "places": {name: [round(x, 4), round(y, 4)] for name, (x, y) in places.items()},
+            "visits": visits,
+            **more,
+            "scans": list(scans),
+            "poses": self.poses.round(4).tolist(),
+        }
+        return replace(self, truth=truth)
+
+
+@dataclass
+class Recorder:
+    """Records the pose of a robot after each motion, and when a scan is due."""
+
+    every: float = EVERY  # metres between scans
+    turn: float = math.radians(10)  # radians between scans if the robot turns
+    # Pose after each motion, or after each part of a long motion.
+    poses: list[Pose] = field(default_factory=list)
+    # For each world (each arrangement of the clutter), the indices of poses at which a scan is
+    # taken.
+    scans: list[tuple[World, list[int]]] = field(default_factory=list)
+    metres: float = 0.0  # distance driven so far
+    _seconds: list[float] = field(default_factory=list)  # Time of each pose.
+    _way: float = 0.0  # Metres since the last scan.
+    _turned: float = 0.0
+
+    def __post_init__(self) -> None:
+        mend = f"a scan each {EVERY} m is usual"
+        a_number("every", self.every, SimulatorError, CLOSEST, what="metres", mend=mend)
+
+    @property
+    def taken(self) -> int:
+        """The number of scans so far."""
+        return sum(len(numbers) for _, numbers in self.scans)
+
+    def note(self, world: World, pose: Pose) -> None:
+        """Record the pose after a motion in this world.
+
+        A long motion is divided into parts, so that scans are also taken during the motion.
+        """
+        if not self.poses:
+            self._add(world, pose, 0.0, 0.0)
+            return
+        start = self.poses[-1]
+        dx, dy, turned = displacement_between(start, pose)
+        way = math.hypot(dx, dy)
+        parts = max(math.ceil(FINE * max(way / self.every, abs(turned) / self.turn)), 1)
+        for part in range(1, parts):
+            there = moved(start, (dx * part / parts, dy * part / parts, turned * part / parts))
+            self._add(world, there, way / parts, abs(turned) / parts)
+        self._add(world, pose, way / parts, abs(turned) / parts)
+
+    def _add(self, world: World, pose: Pose, way: float, turned: float) -> None:
+        """Record a pose after a motion of `way` metres and `turned` radians; scan if one is due."""
+        self.metres += way
+        before = self._seconds[-1] if self._seconds else 0.0
+        self._seconds.append(before + way / SPEED + turned / SPIN)
+        self._way, self._turned = self._way + way, self._turned + turned
+        self.poses.append(pose)
+        if not self.scans or self.scans[-1][0] is not world:
+            self.scans.append((world, []))
+        is_due = self._way >= self.every - TINY or self._turned >= self.turn - TINY
+        if is_due or len(self.poses) == 1:
+            self.scans[-1][1].append(len(self.poses) - 1)
+            self._way = self._turned = 0.0
+
+    def drive(self, name: str, laser: Laser, odometer: Odometer, seed: int) -> RecordedDrive:
+        """Make the drive from the recorded poses. A last scan is taken at its end.
+
+        Scans and odometry have random generators of their own, with this seed, so their
+        noise does not change the trajectory.
+        """
+        if self.scans[-1][1][-1:] != [len(self.poses) - 1]:
+            self.scans[-1][1].append(len(self.poses) - 1)
+        # Use generators 2 and 3 of this seed. The drive itself uses others.
+        sight, wheels = (np.random.default_rng([seed, k]) for k in (2, 3))
+        poses = np.array(self.poses)
+        numbers = [number for _, part in self.scans for number in part]
+        ranges = np.vstack(
+            [laser.scan(world, poses[part], sight) for world, part in self.scans if part]
+        )
+        return RecordedDrive(
+            name=name,
+            ranges=np.where(ranges < laser.reach, ranges, np.inf),
+            odometry=odometer.reading(poses, wheels)[numbers],
+            poses=poses[numbers],
+            times=np.array(self._seconds)[numbers],
+            metres=self.metres,
+            odometer=odometer,
+            laser=laser,
+        )

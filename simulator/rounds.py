@@ -26,12 +26,10 @@ from numpy.typing import NDArray
 from skimage.measure import points_in_poly
 
 from simulator.cruise import CELL, FreeRectangle, FreeSpace, drive_along
-from simulator.drive import EVERY, RecordedDrive, Recorder
 from simulator.driver import Driver
 from simulator.errors import SimulatorError
-from simulator.laser import Laser
 from simulator.plans import Door, Plan, Room
-from simulator.robot import Body, Odometer, SimulatedRobot
+from simulator.robot import EVERY, Body, Laser, Odometer, RecordedDrive, Recorder, SimulatedRobot
 from simulator.world import Array, World, distances_to
 from ssh_abduction.data.checks import a_number, a_whole_number
 from ssh_abduction.data.words import counted

@@ -10,13 +10,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from simulator.cruise import FreeSpace, drive_along
-from simulator.drive import EVERY, RecordedDrive, Recorder
 from simulator.driver import STILL, Corridors, Driver, Tolerance
 from simulator.errors import SimulatorError
 from simulator.junctions import ACTIONS, Pilot
-from simulator.laser import Laser
 from simulator.panorama import Camera
-from simulator.robot import DIGITS, Body, Odometer, Report, SimulatedRobot
+from simulator.robot import (
+    DIGITS,
+    EVERY,
+    Body,
+    Laser,
+    Odometer,
+    RecordedDrive,
+    Recorder,
+    Report,
+    SimulatedRobot,
+)
 from simulator.watch import DriveWatch
 from simulator.world import Array, World
 from ssh_abduction.data.checks import a_flag, a_number, a_whole_number, an_instance

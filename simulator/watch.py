@@ -17,7 +17,7 @@ import numpy as np
 
 from simulator.driver import TURNS, Driver
 from simulator.errors import SimulatorError, SimulatorWarning
-from simulator.laser import meetings
+from simulator.robot import meetings
 from simulator.world import ACTIONS, World, are_square
 from ssh_abduction.data.odometry import Pose, displacement_between
 

@@ -14,7 +14,7 @@ from grid_filter import LEAST_BLUR, BeamModel, Filter, Grid, Histogram, Particle
 from grid_localisation import Case, Judged
 from grid_worlds import Scene, boxes, comb, maze, rectangle, ring, taylor_hall
 
-from simulator.laser import Laser
+from simulator.robot import Laser
 from simulator.world import World
 
 pytestmark = pytest.mark.slow

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perception.places.closures import VisitMatch
-from perception.places.importing import factor_of
+from perception.places.closures import VisitMatch, factor_of
 from perception.places.matching import Match
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit

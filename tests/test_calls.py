@@ -23,9 +23,9 @@ import numpy as np
 import pytest
 
 from perception.views import ViewClusterer
-from simulator.laser import Laser
 from simulator.panorama import Camera, Light, Paint
 from simulator.plans import Door, Plan, Room
+from simulator.robot import Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import (

@@ -9,13 +9,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from perception.places.distinctive import find_visits, joined
+from perception.places.distinctive import find_visits
 from perception.places.local_map import CELL, LocalMaps, Patch, Recent
 from perception.places.skeleton import junctions
 from perception.places.track import Track
 from perception.places.visits import Visit, Way
 from perception.readers.scans import LaserScanner, RobotLog, Scan
-from simulator.laser import meetings
+from simulator.robot import meetings
 from ssh_abduction.data.odometry import radians_between
 
 ROOM = 0.25  # half of the robot's width in metres
@@ -252,7 +252,7 @@ def test_successive_visits_to_one_place_are_joined() -> None:
     west, east, north = Way(-math.pi), Way(0.0), Way(math.pi / 2)
     middle = np.zeros(2)
     first = Visit(5, middle, 3, 7, 1.0, (west, east), arrived=0, left=1)
-    stay = joined(first, Visit(12, middle + 0.2, 10, 14, 1.0, (east, north), arrived=0, left=1))
+    stay = first.joined(Visit(12, middle + 0.2, 10, 14, 1.0, (east, north), arrived=0, left=1))
     assert (stay.begin, stay.end) == (3, 14)
     assert [way.bearing for way in stay.ways] == [-math.pi, 0.0, math.pi / 2]
     assert (stay.arrived, stay.left) == (0, 2)

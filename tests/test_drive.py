@@ -15,12 +15,10 @@ from test_plans import SCHOOLS, plan_of, xml
 
 from perception.readers.logs import read_log
 from simulator.cruise import FreeSpace, drive_along
-from simulator.drive import Recorder
 from simulator.driver import Driver
 from simulator.errors import SimulatorError, SimulatorWarning
-from simulator.laser import Laser
 from simulator.plans import Plan
-from simulator.robot import Body, Odometer, SimulatedRobot
+from simulator.robot import Body, Laser, Odometer, Recorder, SimulatedRobot
 from simulator.rounds import Building, Rooms, Round, holds, record_plan
 from simulator.tours import record, simulate
 from simulator.world import World

@@ -18,8 +18,7 @@ from streets import drawn
 from simulator.driver import Driver
 from simulator.errors import SimulatorError
 from simulator.junctions import Panorama, Pilot, Place, compass
-from simulator.laser import BEARINGS, Laser
-from simulator.robot import Body, SimulatedRobot
+from simulator.robot import BEARINGS, Body, Laser, SimulatedRobot
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Theory, Trace, solve

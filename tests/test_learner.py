@@ -28,7 +28,7 @@ from perception.images import images_of
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import learning_curve
 from perception.views import ViewClusterer
-from simulator.laser import BEARINGS, Laser
+from simulator.robot import BEARINGS, Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Theory, Trace, solve

@@ -20,8 +20,8 @@ from perception.recognition import recogniser
 from perception.store import load, save
 from perception.views import ViewClusterer
 from simulator.errors import SimulatorError
-from simulator.laser import BEARINGS, Laser
 from simulator.panorama import CEILING, EYE, STEEPEST, Camera, Light, Paint
+from simulator.robot import BEARINGS, Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.cli import main

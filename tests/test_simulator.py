@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from simulator.driver import LONG, Driver, act, climb, sight
 from simulator.errors import SimulatorError
-from simulator.laser import BEARINGS, Laser
-from simulator.robot import Body, SimulatedRobot, reported
+from simulator.robot import BEARINGS, Body, Laser, SimulatedRobot, reported
 from simulator.tours import noise_model, simulate
 from simulator.world import World
 from ssh_abduction import Trace
@@ -89,7 +88,7 @@ def test_ranges_equal_those_computed_beam_by_beam(x: float, y: float, heading: f
 def test_ranges_of_many_poses_equal_those_of_single_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     poses = np.random.default_rng(0).uniform([0.3, 0.3, -3], [3.7, 1.7, 3], (50, 3))
     together = Laser().exact(RECTANGLE, poses)
-    monkeypatch.setattr("simulator.laser._BLOCK", 180 * 8 * 7)
+    monkeypatch.setattr("simulator.robot._BLOCK", 180 * 8 * 7)
     np.testing.assert_array_equal(Laser().exact(RECTANGLE, poses), together)
     np.testing.assert_array_equal(
         np.vstack([Laser().exact(RECTANGLE, pose) for pose in poses]), together

@@ -16,7 +16,7 @@ from perception.places.following import follow
 from perception.places.importing import stream_visits
 from perception.places.visits import Visit
 from perception.readers.scans import Damage, LaserScanner, RobotLog, Scan
-from simulator.laser import meetings
+from simulator.robot import meetings
 
 # A room of 6 by 5 m with a door, in which a robot drives round and round.
 ROOM = [(0, 0, 6, 0), (0, 0, 0, 5), (0, 5, 2.4, 5), (3.6, 5, 6, 5), (6, 0, 6, 5)]

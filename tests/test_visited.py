@@ -32,7 +32,7 @@ from visited import (
 )
 
 from perception.readers.scans import LaserScanner, RobotLog, Scan
-from simulator.laser import BEAMS, BEARINGS, meetings
+from simulator.robot import BEAMS, BEARINGS, meetings
 from ssh_abduction import SSHMap, Trace, evaluate, solve
 from ssh_abduction.data import Action, DState, Step
 

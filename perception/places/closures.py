@@ -44,6 +44,19 @@ NOISE = (0.1, 0.1, math.radians(1))
 INFLATED, BEND, BENDS, GATE = 10.0, 2e-4, 10, 20.0
 # The drifts of the heading that are tried, in radians per metre.
 DRIFTS = BEND * np.arange(-BENDS, BENDS + 1)
+# Standard deviations of the error of a closure, in metres and radians (docs/measurements/logs.md).
+ERROR = (0.05, 0.05, math.radians(0.5))
+# The factors that are tried, and the standard deviation of the prior of their natural logarithm.
+# Because of this prior, a few closures do not change the covariances much.
+FACTORS = 2.0 ** np.arange(-7, 5, 0.5)
+CHANGE = 0.5
+# WRONG is the share of closures that are wrong. The errors of wrong closures are uniformly
+# distributed in the ellipsoid that the gate of closures allows. VOLUME is the natural logarithm
+# of its volume if the covariance is the unit matrix, so that it is a ball.
+WRONG = 0.02
+VOLUME = math.log(4 / 3 * math.pi * (INFLATED * GATE) ** 1.5)
+# Systematic drift of the heading of a track of matched scans, in radians per metre.
+DRIFT = 0.001
 # Rotations are tried in steps of TURN radians, from the least to the largest that the track allows
 # within SIGMAS standard deviations.
 TURN, SIGMAS = math.radians(6), 3.0
@@ -346,7 +359,19 @@ class _ClosureGraph:
         """
         off, jacobian, solver = self.fit(kept)
         rows = self._moves + np.searchsorted(np.flatnonzero(kept), asked)
-        return np.concatenate([*self._gains(off[rows], jacobian, rows, solver)])
+        found = []
+        for begin in range(0, len(rows), TOGETHER):
+            some = rows[begin : begin + TOGETHER]
+            own = (3 * some[:, None] + np.arange(3)).ravel()
+            dense = jacobian[own].toarray()
+            moved = solver.solve(dense.T).T.reshape(len(some), 3, -1)
+            # How much of its own error each edge takes away by moving the poses.
+            taken = dense.reshape(len(some), 3, -1) @ moved.transpose(0, 2, 1)
+            left = (1 + REGULAR) * np.eye(3) - taken
+            errors = off[some]
+            rest = np.linalg.solve(left, errors[..., None])[..., 0]
+            found.append(np.einsum("ki,ki->k", errors, rest))
+        return np.concatenate(found)
 
     def fit(self, kept: NDArray[np.bool_]) -> tuple[Array, Any, Any]:
         """Fit the poses to the closures kept. The fit begins with the result of the last one.
@@ -374,20 +399,6 @@ class _ClosureGraph:
                 break
             squares, self._unknown = tried[-1]
         return off, jacobian, solver
-
-    def _gains(
-        self, off: Array, jacobian: Any, rows: NDArray[np.int_], solver: Any
-    ) -> Iterator[Array]:
-        """Compute the leave-one-out chi-square of some edges, TOGETHER of them at a time."""
-        for begin in range(0, len(off), TOGETHER):
-            some = off[begin : begin + TOGETHER]
-            own = (3 * rows[begin : begin + TOGETHER, None] + np.arange(3)).ravel()
-            dense = jacobian[own].toarray()
-            found = solver.solve(dense.T).T.reshape(len(some), 3, -1)
-            # How much of its own error each edge takes away by moving the poses.
-            taken = dense.reshape(len(some), 3, -1) @ found.transpose(0, 2, 1)
-            left = (1 + REGULAR) * np.eye(3) - taken
-            yield np.einsum("ki,ki->k", some, np.linalg.solve(left, some[..., None])[..., 0])
 
     def _squares(self, some: NDArray[np.bool_], unknown: Array) -> float:
         """Compute the chi-square of some edges and of the drift."""
@@ -417,3 +428,29 @@ class _ClosureGraph:
         values, of, by = (entry.ravel() for entry in entries)
         jacobian = coo_array((values, (of, by)), shape=(3 * len(first), len(unknown))).tocsr()
         return (whitening @ off[..., None])[..., 0], jacobian
+
+
+def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> float:
+    """Estimate the factor that corrects the covariances of a track; 1 if there is no closure."""
+    if not closings:
+        return 1.0
+    scans = [visit.scan for visit in visits]
+    middles = np.array([visit.middle for visit in visits])
+    first, last = [c.first for c in closings], [c.last for c in closings]
+    matches = np.array([(*c.match.shift, c.match.turn) for c in closings])
+    spreads = np.array(
+        [uncertainty(track, scans[c.first], scans[c.last], middles[c.last]) for c in closings]
+    )
+    spread = FACTORS[:, None, None, None] * spreads + np.diag(ERROR) ** 2  # (factors, closures)
+    inverse, size = np.linalg.inv(spread), np.linalg.slogdet(math.tau * spread)[1]
+    wrong = math.log(WRONG) - VOLUME - np.linalg.slogdet(spreads + np.diag(ERROR) ** 2)[1] / 2
+    best = np.full(len(FACTORS), -np.inf)
+    for drift in DRIFTS:
+        poses = without_drift(middles, track.way[scans], drift)
+        off = errors_of(seen_from(poses[first], poses[last]), matches)
+        squares = np.einsum("ni,fnij,nj->fn", off, inverse, off)
+        right = math.log(1 - WRONG) - (squares + size) / 2
+        fits = np.logaddexp(right, wrong).sum(axis=1) - (drift / DRIFT) ** 2 / 2
+        best = np.maximum(best, fits)
+    best -= (np.log(FACTORS) / CHANGE) ** 2 / 2
+    return float(FACTORS[best.argmax()])

@@ -29,12 +29,10 @@ from perception.places.following import Followed
 from perception.places.local_map import LocalMaps, PackedPatch, Recent
 from perception.places.skeleton import Junction, junctions
 from perception.places.track import Array, Track
-from perception.places.visits import MERGED, Visit, Way
+from perception.places.visits import MERGED, SAME, SHARE, Visit, Way, taken
 from perception.readers.scans import RobotLog, Scan, in_turn
 from ssh_abduction.data.odometry import Pose, radians_between
 
-# Junctions are one place within SAME metres, or within this share of the smaller radius.
-SAME, SHARE = 0.6, 0.5
 # The robot turned around if its directions of motion over some stride in metres, before and after,
 # differ by more than REVERSED radians. It turns on the spot or in a curve, so there are several
 # strides. Other visits are farther away along the trajectory than a stride and than their radius.
@@ -370,7 +368,7 @@ class Stays:
             self._turns.append(_TurningPoint(self._recent.way(last), END, math.pi, last))
         for visit in self._complete(self._limit(horizon)):
             if self._staying and self._comes_back(visit):
-                self._staying = joined(self._staying, visit)
+                self._staying = self._staying.joined(visit)
             else:
                 yield from [self._staying] if self._staying else []
                 patch = self._maps.around(visit.scan, visit.middle, self._half)
@@ -386,7 +384,7 @@ class Stays:
         The visit with the largest product of support (number of scans) and radius is kept.
         """
         last = self._passing
-        near = last is not None and are_near(last, visit)
+        near = last is not None and last.is_near(visit)
         if last is None or not near or not self._may_overlap(last, visit.scan, visit.begin):
             self._settle()
             self._passing = visit
@@ -509,9 +507,7 @@ class Stays:
         for side in (-1, 1):
             bearing = self._crossing(visit, side)
             numbers.append(None if bearing is None else taken(ways, bearing))
-        return with_ways_in_order(
-            replace(visit, ways=tuple(ways), arrived=numbers[0], left=numbers[1])
-        )
+        return replace(visit, ways=tuple(ways), arrived=numbers[0], left=numbers[1]).in_order()
 
     def _crossing(self, visit: Visit, side: int) -> float | None:
         """The direction in radians in which the robot enters (-1) or leaves (1) a place's disc.
@@ -536,38 +532,4 @@ class Stays:
         """Whether a visit continues the last one: the robot left the disc, and soon came back."""
         last = self._staying
         soon = self._recent.way(visit.scan) <= self._left + STAY
-        return last is not None and soon and are_near(last, visit)
-
-
-def are_near(first: Visit, second: Visit) -> bool:
-    """Whether the middles of two visits are so near that they may be one place."""
-    near = max(SAME, SHARE * max(first.radius, second.radius))
-    return math.dist(first.middle, second.middle) < near
-
-
-def joined(first: Visit, last: Visit) -> Visit:
-    """Make one visit of two successive visits to the same place."""
-    ways = list(first.ways)
-    left = None if last.left is None else taken(ways, last.ways[last.left].bearing)
-    return with_ways_in_order(replace(first, end=last.end, ways=tuple(ways), left=left))
-
-
-def with_ways_in_order(visit: Visit) -> Visit:
-    """The visit with its ways in counterclockwise order."""
-    order = sorted(range(len(visit.ways)), key=lambda k: visit.ways[k].bearing)
-    arrived, left = (None if k is None else order.index(k) for k in (visit.arrived, visit.left))
-    return replace(visit, ways=tuple(visit.ways[k] for k in order), arrived=arrived, left=left)
-
-
-def taken(ways: list[Way], bearing: float) -> int:
-    """Find the way out that the robot took, by its bearing in radians, as an index of `ways`.
-
-    The way with nearly this bearing becomes sure. If there is none, a new way is added.
-    """
-    near = [k for k in range(len(ways)) if radians_between(ways[k].bearing, bearing) < MERGED]
-    if not near:
-        ways.append(Way(bearing))
-        return len(ways) - 1
-    k = min(near, key=lambda k: radians_between(ways[k].bearing, bearing))
-    ways[k] = replace(ways[k], sure=True)
-    return k
+        return last is not None and soon and last.is_near(visit)

@@ -516,11 +516,8 @@ def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, 
     in_view = (beam >= 1) & (beam < len(scan.ranges) - 1)
     beam, far = beam[in_view], np.abs(points[in_view])
     ranges = np.nan_to_num(scan.ranges, nan=0.0, posinf=laser.reach)
-    free, wall = (_neighbours(ranges, beam, best) for best in (np.min, np.max))
+    # The nearest and the farthest range of each beam and its two neighbours.
+    around = ranges[[beam - 1, beam, beam + 1]]
+    free, wall = around.min(axis=0), around.max(axis=0)
     margin = MARGIN + MARGIN / 8 * far
     return int((far < free - margin).sum()), int((far < wall + MARGIN).sum())
-
-
-def _neighbours(ranges: Array, beam: Array, best: Callable[..., Array]) -> Array:
-    """For each of k beams, the `best` (np.min or np.max) of its range and its neighbours', (k,)."""
-    return best([ranges[beam - 1], ranges[beam], ranges[beam + 1]], axis=0)

@@ -33,19 +33,7 @@ import numpy as np
 from perception.errors import ImageWarning, LogError
 from perception.places import following, jumps, log_checks
 from perception.places.agreement import disagreement
-from perception.places.closures import (
-    DRIFTS,
-    GATE,
-    INFLATED,
-    VisitMatch,
-    agreeing,
-    errors_of,
-    find_closures,
-    fitted_poses,
-    seen_from,
-    uncertainty,
-    without_drift,
-)
+from perception.places.closures import agreeing, factor_of, find_closures, fitted_poses
 from perception.places.distinctive import WIDTH, WINDOW, find_visits, visits_of
 from perception.places.following import (
     Followed,
@@ -57,7 +45,7 @@ from perception.places.following import (
 )
 from perception.places.log_checks import HOPELESS, LEAST_WAY, Units, units_of
 from perception.places.partings import with_partings
-from perception.places.tracing import DRIFT, starts_of_drives, to_trace
+from perception.places.tracing import starts_of_drives, to_trace
 from perception.places.track import Array, Track
 from perception.places.unrelated import closures_across_cuts
 from perception.places.visits import Visit, patches_of
@@ -89,17 +77,6 @@ _log = log_of("ssh_abduction.perception.places")
 SEEN, MOST_VIEWS = 12, 20
 # Largest share of scans before which a track may be broken.
 MOST_BREAKS = 0.1
-# Standard deviations of the error of a closure, in metres and radians (docs/measurements/logs.md).
-ERROR = (0.05, 0.05, math.radians(0.5))
-# The factors that are tried, and the standard deviation of the prior of their natural logarithm.
-# Because of this prior, a few closures do not change the covariances much.
-FACTORS = 2.0 ** np.arange(-7, 5, 0.5)
-CHANGE = 0.5
-# WRONG is the share of closures that are wrong. The errors of wrong closures are uniformly
-# distributed in the ellipsoid that the gate of `closures` allows. VOLUME is the natural logarithm
-# of its volume if the covariance is the unit matrix, so that it is a ball.
-WRONG = 0.02
-VOLUME = math.log(4 / 3 * math.pi * (INFLATED * GATE) ** 1.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,32 +322,6 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     begin = time.process_time()
     yield
     seconds[stage] = round(time.process_time() - begin, 3)
-
-
-def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMatch]) -> float:
-    """Estimate the factor that corrects the covariances of a track; 1 if there is no closure."""
-    if not closings:
-        return 1.0
-    scans = [visit.scan for visit in visits]
-    middles = np.array([visit.middle for visit in visits])
-    first, last = [c.first for c in closings], [c.last for c in closings]
-    matches = np.array([(*c.match.shift, c.match.turn) for c in closings])
-    spreads = np.array(
-        [uncertainty(track, scans[c.first], scans[c.last], middles[c.last]) for c in closings]
-    )
-    spread = FACTORS[:, None, None, None] * spreads + np.diag(ERROR) ** 2  # (factors, closures)
-    inverse, size = np.linalg.inv(spread), np.linalg.slogdet(math.tau * spread)[1]
-    wrong = math.log(WRONG) - VOLUME - np.linalg.slogdet(spreads + np.diag(ERROR) ** 2)[1] / 2
-    best = np.full(len(FACTORS), -np.inf)
-    for drift in DRIFTS:
-        poses = without_drift(middles, track.way[scans], drift)
-        off = errors_of(seen_from(poses[first], poses[last]), matches)
-        squares = np.einsum("ni,fnij,nj->fn", off, inverse, off)
-        right = math.log(1 - WRONG) - (squares + size) / 2
-        fits = np.logaddexp(right, wrong).sum(axis=1) - (drift / DRIFT) ** 2 / 2
-        best = np.maximum(best, fits)
-    best -= (np.log(FACTORS) / CHANGE) ** 2 / 2
-    return float(FACTORS[best.argmax()])
 
 
 class LiveLog:

@@ -29,17 +29,9 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist, pdist, squareform
 
 from perception.places.closures import VisitMatch
-from perception.places.distinctive import (
-    RIM,
-    SAME,
-    STAY,
-    are_near,
-    joined,
-    taken,
-    with_ways_in_order,
-)
+from perception.places.distinctive import RIM, STAY
 from perception.places.track import Array, Track, points_turned
-from perception.places.visits import Visit, Way
+from perception.places.visits import SAME, Visit, Way, taken
 
 # A stretch reaches REACH metres of trajectory to both sides of a visit. Partings between them and
 # FARTHER metres are found after those, as the trajectories are aligned less well there. The points
@@ -164,9 +156,8 @@ class _DrivePoints:
         arrived, left = (self._crossed(side, middle, ways) for side in sides)
         far = np.hypot(*(self.middles - middle).T) + np.abs(self.ways - way)
         patch = self.visits[int(far.argmin())].patch
-        return with_ways_in_order(
-            Visit(scan, middle, scan, scan, RADIUS, tuple(ways), arrived, left, patch=patch)
-        )
+        visit = Visit(scan, middle, scan, scan, RADIUS, tuple(ways), arrived, left, patch=patch)
+        return visit.in_order()
 
     def _crossed(self, side: range, middle: Array, ways: list[Way]) -> int | None:
         """The index in `ways` of the way by which points leave a disc; None if they stay in it."""
@@ -296,7 +287,7 @@ def _moved(visit: Visit, move: Array) -> Visit:
     for way in visit.ways:
         x, y = rim * math.cos(way.bearing) - move[0], rim * math.sin(way.bearing) - move[1]
         ways.append(replace(way, bearing=math.atan2(y, x)))
-    return with_ways_in_order(replace(visit, middle=visit.middle + move, ways=tuple(ways)))
+    return replace(visit, middle=visit.middle + move, ways=tuple(ways)).in_order()
 
 
 def _change(one: VisitMatch, moves: Array) -> Array:
@@ -315,8 +306,8 @@ def _without_returns(
     number: list[int] = []  # for each visit, the index in `kept` of the visit that it belongs to
     for visit in visits:
         last = kept[-1] if kept else None
-        if last and are_near(last, visit) and _is_soon(track, last, visit):
-            kept[-1] = joined(last, visit)
+        if last and last.is_near(visit) and _is_soon(track, last, visit):
+            kept[-1] = last.joined(visit)
         else:
             kept.append(visit)
         number.append(len(kept) - 1)

@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.places.closures import NOISE, VisitMatch, uncertainty
+from perception.places.closures import DRIFT, NOISE, VisitMatch, uncertainty
 from perception.places.distinctive import RIM, SMALL
 from perception.places.local_map import CELL, PackedPatch
 from perception.places.track import Array, Track, covariance_turned, points_turned, wrapped
@@ -43,9 +43,8 @@ AHEAD = math.radians(15)
 # Additional standard deviations of each displacement, beside those of scan matching, in metres and
 # radians.
 FLOOR = (0.02, 0.02, 0.002)
-# Systematic errors of a track of matched scans: relative error of the scale, and drift of the
-# heading in radians per metre.
-SCALE, DRIFT = 0.01, 0.001
+# Systematic relative error of the scale of a track of matched scans.
+SCALE = 0.01
 # Standard deviation of the bearing of a gateway, in degrees.
 SPREAD = 16.0
 # A course is at most this many metres away from its polygonal chain.
@@ -175,8 +174,10 @@ def _step(
     extra["seen"] = [round(x, 4) for x in seen]
     if scan.corrected is not None:
         truth = {"pose": [round(x, 4) for x in moved(scan.corrected, seen)]}
+    # The ranges that a laser in the middle of the place would measure: (181,), metres.
+    image, _ = _free_along(patch, visit.middle, pose[2] + BEAMS)
     return Step(
-        image=tuple(map(_millimetres, _image(patch, visit.middle, pose[2]).tolist())),
+        image=tuple(map(_millimetres, image.tolist())),
         star=_star(visit, pose[2]),
         displacement=onward,
         covariance=covariance,
@@ -218,11 +219,6 @@ def _star(visit: Visit, heading: float) -> tuple[Gateway, ...]:
 def _clockwise(visit: Visit, heading: float) -> list[Way]:
     """The ways out of a place, clockwise from behind a robot with a heading in radians."""
     return sorted(visit.ways, key=lambda way: (-wrapped(way.bearing - heading), way.sure))
-
-
-def _image(patch: PackedPatch, middle: Array, heading: float) -> Array:
-    """The ranges that a laser in the middle of a place would measure: (181,), metres."""
-    return _free_along(patch, middle, heading + BEAMS)[0]
 
 
 def _branches(visit: Visit, patch: PackedPatch, heading: float) -> list[dict[str, object]]:

@@ -8,9 +8,12 @@ from dataclasses import dataclass, replace
 
 from perception.places.local_map import PackedPatch
 from perception.places.track import Array
+from ssh_abduction.data.odometry import radians_between
 
 # Two ways out whose bearings differ by less than this, in radians, are one.
 MERGED = math.radians(45)
+# Junctions are one place within SAME metres, or within this share of the smaller radius.
+SAME, SHARE = 0.6, 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,23 @@ class Visit:
         """Copy the visit, with its indices of scans increased by `scans`."""
         return replace(self, scan=self.scan + scans, begin=self.begin + scans, end=self.end + scans)
 
+    def is_near(self, other: Visit) -> bool:
+        """Whether the middles of two visits are so near that they may be one place."""
+        near = max(SAME, SHARE * max(self.radius, other.radius))
+        return math.dist(self.middle, other.middle) < near
+
+    def joined(self, last: Visit) -> Visit:
+        """Make one visit of two successive visits to the same place."""
+        ways = list(self.ways)
+        left = None if last.left is None else taken(ways, last.ways[last.left].bearing)
+        return replace(self, end=last.end, ways=tuple(ways), left=left).in_order()
+
+    def in_order(self) -> Visit:
+        """The visit with its ways in counterclockwise order."""
+        order = sorted(range(len(self.ways)), key=lambda k: self.ways[k].bearing)
+        arrived, left = (None if k is None else order.index(k) for k in (self.arrived, self.left))
+        return replace(self, ways=tuple(self.ways[k] for k in order), arrived=arrived, left=left)
+
 
 def patches_of(visits: Sequence[Visit]) -> list[PackedPatch]:
     """Return the local map of each visit. Raises ValueError if one has none."""
@@ -71,3 +91,17 @@ def patches_of(visits: Sequence[Visit]) -> list[PackedPatch]:
             "those of find_visits or stream_visits"
         )
     return found
+
+
+def taken(ways: list[Way], bearing: float) -> int:
+    """Find the way out that the robot took, by its bearing in radians, as an index of `ways`.
+
+    The way with nearly this bearing becomes sure. If there is none, a new way is added.
+    """
+    near = [k for k in range(len(ways)) if radians_between(ways[k].bearing, bearing) < MERGED]
+    if not near:
+        ways.append(Way(bearing))
+        return len(ways) - 1
+    k = min(near, key=lambda k: radians_between(ways[k].bearing, bearing))
+    ways[k] = replace(ways[k], sure=True)
+    return k

@@ -360,6 +360,8 @@ def _record(
     frames: Frames, child: str, parent: str, transform: Any, is_static: bool
 ) -> FrameTransform:
     """Record a message with the transform from a parent frame to a child frame."""
+    from scipy.spatial.transform import Rotation
+
     move, turn = transform.translation, transform.rotation
     flat = flat_pose(move, turn)
     parents = frames.setdefault(child, {})
@@ -372,7 +374,7 @@ def _record(
     parents[parent] = edge  # The parent in the last message comes last.
     edge.translation = np.array([move.x, move.y, move.z])
     if edge.track is None or edge.count == 0 or edge.off != (0.0, 0.0) or flat != edge.first:
-        edge.rotation = _rotation(turn)
+        edge.rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
     edge.count += 1
     x, y, angle = displacement_between(edge.first, flat)
     edge.off = max(edge.off[0], math.hypot(x, y)), max(edge.off[1], abs(angle))
@@ -458,13 +460,6 @@ def flat_pose(position: Any, orientation: Any) -> Pose:
             f"{', '.join(f'{v:g}' for v in numbers)}"
         )
     return position.x, position.y, math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-
-
-def _rotation(q: Any) -> Array:
-    """The rotation matrix of a quaternion, (3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), dtype=np.float64)
 
 
 def stamp_of(header: Any) -> float:

@@ -43,27 +43,8 @@ from dataclasses import dataclass, replace
 from typing import IO
 
 from perception.errors import LogError
-from perception.readers.carmen_survey import (
-    EDGES,
-    KINDS,
-    VERTICES,
-    Findings,
-    Meaning,
-    ScanLine,
-    edge_of,
-    meaning_of,
-    mount_in_log,
-    parameters_of,
-    pose_at,
-    reach_of,
-    refuse_cut,
-    scan_line,
-    survey_of,
-    time_at,
-    vertex_of,
-    without_codes,
-    words,
-)
+from perception.readers import carmen_survey
+from perception.readers.carmen_survey import KINDS, Findings, Meaning, ScanLine, pose_at, time_at
 from perception.readers.lines import LONGEST_LINE, lines
 from perception.readers.scans import (
     Array,
@@ -112,7 +93,7 @@ def read(
     there. `surveyed` is the part of the log that is surveyed; None for all of it. Raises
     LogError if the log holds no scan, or no odometry.
     """
-    found = survey_of(surveyed or file, source, format != "carmen")
+    found = carmen_survey.survey_of(surveyed or file, source, format != "carmen")
     if format == "g2o" and not found.graph.vertices:
         raise LogError(
             f"{source}: expected vertices in lines VERTEX2 or VERTEX_SE2, got none; leave the "
@@ -139,15 +120,15 @@ def read(
     ]
     if others:
         notes.append(f"Scans are read from the lines {kind} only, not from {', '.join(others)}.")
-    meaning = meaning_of(found, survey, kind, source, notes)
+    meaning = carmen_survey.meaning_of(found, survey, kind, source, notes)
     is_corrected = meaning != "edges" or found.graph.is_corrected(CORRECTED)
     if not is_corrected:
         notes.append(
             "The poses of the vertices have not been corrected: they only add up the edges."
         )
     assumed: dict[str, str] = {}
-    mount = mount_in_log(found, survey, meaning, kind)
-    reach = reach_of(found, survey, kind, assumed)
+    mount = carmen_survey.mount_in_log(found, survey, meaning, kind)
+    reach = carmen_survey.reach_of(found, survey, kind, assumed)
     if kind == "FLASER" and "fov" not in found.parameters and survey.beams not in HALF_A_CIRCLE:
         assumed["fov"] = (
             f"The log does not say how wide the laser looks: its {survey.beams} beams are "
@@ -169,14 +150,14 @@ def _scans(
     for number, raw in lines(file, source):
         tag = b""
         try:
-            tokens = words(raw)
+            tokens = carmen_survey.words(raw)
             if not tokens:
                 continue
             tag = tokens[0]
             if tag != kind.encode():
                 odometer.read_line(tag, tokens)
-            elif (line := scan_line(tokens)) is not None:
-                refuse_cut(tag, line.after, odometer.found.usual_length(tag))
+            elif (line := carmen_survey.scan_line(tokens)) is not None:
+                carmen_survey.refuse_cut(tag, line.after, odometer.found.usual_length(tag))
                 seen, pose = _measured(line, mount, reach, fov), odometer.pose_of(line)
                 waiting.append(Scan(*seen, *pose, line.time, number))
         except Damaged as damage:
@@ -214,7 +195,7 @@ class _OdometerPoses:
 
     def read_line(self, tag: bytes, tokens: list[bytes]) -> None:
         """Process a line that is no scan. Raises Damaged."""
-        refuse_cut(tag, len(tokens), self.found.usual_length(tag))
+        carmen_survey.refuse_cut(tag, len(tokens), self.found.usual_length(tag))
         if tag == b"ODOM":
             pose = pose_at(tokens, 1)
             self.behind = self.chain
@@ -229,11 +210,11 @@ class _OdometerPoses:
             self.truth = pose_at(tokens, 1), pose_at(tokens, 4)
         elif tag == b"PARAM":
             # The survey already has parameters and edges. Reading them again reports damaged lines.
-            parameters_of(tokens)
-        elif self.found.graph.vertices and tag in EDGES:
-            edge_of(tokens)
-        elif self.found.graph.vertices and tag in VERTICES:
-            self.news = vertex_of(tokens)[1]
+            carmen_survey.parameters_of(tokens)
+        elif self.found.graph.vertices and tag in carmen_survey.EDGES:
+            carmen_survey.edge_of(tokens)
+        elif self.found.graph.vertices and tag in carmen_survey.VERTICES:
+            self.news = carmen_survey.vertex_of(tokens)[1]
             self.vertex = 0 if self.vertex is None else self.vertex + 1
         elif tag not in OTHERS:
             self.skip_line(tag)
@@ -302,4 +283,4 @@ def _measured(line: ScanLine, mount: Pose, reach: float, fov: float) -> tuple[Ar
         first, step = -fov / 2, fov / max(1, beams - beams % 2)
     else:
         first, step, reach = line.shape
-    return line.ranges, laser_of(first, step, beams, without_codes(reach), mount)
+    return line.ranges, laser_of(first, step, beams, carmen_survey.without_codes(reach), mount)

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from perception.readers.scans import Scan
-    from simulator.drive import RecordedDrive
     from simulator.panorama import Camera
+    from simulator.robot import RecordedDrive
     from ssh_abduction.data.trace import Trace
 
 ENDINGS = (".log", ".clf", ".bag", ".mcap")
@@ -141,9 +141,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _drive(options: argparse.Namespace) -> RecordedDrive:
     """Simulate the drive to write as a robot's log. Raise AbductionError for wrong options."""
-    from simulator.drive import EVERY
     from simulator.plans import Plan
-    from simulator.robot import Odometer
+    from simulator.robot import EVERY, Odometer
     from simulator.rounds import record_plan
     from simulator.tours import record
     from simulator.world import World
@@ -202,7 +201,7 @@ def _write_log(options: argparse.Namespace, drive: RecordedDrive) -> int:
 def scans_of(drive: RecordedDrive) -> Iterator[Scan]:
     """Yield the scans of a drive. Their corrected poses are the true ones."""
     from perception.readers.scans import LaserScanner, Scan
-    from simulator.laser import BEAMS, BEARINGS
+    from simulator.robot import BEAMS, BEARINGS
 
     first, step = float(BEARINGS[0]), float(BEARINGS[1] - BEARINGS[0])
     laser = LaserScanner(first, step, BEAMS, drive.laser.reach)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from perception.features import TellingFeatures
 from perception.recognition import LearningCurve
-from simulator.laser import BEARINGS
+from simulator.robot import BEARINGS
 from simulator.world import World
 from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError

@@ -29,7 +29,7 @@ from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import LearningCurve, learning_curve, recogniser
 from perception.views import ViewClusterer
 from simulator.driver import STILL
-from simulator.laser import Laser
+from simulator.robot import Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace

@@ -17,8 +17,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from perception.images import images_of
 from simulator.driver import STILL, Tolerance
-from simulator.laser import Laser
-from simulator.robot import Body
+from simulator.robot import Body, Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.checks import one_of
