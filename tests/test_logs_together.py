@@ -23,7 +23,7 @@ from perception.places.importing import Imported, import_log
 from perception.places.joining import join_logs
 from perception.places.local_map import CELL, Patch
 from perception.places.matching import Match, Scene
-from perception.places.unrelated import agreeing_matches, without_clashes
+from perception.places.unrelated import DriveScenes, agreeing_matches, without_clashes
 from perception.readers.scans import RobotLog
 from perception.readers.writers import write_carmen
 from simulator.tours import record
@@ -204,8 +204,9 @@ def test_relation_that_puts_walls_into_free_space_does_not_count() -> None:
         return VisitMatch(first, last, Match(1.0, 0.0, np.zeros(2), 1.0, 0.1))
 
     right, wrong = [matched(k, k) for k in range(3)], [matched(k + 1, k) for k in range(2)]
-    assert without_clashes([*wrong, *right], rooms, rooms, poses, poses) == right
-    assert without_clashes(wrong, rooms, rooms, poses, poses) == []
+    drive = DriveScenes(rooms, poses)
+    assert without_clashes([*wrong, *right], drive, drive) == right
+    assert without_clashes(wrong, drive, drive) == []
 
 
 def test_join_logs_keeps_a_single_log(

@@ -42,6 +42,20 @@ BESIDE, CLASHING = 6.0, 0.1
 MATCHED = 200
 
 
+@dataclass(frozen=True, eq=False)
+class DriveScenes:
+    """The visits of a drive, prepared for matching."""
+
+    scenes: Sequence[Scene]  # the local map of each visit
+    poses: Array  # (n, 3) poses of the visits, as `fitted_poses` returns them
+
+    @staticmethod
+    def of(visits: Sequence[Visit], poses: Array) -> DriveScenes:
+        """Prepare the local map of each visit."""
+        pairs = zip(patches_of(visits), visits, strict=True)
+        return DriveScenes([Scene.of(patch, visit.middle) for patch, visit in pairs], poses)
+
+
 def closures_between(
     drives: Sequence[Sequence[Visit]], poses: Sequence[Array]
 ) -> Iterator[VisitMatch]:
@@ -49,14 +63,11 @@ def closures_between(
 
     `poses` has, for each drive, the poses of its visits, as `fitted_poses` returns them.
     """
-    scenes = [scenes_of(visits) for visits in drives]
+    parts = [*map(DriveScenes.of, drives, poses)]
     counts = [0, *accumulate(len(visits) for visits in drives)]
-    pairs = [*combinations(range(len(drives)), 2)]
     found = {
-        (a, b): without_clashes(
-            _reliable_matches(scenes[a], scenes[b]), scenes[a], scenes[b], poses[a], poses[b]
-        )
-        for a, b in pairs
+        (a, b): without_clashes(_reliable_matches(parts[a], parts[b]), parts[a], parts[b])
+        for a, b in combinations(range(len(drives)), 2)
     }
     for (a, b), agreed in agreeing_matches(poses, found).items():
         for closing in _best_of_each_visit(agreed):
@@ -85,20 +96,12 @@ def closures_across_cuts(track: Track, visits: Sequence[Visit], poses: Array) ->
     ]
 
 
-def scenes_of(visits: Sequence[Visit]) -> list[Scene]:
-    """Prepare the local map of each visit for matching."""
-    return [
-        Scene.of(patch, visit.middle)
-        for visit, patch in zip(visits, patches_of(visits), strict=True)
-    ]
-
-
-def _reliable_matches(ours: Sequence[Scene], theirs: Sequence[Scene]) -> list[VisitMatch]:
+def _reliable_matches(ours: DriveScenes, theirs: DriveScenes) -> list[VisitMatch]:
     """Match each visit of a drive with each visit of an earlier one, in all rotations."""
     found: list[VisitMatch] = []
-    for j, scene in enumerate(theirs):
+    for j, scene in enumerate(theirs.scenes):
         turned = Turned.of(scene, TURNS)
-        for i, other in enumerate(ours):
+        for i, other in enumerate(ours.scenes):
             matched = match(other, turned)
             if matched is not None and is_reliable(matched):
                 found.append(VisitMatch(i, j, matched))
@@ -149,42 +152,28 @@ def agreeing_matches(
 
 
 def without_clashes(
-    found: Sequence[VisitMatch],
-    ours: Sequence[Scene],
-    theirs: Sequence[Scene],
-    first: Array,
-    last: Array,
+    found: Sequence[VisitMatch], ours: DriveScenes, theirs: DriveScenes
 ) -> list[VisitMatch]:
-    """Drop the matches of relations that put walls of one drive into free space of the other.
-
-    `first` and `last` have the poses of the visits of each drive, (n, 3).
-    """
-    sets, votes = _support(found, _relations(found, first, last))
+    """Drop the matches of relations that put walls of one drive into free space of the other."""
+    sets, votes = _support(found, _relations(found, ours.poses, theirs.poses))
     judged, kept = np.zeros(len(found), bool), np.ones(len(found), bool)
     # Matches that agree are judged together, those on which most visits agree first.
     for k in sorted(range(len(found)), key=lambda k: -votes[k]):
         if votes[k] > 1 and not judged[k]:
             agreed = [found[i] for i in np.flatnonzero(sets[k]).tolist()]
-            relation = _relations(agreed, first, last)
-            shares = _clashes(relation, ours, theirs, first, last)
+            shares = _clashes(_relations(agreed, ours.poses, theirs.poses), ours, theirs)
             if shares and median(shares) > CLASHING:
                 kept[sets[k] & ~judged] = False
             judged |= sets[k]
     return [one for one, keep in zip(found, kept, strict=True) if keep]
 
 
-def _clashes(
-    relation: _FrameMatches,
-    ours: Sequence[Scene],
-    theirs: Sequence[Scene],
-    first: Array,
-    last: Array,
-) -> list[float]:
+def _clashes(relation: _FrameMatches, ours: DriveScenes, theirs: DriveScenes) -> list[float]:
     """Return the share of wall points in free space for each pair of visits that are near."""
     shares = []
-    for scene, (x, y, turned) in zip(theirs, last, strict=True):
+    for scene, (x, y, turned) in zip(theirs.scenes, theirs.poses, strict=True):
         at, turn, _ = relation.placed(np.array([x, y]))
-        for other, (*middle, bent) in zip(ours, first, strict=True):
+        for other, (*middle, bent) in zip(ours.scenes, ours.poses, strict=True):
             if math.dist(at, middle) < BESIDE:
                 shift = points_turned(-bent, (at - middle)[None])[0]
                 shares.append(other.clash(scene, turn + turned - bent, shift))
