@@ -100,7 +100,10 @@ def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
 
 
 def read_map_file(path: Path) -> MapFile:
-    """Read the YAML file of an occupancy map, but not its image. Raises SimulatorError."""
+    """Read the YAML file of an occupancy map, but not its image, and warn of unknown fields.
+
+    Raises SimulatorError, which names the field.
+    """
     data = read_file(path, LARGEST_TEXT, "the YAML file of an occupancy map", SimulatorError)
     try:
         # Scalars stay texts, as in the parser of map_server. PyYAML reads 5e-2 as a text.
@@ -114,96 +117,59 @@ def read_map_file(path: Path) -> MapFile:
             f"{named(path)}: expected the YAML file of an occupancy map, got no fields in it; "
             "name another file"
         )
-    return _MapFileReader(fields, path).map_file()
-
-
-class _MapFileReader:
-    """Checks the fields of a map file. Errors name the field that is wrong."""
-
-    def __init__(self, fields: Mapping[str, Any], path: Path) -> None:
-        self.fields, self.path = fields, path
-
-    def map_file(self) -> MapFile:
-        """Check all fields, and warn of unknown ones. Raises SimulatorError."""
-        if strange := sorted(set(self.fields) - FIELDS):
-            warnings.warn(
-                f"{named(self.path)}: expected the fields {', '.join(sorted(FIELDS))}, got others, "
-                f"which are not read: {brief(', '.join(strange))}; check their spelling",
-                SimulatorWarning,
-                stacklevel=5,
-            )
-        mode = self._mode()
-        negate = self._truth("negate")
-        if mode == "raw" and negate:
-            raise self._wrong(
-                "negate",
-                "0 in mode raw, where map_server and nav2_map_server disagree on what 1 means",
-            )
-        # Mode scale interpolates between the thresholds, so a default would change every cell.
-        occupied = self._share("occupied_thresh", None if mode == "scale" else OCCUPIED_THRESH)
-        free = self._share("free_thresh", None if mode == "scale" else FREE_THRESH)
-        if mode == "scale" and free >= occupied:
-            raise self._wrong(
-                "free_thresh", f"less than occupied_thresh ({occupied:g}) in mode scale"
-            )
-        place = self._image(), self._resolution(), self._origin()
-        return MapFile(*place, negate, occupied, free, mode)
-
-    def _wrong(self, name: str, expected: str) -> SimulatorError:
-        got = brief(self.fields[name]) if name in self.fields else "none"
-        return SimulatorError(
-            f"{named(self.path)}: {name}: expected {expected}, got {got}; mend it"
+    if strange := sorted(set(fields) - FIELDS):
+        warnings.warn(
+            f"{named(path)}: expected the fields {', '.join(sorted(FIELDS))}, got others, "
+            f"which are not read: {brief(', '.join(strange))}; check their spelling",
+            SimulatorWarning,
+            stacklevel=4,
         )
+    return _checked(fields, path)
 
-    def _image(self) -> Path:
-        value = self.fields.get("image")
-        if not isinstance(value, str) or not value:
-            raise self._wrong("image", "the path of an image, seen from the YAML file")
-        return self.path.parent / value
 
-    def _mode(self) -> Mode:
-        mode = next((mode for mode in MODES if self.fields.get("mode", "trinary") == mode), None)
-        if mode is None:
-            raise self._wrong("mode", f"{', '.join(MODES[:-1])} or {MODES[-1]}")
-        return mode
+def _checked(fields: Mapping[str, Any], path: Path) -> MapFile:
+    """Check the fields of a map file. Raises SimulatorError."""
 
-    def _truth(self, name: str) -> bool:
-        value = self.fields.get(name, "0")
-        if not isinstance(value, str) or value.lower() not in TRUTHS:
-            raise self._wrong(name, "0 or 1")
-        return TRUTHS[value.lower()]
+    def need(name: str, is_good: bool, expected: str) -> None:
+        if not is_good:
+            got = brief(fields[name]) if name in fields else "none"
+            raise SimulatorError(f"{named(path)}: {name}: expected {expected}, got {got}; mend it")
 
-    @staticmethod
-    def _number(value: object) -> float:
-        """Convert a text to a finite number; NaN for anything else."""
-        try:
-            number = float(value) if isinstance(value, str) else math.nan
-        except ValueError:
-            return math.nan
-        return number if math.isfinite(number) else math.nan
+    mode = fields.get("mode", "trinary")
+    need("mode", mode in MODES, f"{', '.join(MODES[:-1])} or {MODES[-1]}")
+    negate = TRUTHS.get(str(fields.get("negate", "0")).lower())
+    need("negate", negate is not None, "0 or 1")
+    disagree = "0 in mode raw, where map_server and nav2_map_server disagree on what 1 means"
+    need("negate", not (negate and mode == "raw"), disagree)
+    # Mode scale interpolates between the thresholds, so a default would change every cell.
+    shares = []
+    for name, usual in (("occupied_thresh", OCCUPIED_THRESH), ("free_thresh", FREE_THRESH)):
+        shares.append(_number(fields.get(name, None if mode == "scale" else usual)))
+        need(name, 0 <= shares[-1] <= 1, "a threshold from 0 to 1")
+    occupied, free = shares
+    less = f"less than occupied_thresh ({occupied:g}) in mode scale"
+    need("free_thresh", mode != "scale" or free < occupied, less)
+    image = fields.get("image")
+    named_image = isinstance(image, str) and image != ""
+    need("image", named_image, "the path of an image, seen from the YAML file")
+    resolution = _number(fields.get("resolution"))
+    need("resolution", 0 < resolution <= FARTHEST, "metres per pixel, above 0")
+    origin = fields.get("origin")
+    place = [_number(item) for item in origin] if isinstance(origin, list) else []
+    is_near = len(place) == 3 and all(abs(number) <= FARTHEST for number in place)
+    need("origin", is_near, f"[x, y, yaw] in metres and radians, of at most {FARTHEST:,.0f}")
+    x, y, yaw = place
+    image = path.parent / str(image)
+    return MapFile(image, resolution, (x, y, yaw), bool(negate), occupied, free, mode)
 
-    def _share(self, name: str, otherwise: float | None) -> float:
-        if name not in self.fields and otherwise is not None:
-            return otherwise
-        number = self._number(self.fields.get(name))
-        if not 0 <= number <= 1:
-            raise self._wrong(name, "a threshold from 0 to 1")
-        return number
 
-    def _resolution(self) -> float:
-        number = self._number(self.fields.get("resolution"))
-        if not 0 < number <= FARTHEST:
-            raise self._wrong("resolution", "metres per pixel, above 0")
-        return number
-
-    def _origin(self) -> tuple[float, float, float]:
-        value = self.fields.get("origin")
-        numbers = [self._number(item) for item in value] if isinstance(value, list) else []
-        if len(numbers) != 3 or not all(abs(number) <= FARTHEST for number in numbers):
-            raise self._wrong(
-                "origin", f"[x, y, yaw] in metres and radians, of at most {FARTHEST:,.0f}"
-            )
-        return numbers[0], numbers[1], numbers[2]
+def _number(value: object) -> float:
+    """Convert a text to a finite number; NaN for anything else."""
+    try:
+        number = float(value) if isinstance(value, str | float) else math.nan
+    except ValueError:
+        return math.nan
+    return number if math.isfinite(number) else math.nan
 
 
 def _cells(fields: MapFile, path: Path) -> Cells:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -264,7 +265,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tupl
 
 
 class _PlanReader:
-    """Reads the XML of a plan. All methods but `wrong` raise SimulatorError for wrong parts."""
+    """Reads the XML of a plan. All methods raise SimulatorError for wrong parts."""
 
     def __init__(self, where: str) -> None:
         self.where = where
@@ -273,12 +274,10 @@ class _PlanReader:
         """Read the rooms and doors of a plan."""
         scale = self.scale(building)
         spaces = building.findall("floor/spaces/space")
-        if not spaces:
-            raise self.wrong("floor/spaces", "at least one space", None)
+        self.need(spaces, "floor/spaces", "at least one space", None)
         rooms = tuple(self.room(space, f"space[{i}]", scale) for i, space in enumerate(spaces))
         numbers = {room.name: i for i, room in enumerate(rooms)}
-        if len(numbers) < len(rooms):
-            raise self.wrong("space", "a unique id for each space", None)
+        self.need(len(numbers) == len(rooms), "space", "a unique id for each space", None)
         # Collect the positions of each door from both of its rooms.
         sides: dict[tuple[int, int], dict[int, list[Point]]] = {}
         for here, space in enumerate(spaces):
@@ -297,12 +296,11 @@ class _PlanReader:
         )
         return rooms, doors
 
-    def wrong(self, name: str, expected: str, value: object) -> SimulatorError:
-        """Make the error that a part of the plan is wrong."""
-        return SimulatorError(
-            f"{self.where}: {name}: expected {expected}, got "
-            f"{'none' if value is None else brief(value)}; mend it"
-        )
+    def need(self, is_good: object, name: str, expected: str, value: object) -> None:
+        """Raise SimulatorError if a part of the plan is not what is expected."""
+        if not is_good:
+            got = "none" if value is None else brief(value)
+            raise SimulatorError(f"{self.where}: {name}: expected {expected}, got {got}; mend it")
 
     def scale(self, building: Element) -> float:
         """Read the size of a pixel in metres."""
@@ -311,16 +309,14 @@ class _PlanReader:
         )
         length = self.number(building.findtext("scale/real_distance/value"), "scale/real_distance")
         unit = building.findtext("scale/real_distance/um")
-        if unit not in METRES:
-            raise self.wrong("scale/real_distance/um", " or ".join(METRES), unit)
-        if not (pixels > 0 and length > 0):
-            raise self.wrong("scale", "distances above 0", [pixels, length])
-        return METRES[unit] * length / pixels
+        self.need(unit in METRES, "scale/real_distance/um", " or ".join(METRES), unit)
+        self.need(pixels > 0 and length > 0, "scale", "distances above 0", [pixels, length])
+        return METRES[str(unit)] * length / pixels
 
     def room(self, space: Element, where: str, scale: float) -> Room:
         """Read a room."""
-        if not (name := space.get("id")):
-            raise self.wrong(f"{where}.id", "a text", name)
+        name = space.get("id", "")
+        self.need(name, f"{where}.id", "a text", space.get("id"))
         corners = tuple(
             self.point(point, where, scale) for point in space.findall("bounding_polygon/point")
         )
@@ -333,32 +329,31 @@ class _PlanReader:
         """Read the indices of the two rooms of a door, in ascending order."""
         names = [target.text or "" for target in portal.findall("target/id")]
         rooms = sorted({numbers[name] for name in names if name in numbers})
-        if len(names) != 2 or len(rooms) != 2 or here not in rooms:
-            raise self.wrong(f"{where}.target", "the ids of this space and of another one", names)
+        is_pair = len(names) == len(rooms) == 2 and here in rooms
+        self.need(is_pair, f"{where}.target", "the ids of this space and of another one", names)
         return rooms[0], rooms[1]
 
     def middle(self, line: Element, scale: float) -> Point:
         """Read a line, and return its middle in metres."""
         ends = [self.point(point, "linesegment", scale) for point in line.findall("point")]
-        if not ends:
-            raise self.wrong("linesegment", "points", None)
+        self.need(ends, "linesegment", "points", None)
         return _mean(ends)
 
     def point(self, point: Element | None, where: str, scale: float) -> Point:
         """Read a point, and convert it to metres. In drawings y points down; here it points up."""
-        if point is None:
-            raise self.wrong(f"{where}.point", "x and y", None)
+        self.need(point is not None, f"{where}.point", "x and y", None)
+        assert point is not None
         x, y = (self.number(point.get(name), f"{where}.{name}") for name in "xy")
         return scale * x, -scale * y
 
     def number(self, text: str | None, where: str) -> float:
         """Read a number of at most a million."""
-        try:
+        value: float | None = None
+        with suppress(ValueError):
             value = float(text or "")
-        except ValueError:
-            raise self.wrong(where, "a number", text) from None
-        if not abs(value) <= 1e6:
-            raise self.wrong(where, "a number of at most 1,000,000", text)
+        self.need(value is not None, where, "a number", text)
+        assert value is not None
+        self.need(abs(value) <= 1e6, where, "a number of at most 1,000,000", text)
         return value
 
 

@@ -391,16 +391,17 @@ class WorldReader(FieldReader):
 
     error, mend = SimulatorError, "mend it (docs/reference/worlds.md)"
 
+    def need(self, is_good: bool, name: str, expected: str, value: Any) -> None:
+        """Raise SimulatorError if a value is not what is expected."""
+        if not is_good:
+            raise self.wrong(name, expected, value)
+
     def fields(self, data: Any) -> dict[str, Any]:
         """Read the arguments of `World`, by name, from a JSON object."""
-        if (
-            not isinstance(data, Mapping)
-            or data.get("format") != FORMAT
-            or data.get("version") != VERSION
-        ):
-            raise self.wrong(
-                "format", f'an object with "format": "{FORMAT}", "version": {VERSION}', data
-            )
+        head = {"format": FORMAT, "version": VERSION}
+        is_world = isinstance(data, Mapping) and all(data.get(k) == v for k, v in head.items())
+        expected = f'an object with "format": "{FORMAT}", "version": {VERSION}'
+        self.need(is_world, "format", expected, data)
         segments, each = self.walls(data), partial(self.each, data, optional=True)
         # Places are those of dstates and those listed; routes may also lead through other points.
         dstates = each("dstates", self.dstate)
@@ -437,17 +438,15 @@ class WorldReader(FieldReader):
         ]
         if "occupancy" in data:
             walls.append(self.occupancy(data["occupancy"]))
-        if not walls:
-            raise self.wrong(
-                "polygons", "at least one wall in polygons, segments, arcs or occupancy", []
-            )
+        expected = "at least one wall in polygons, segments, arcs or occupancy"
+        self.need(bool(walls), "polygons", expected, [])
         return np.vstack(walls)
 
     def row(self, value: Any, count: int, name: str) -> Array:
         """Read a list of `count` finite numbers: (count,)."""
-        good = isinstance(value, list) and len(value) == count
-        if not good or not all(is_finite(x) and abs(x) <= FARTHEST for x in value):
-            raise self.wrong(name, f"{count} finite numbers, of at most {FARTHEST:,.0f}", value)
+        is_row = isinstance(value, list) and len(value) == count
+        is_good = is_row and all(is_finite(x) and abs(x) <= FARTHEST for x in value)
+        self.need(is_good, name, f"{count} finite numbers, of at most {FARTHEST:,.0f}", value)
         return np.array(value, dtype=float)
 
     def segment(self, value: Any, name: str) -> Array:
@@ -456,8 +455,8 @@ class WorldReader(FieldReader):
 
     def loop(self, value: Any, name: str) -> Array:
         """Read a list of points, and make the sides of the closed polygon: (n, 4), metres."""
-        if not isinstance(value, list) or len(value) < 3:
-            raise self.wrong(name, "at least three points [x, y]", value)
+        is_loop = isinstance(value, list) and len(value) >= 3
+        self.need(is_loop, name, "at least three points [x, y]", value)
         points = np.array([self.row(p, 2, f"{name}[{i}]") for i, p in enumerate(value)])
         return np.hstack([points, np.roll(points, -1, axis=0)])
 
@@ -468,20 +467,15 @@ class WorldReader(FieldReader):
         counterclockwise.
         """
         x, y, radius, first, last = self.row(value, 5, name)
-        if not radius > 0 or not 0 < last - first <= 360:
-            raise self.wrong(
-                name,
-                "[x, y, radius above 0, from, to], where `to` is up to 360 degrees above `from`",
-                value,
-            )
+        expected = "[x, y, radius above 0, from, to], where `to` is up to 360 degrees above `from`"
+        self.need(radius > 0 and 0 < last - first <= 360, name, expected, value)
         angles = np.radians(np.linspace(first, last, 1 + math.ceil((last - first) / ARC)))
         points = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
         return np.hstack([points[:-1], points[1:]])
 
     def occupancy(self, value: Any) -> Array:
         """Read the walls, (n, 4) metres, of an occupancy map in a file beside this one."""
-        if not isinstance(value, str):
-            raise self.wrong("occupancy", "the name of a YAML file", value)
+        self.need(isinstance(value, str), "occupancy", "the name of a YAML file", value)
         return read_occupancy(Path(self.where).parent / value)[1]
 
     def ragged(self, walls: Array, value: Any) -> Array:
@@ -490,16 +484,13 @@ class WorldReader(FieldReader):
         The shifts are always the same, so that a world looks the same on each drive.
         `value` is the standard deviation of the shifts in metres; 0 changes nothing.
         """
-        if not is_finite(value) or not 0 <= value <= 1:
-            raise self.wrong("ragged", "metres by which walls are uneven, 0 to 1", value)
+        is_share = is_finite(value) and 0 <= value <= 1
+        self.need(is_share, "ragged", "metres by which walls are uneven, 0 to 1", value)
         if not value:
             return walls
-        if np.hypot(*(walls[:, 2:] - walls[:, :2]).T).sum() > LONGEST:
-            raise self.wrong(
-                "ragged",
-                f"walls of at most {LONGEST:,} m together, as uneven walls have many pieces",
-                value,
-            )
+        is_short = np.hypot(*(walls[:, 2:] - walls[:, :2]).T).sum() <= LONGEST
+        expected = f"walls of at most {LONGEST:,} m together, as uneven walls have many pieces"
+        self.need(is_short, "ragged", expected, value)
         pieces = []
         for x1, y1, x2, y2 in walls:
             line = np.linspace(
@@ -515,10 +506,9 @@ class WorldReader(FieldReader):
 
     def points(self, value: Any, name: str) -> dict[str, Point]:
         """Read an object of points: a dict from name to (x, y) in metres."""
-        if not isinstance(value, Mapping):
-            raise self.wrong(name, "an object of names and points [x, y]", value)
-        if clash := next((text for text in value if text in ACTIONS or "," in text), None):
-            raise self.wrong(name, "names without commas that are no actions", clash)
+        self.need(isinstance(value, Mapping), name, "an object of names and points [x, y]", value)
+        clash = next((text for text in value if text in ACTIONS or "," in text), None)
+        self.need(not clash, name, "names without commas that are no actions", clash)
         found = {
             text: self.row(point, 2, f"{name}.{text}").tolist() for text, point in value.items()
         }
@@ -526,11 +516,11 @@ class WorldReader(FieldReader):
 
     def lift(self, value: Any, name: str) -> Lift:
         """Read a lift: an object with name, from and to."""
-        if not isinstance(value, Mapping) or not isinstance(value.get("name"), str):
-            raise self.wrong(name, "an object with name, from and to", value)
+        is_named = isinstance(value, Mapping) and isinstance(value.get("name"), str)
+        self.need(is_named, name, "an object with name, from and to", value)
         action = value["name"]
-        if not action or action in ACTIONS or "," in action:
-            raise self.wrong(f"{name}.name", "a name without commas that is no action", action)
+        is_new = action and action not in ACTIONS and "," not in action
+        self.need(is_new, f"{name}.name", "a name without commas that is no action", action)
         start, end = (self.row(value.get(k), 2, f"{name}.{k}") for k in ("from", "to"))
         return Lift(action, (float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
 
@@ -541,25 +531,19 @@ class WorldReader(FieldReader):
         actions = [*ACTIONS, *dict.fromkeys(lift.name for lift in lifts)]
         by_places = any(isinstance(stop, str) and stop in stops for stop in value)
         for i, stop in enumerate(value):
-            if by_places and not (isinstance(stop, str) and stop in stops):
-                raise self.wrong(
-                    f"route[{i}]",
-                    f"a place ({', '.join(stops)}), as there are others in the route",
-                    stop,
-                )
-            if not by_places and stop not in actions:
-                raise self.wrong(
-                    f"route[{i}]",
-                    f"{', '.join(actions[:-1])} or {actions[-1]}"
-                    + (", or the name of a place" if stops else ""),
-                    stop,
-                )
+            if by_places:
+                is_good = isinstance(stop, str) and stop in stops
+                expected = f"a place ({', '.join(stops)}), as there are others in the route"
+            else:
+                is_good, expected = stop in actions, f"{', '.join(actions[:-1])} or {actions[-1]}"
+                expected += ", or the name of a place" if stops else ""
+            self.need(is_good, f"route[{i}]", expected, stop)
         return tuple(value)
 
     def reach(self, value: Any) -> float:
         """Check the reach, in metres."""
-        if not is_finite(value) or not NEAREST <= value <= FARTHEST:
-            raise self.wrong("reach", f"metres above 0, {NEAREST} to {FARTHEST:,.0f}", value)
+        is_good = is_finite(value) and NEAREST <= value <= FARTHEST
+        self.need(is_good, "reach", f"metres above 0, {NEAREST} to {FARTHEST:,.0f}", value)
         return float(value)
 
     def angles(self, value: Any, walls: Array) -> Angles:
@@ -568,8 +552,7 @@ class WorldReader(FieldReader):
         If the file says nothing (None), it is "right" if nearly all walls have one of two
         perpendicular directions, else "any". Raises SimulatorError for another value.
         """
-        if value not in (None, "right", "any"):
-            raise self.wrong("angles", '"right" or "any"', value)
+        self.need(value in (None, "right", "any"), "angles", '"right" or "any"', value)
         chosen: Angles = value or ("right" if are_square(walls) else "any")
         return chosen
 
@@ -580,12 +563,11 @@ class WorldReader(FieldReader):
 
     def clutter(self, value: Any, name: str) -> Clutter:
         """Read a polygon that may move."""
-        if not isinstance(value, Mapping):
-            raise self.wrong(name, "an object with a polygon", value)
+        self.need(isinstance(value, Mapping), name, "an object with a polygon", value)
         moves = self.row(value.get("moves", [0, 0]), 2, f"{name}.moves")
         present = value.get("present", 1.0)
-        if not is_finite(present) or not 0 <= present <= 1:
-            raise self.wrong(f"{name}.present", "a probability", present)
+        is_share = is_finite(present) and 0 <= present <= 1
+        self.need(is_share, f"{name}.present", "a probability", present)
         return Clutter(
             self.loop(value.get("polygon"), f"{name}.polygon"),
             (float(moves[0]), float(moves[1])),
@@ -594,13 +576,13 @@ class WorldReader(FieldReader):
 
     def dstate(self, value: Any, name: str) -> TrueDState:
         """Read a true dstate."""
-        if not isinstance(value, Mapping) or value.get("direction") not in (1, -1):
-            raise self.wrong(
-                name, "an object with name, place, path, direction 1 or -1, pose", value
-            )
+        is_state = isinstance(value, Mapping) and value.get("direction") in (1, -1)
+        self.need(
+            is_state, name, "an object with name, place, path, direction 1 or -1, pose", value
+        )
         texts = [value.get(key) for key in ("name", "place", "path")]
-        if not all(isinstance(text, str) for text in texts):
-            raise self.wrong(name, "texts for name, place and path", value)
+        are_texts = all(isinstance(text, str) for text in texts)
+        self.need(are_texts, name, "texts for name, place and path", value)
         label, place, path = map(str, texts)
         pose = self.pose(value.get("pose"), f"{name}.pose")
         return TrueDState(label, place, path, int(value["direction"]), pose)
