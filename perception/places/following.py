@@ -130,7 +130,8 @@ def _stands(log: RobotLog, track: Track, first: int, last: int) -> bool:
     for scan in log.scans[last : last + IN_A_ROW]:
         if len(seen := surfaces_in(scan)):
             onward = displacement_between(begin, scan.odometry)
-            pose, _, share = _matched(seen, known, track.pose(first - 1), onward, wide)
+            motion = _ScanMotion(scan, seen, known, track.pose(first - 1), onward, onward)
+            pose, _, share = motion.matched(onward, wide)
             turns.append(abs(wrapped(pose[2] - track.poses[first - 1, 2] - onward[2])))
             shares.append(share)
     if not shares:  # the laser sees nothing
@@ -223,7 +224,7 @@ class _ScanMotion:
 
     scan: Scan  # the next scan
     seen: Surfaces  # the surfaces that it shows
-    recent: deque[Surfaces]  # the surfaces in previous scans, in the frame of the track
+    recent: Iterable[Surfaces]  # the surfaces in previous scans, in the frame of the track
     last: Pose  # pose of the previous scan
     onward: Pose  # the motion by odometry
     before: Pose  # the motion to the previous scan
@@ -240,7 +241,7 @@ class _ScanMotion:
         # An odometer that misses a large turn stands still. In corridors, scans that hardly
         # overlap match as well if they are turned around.
         most = TURNED if any(self.onward) else math.pi
-        found = _matched(self.seen, self.recent, self.last, self.onward, prior, most)
+        found = self.matched(self.onward, prior, most)
         if found[2] < POOR and doubt in (Doubt.DOUBTFUL, Doubt.SEAM):
             if other := self._without_odometry():
                 return other
@@ -248,16 +249,47 @@ class _ScanMotion:
                 return nowhere
         return Followed(self.scan, *found)
 
+    def matched(
+        self, onward: Pose, prior: Array, most: float = math.pi
+    ) -> tuple[Pose, Array, float]:
+        """Match a scan with the walls that previous scans saw.
+
+        `onward` is the expected motion since the previous scan, `prior` its (3, 3) covariance. The
+        heading differs by at most `most` radians. Returns the pose; the covariance of the motion,
+        in the frame of the robot at the previous scan; and the share of the points on walls.
+        """
+        walls = Surfaces.joined(self.recent)
+        guess: Array = np.array(moved(self.last, onward))
+        weight: Array = np.asarray(
+            np.linalg.inv(covariance_turned(self.last[2], prior)), np.float64
+        )
+        pose, information, share = guess, weight, 0.0
+        if len(walls) and len(self.seen):
+            fit = ScanFit(self.seen.some(POINTS), walls)
+            share, pose, information = fit.improved(guess, weight)
+            # A poor match may have a wrong heading: try others.
+            if share < POOR and len(self.seen) >= FEW_POINTS:
+                turns = (wrapped(2 * math.pi * k / HEADINGS) for k in range(HEADINGS))
+                turned = [guess + np.array([0, 0, turn]) for turn in turns if abs(turn) <= most]
+                best = max(
+                    (fit.improved(other, weight) for other in turned), key=lambda found: found[0]
+                )
+                if best[0] > 1.5 * share:
+                    share, pose, information = best
+        covariance = covariance_turned(-self.last[2], _accumulating(information, weight))
+        off = pose - guess
+        astray = np.array([*points_turned(-self.last[2], off[:2]), wrapped(float(off[2]))])
+        if share < CLEAR and astray @ np.linalg.solve(prior, astray) > CONTRARY:
+            covariance += np.diag(astray**2)
+        return (float(pose[0]), float(pose[1]), wrapped(float(pose[2]))), covariance, share
+
     def _without_odometry(self) -> Followed | None:
         """Match the scan without odometry; None if it does not match.
 
         Two guesses are tried: the robot moved as it did before, or it stood still.
         """
         wide = np.diag(UNKNOWN) ** 2
-        onward, stayed = (
-            _matched(self.seen, self.recent, self.last, guess, wide)
-            for guess in (self.before, (0.0, 0.0, 0.0))
-        )
+        onward, stayed = (self.matched(guess, wide) for guess in (self.before, (0.0, 0.0, 0.0)))
         best = stayed if stayed[2] > onward[2] + ALIKE else onward
         return Followed(self.scan, *best, cut=True) if best[2] >= SURE else None
 
@@ -279,44 +311,6 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
         if abs(off) > TURNED and track.shares[i] >= POOR and i not in track.cuts:
             found.append((i, off))
     return found
-
-
-def _matched(
-    seen: Surfaces,
-    recent: Iterable[Surfaces],
-    last: Pose,
-    onward: Pose,
-    prior: Array,
-    most: float = math.pi,
-) -> tuple[Pose, Array, float]:
-    """Match a scan with the walls that previous scans saw.
-
-    `onward` is the expected motion since the previous scan, `prior` its (3, 3) covariance. The
-    heading differs by at most `most` radians. Returns the pose; the covariance of the motion, in
-    the frame of the robot at the previous scan; and the share of the points on walls.
-    """
-    walls = Surfaces.joined(recent)
-    guess: Array = np.array(moved(last, onward))
-    weight: Array = np.asarray(np.linalg.inv(covariance_turned(last[2], prior)), np.float64)
-    pose, information, share = guess, weight, 0.0
-    if len(walls) and len(seen):
-        fit = ScanFit(seen.some(POINTS), walls)
-        share, pose, information = fit.improved(guess, weight)
-        # A poor match may have a wrong heading: try others.
-        if share < POOR and len(seen) >= FEW_POINTS:
-            turns = (wrapped(2 * math.pi * k / HEADINGS) for k in range(HEADINGS))
-            turned = [guess + np.array([0, 0, turn]) for turn in turns if abs(turn) <= most]
-            best = max(
-                (fit.improved(other, weight) for other in turned), key=lambda found: found[0]
-            )
-            if best[0] > 1.5 * share:
-                share, pose, information = best
-    covariance = covariance_turned(-last[2], _accumulating(information, weight))
-    off = pose - guess
-    astray = np.array([*points_turned(-last[2], off[:2]), wrapped(float(off[2]))])
-    if share < CLEAR and astray @ np.linalg.solve(prior, astray) > CONTRARY:
-        covariance += np.diag(astray**2)
-    return (float(pose[0]), float(pose[1]), wrapped(float(pose[2]))), covariance, share
 
 
 def _accumulating(information: Array, prior: Array) -> Array:

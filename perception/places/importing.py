@@ -79,6 +79,16 @@ SEEN, MOST_VIEWS = 12, 20
 MOST_BREAKS = 0.1
 
 
+Tell = Callable[[str], None]  # a function that takes notes
+# A log with checked odometry, its track, and notes on suspicious odometry.
+Tracked = tuple[RobotLog, Track, tuple[str, ...]]
+Seconds = dict[str, float]  # processor time by stage
+
+
+def tell_nobody(note: object) -> None:
+    """Take a note, and do nothing."""
+
+
 @dataclass(frozen=True, eq=False)
 class Imported:
     """Result of `import_log`."""
@@ -97,10 +107,7 @@ class Imported:
 
 
 def import_log(
-    log: RobotLog,
-    width: float = WIDTH,
-    name: str | None = None,
-    tell: Callable[[str], None] = lambda note: None,
+    log: RobotLog, width: float = WIDTH, name: str | None = None, tell: Tell = tell_nobody
 ) -> Imported:
     """Import a log as a trace.
 
@@ -110,7 +117,7 @@ def import_log(
     distinctive place or hardly moved, the scans do not match, or the width is no positive number.
     """
     a_number("width", width, LogError, above=0, what="metres", mend="give the width of the robot")
-    seconds: dict[str, float] = {}
+    seconds: Seconds = {}
     if not any(((scan.ranges > 0) & (scan.ranges < scan.laser.reach)).any() for scan in log.scans):
         raise LogError(
             f"{named(log.source)}: expected scans that meet walls, got {len(log)} in which no "
@@ -122,15 +129,15 @@ def import_log(
     _refuse_bad(log, track, notes)
     with _timed(seconds, "places"):
         visits = find_visits(log, track, width)
-    return _imported(log, track, visits, width, name, notes, seconds)
+    return _imported((log, track, notes), visits, width, name, seconds)
 
 
 def import_live(
     items: Iterable[Scan | Damage],
     width: float = WIDTH,
     name: str | None = None,
-    tell: Callable[[str], None] = lambda note: None,
-    show: Callable[[Visit], None] = lambda visit: None,
+    tell: Tell = tell_nobody,
+    show: Callable[[Visit], None] = tell_nobody,
     source: str = "",
 ) -> tuple[RobotLog, Imported]:
     """Import a log as a trace while it is read or recorded.
@@ -154,7 +161,7 @@ def import_live(
     Raises:
         LogError: As `import_log`, or an item is no scan.
     """
-    seconds: dict[str, float] = {}
+    seconds: Seconds = {}
     live = LiveLog(items, width, tell, source)
     visits: list[Visit] = []
     with _timed(seconds, "places"):
@@ -164,7 +171,7 @@ def import_live(
         log, track, notes = live.result()
     del live  # It has a copy of the track.
     _refuse_bad(log, track, notes)
-    return log, _imported(log, track, tuple(visits), width, name, notes, seconds)
+    return log, _imported((log, track, notes), tuple(visits), width, name, seconds)
 
 
 def _refuse_bad(log: RobotLog, track: Track, notes: Sequence[str]) -> None:
@@ -191,15 +198,10 @@ def _refuse_bad(log: RobotLog, track: Track, notes: Sequence[str]) -> None:
 
 
 def _imported(
-    log: RobotLog,
-    track: Track,
-    visits: tuple[Visit, ...],
-    width: float,
-    name: str | None,
-    notes: tuple[str, ...],
-    seconds: dict[str, float],
+    found: Tracked, visits: tuple[Visit, ...], width: float, name: str | None, seconds: Seconds
 ) -> Imported:
     """Make the trace of the visits, and gather the result of an import. Raises LogError."""
+    log, track, notes = found
     if not visits:
         raise _noted(
             f"{named(log.source)}: expected a way past junctions or turning points, got "
@@ -221,9 +223,7 @@ def _imported(
 
 
 def stream_visits(
-    scans: Iterable[Scan | Damage],
-    width: float = WIDTH,
-    tell: Callable[[str], None] = lambda note: None,
+    scans: Iterable[Scan | Damage], width: float = WIDTH, tell: Tell = tell_nobody
 ) -> Iterator[Visit]:
     """Find the distinctive places that a robot passes, while it drives.
 
@@ -255,9 +255,7 @@ def stream_visits(
     return LiveLog(scans, width, tell).visits()
 
 
-def tracked(
-    log: RobotLog, tell: Callable[[str], None] = lambda note: None
-) -> tuple[RobotLog, Track, tuple[str, ...]]:
+def tracked(log: RobotLog, tell: Tell = tell_nobody) -> Tracked:
     """Compute the trajectory of a robot from its log.
 
     Return the log with the odometry of a single source, in metres and radians; its track; and
@@ -318,7 +316,7 @@ def with_views(trace: Trace) -> Trace:
 
 
 @contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+def _timed(seconds: Seconds, stage: str) -> Iterator[None]:
     begin = time.process_time()
     yield
     seconds[stage] = round(time.process_time() - begin, 3)
@@ -334,7 +332,7 @@ class LiveLog:
         self,
         items: Iterable[Scan | Damage],
         width: float = WIDTH,
-        tell: Callable[[str], None] = lambda note: None,
+        tell: Tell = tell_nobody,
         source: str = "",
     ) -> None:
         mend = "give the width of the robot"
@@ -357,7 +355,7 @@ class LiveLog:
         """Yield each visit with its local map, in order, when it is final."""
         return visits_of(self._followed(), self._width)
 
-    def result(self) -> tuple[RobotLog, Track, tuple[str, ...]]:
+    def result(self) -> Tracked:
         """Return the log, its track and notes. Call this after `visits` has yielded all visits.
 
         Hardly any scan has ranges. Raises LogError if there is no scan.
@@ -428,7 +426,7 @@ class LiveLog:
 class Teller:
     """Tells each kind of note once to a function `tell`, as soon as it is known."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
+    def __init__(self, tell: Tell) -> None:
         self._tell = tell
         self.notes: list[str] = []  # the notes so far
         self._kinds: set[str] = set()

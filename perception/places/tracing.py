@@ -35,6 +35,7 @@ from ssh_abduction.data.odometry import (
 from ssh_abduction.data.star import Gateway
 from ssh_abduction.data.trace import Action, Step, Trace
 
+Stop = tuple[Visit, Pose]  # a visit, and the pose of the robot in it
 # How much two visits to one place differ: standard deviations of its middle, in metres, and of the
 # direction of a way out, in radians (docs/measurements/logs.md).
 MIDDLE, DIRECTION = 0.15, 0.1
@@ -68,16 +69,17 @@ def to_trace(
     previous step, and the next action.
     """
     steps: list[Step] = []
-    last: tuple[Visit, Pose] | None = None
+    last: Stop | None = None
     arrivals: list[tuple[int, float]] = []  # the first step of each visit, and its heading
     # For each visit with which another drive starts, the number of this drive.
     drives = {visit: drive for drive, visit in enumerate(starts_of_drives(track, visits), 2)}
-    for number, (visit, patch) in enumerate(zip(visits, patches_of(visits), strict=True)):
+    patches_of(visits)  # each visit has one
+    for number, visit in enumerate(visits):
         headings = _headings(visit, track)
         arrivals.append((len(steps), headings[0]))
         for heading in headings:
             pose = (float(visit.middle[0]), float(visit.middle[1]), heading)
-            steps.append(_step(log, track, visit, pose, patch, last, number))
+            steps.append(_step(log, track, number, visit, pose, last))
             last = (visit, pose)
         if number < len(visits) - 1:
             extra = dict(steps[-1].extra)
@@ -142,18 +144,13 @@ def _headings(visit: Visit, track: Track) -> list[float]:
 
 
 def _step(
-    log: RobotLog,
-    track: Track,
-    visit: Visit,
-    pose: Pose,
-    patch: PackedPatch,
-    last: tuple[Visit, Pose] | None,
-    number: int,
+    log: RobotLog, track: Track, number: int, visit: Visit, pose: Pose, last: Stop | None
 ) -> Step:
     """Make one step, without its action.
 
     The displacement leads from the pose of the `last` step, unless the track is cut between.
     """
+    assert visit.patch is not None
     onward = covariance = None
     cuts = [] if last is None else track.cuts_between(last[0].scan, visit.scan)
     if last is not None and not cuts:
@@ -168,14 +165,14 @@ def _step(
     if cuts:  # They explain why there is no displacement.
         extra["cuts"] = cuts
     if visit.ways:
-        extra["branches"] = _branches(visit, patch, pose[2])
+        extra["branches"] = _branches(visit, visit.patch, pose[2])
     truth = None
     seen = displacement_between(track.pose(visit.scan), pose)
     extra["seen"] = [round(x, 4) for x in seen]
     if scan.corrected is not None:
         truth = {"pose": [round(x, 4) for x in moved(scan.corrected, seen)]}
     # The ranges that a laser in the middle of the place would measure: (181,), metres.
-    image, _ = _free_along(patch, visit.middle, pose[2] + BEAMS)
+    image, _ = _free_along(visit.patch, visit.middle, pose[2] + BEAMS)
     return Step(
         image=tuple(map(_millimetres, image.tolist())),
         star=_star(visit, pose[2]),

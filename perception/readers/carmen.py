@@ -44,7 +44,15 @@ from typing import IO
 
 from perception.errors import LogError
 from perception.readers import carmen_survey
-from perception.readers.carmen_survey import KINDS, Findings, Meaning, ScanLine, pose_at, time_at
+from perception.readers.carmen_survey import (
+    KINDS,
+    Findings,
+    Meaning,
+    Odom,
+    ScanLine,
+    pose_at,
+    time_at,
+)
 from perception.readers.lines import LONGEST_LINE, lines
 from perception.readers.scans import (
     Array,
@@ -182,9 +190,8 @@ class _OdometerPoses:
     chain: Pose = (0.0, 0.0, 0.0)
     # Value of `chain` before the last ODOM line, or at the last scan if that came later.
     behind: Pose = (0.0, 0.0, 0.0)
-    last: tuple[Pose, float | None] | None = None  # pose and time of the last ODOM line
-    # Pose and time of the ODOM line before the last.
-    before: tuple[Pose, float | None] | None = None
+    last: Odom | None = None  # the last ODOM line
+    before: Odom | None = None  # the ODOM line before the last
     # Whether the next ODOM line starts from a corrected pose, and gives no motion.
     restarts: bool = False
     vertex: int | None = None  # index of the last vertex

@@ -45,6 +45,7 @@ _PARAMETERS = {
 # Meaning of the poses of the scans. The first four are the cases in the docstring of `carmen`, in
 # its order. `lines` means that scans have no poses, and ODOM lines between scans give them.
 Meaning: TypeAlias = Literal["edges", "restarts", "first corrected", "raw", "lines"]
+Odom: TypeAlias = tuple[Pose, float | None]  # pose and time of an ODOM line
 # A rule about scans holds if this share of the scans follows it, since lines may be damaged.
 MOST_SCANS = 0.9
 # The first pose is corrected if it is this far from the second, in metres or radians. Smaller
@@ -495,10 +496,10 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
     `with_graph` says whether to read vertices and edges.
     """
     found = Findings()
-    odometer: tuple[Pose, float | None] | None = None  # Pose and time of the last ODOM line.
+    odometer: Odom | None = None  # the last ODOM line
     since: dict[str, int] = {}  # Number of ODOM lines since the last scan of each kind.
     # A scan that waits for the next ODOM line, with the ODOM line before it.
-    waiting: tuple[Survey, ScanLine, tuple[Pose, float | None] | None] | None = None
+    waiting: tuple[Survey, ScanLine, Odom | None] | None = None
     # For each edge, the kind of its line and how many words that has.
     written: dict[tuple[int, int], tuple[bytes, int]] = {}
     for number, raw in lines(file, source):
@@ -510,12 +511,12 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
             if tag in (b"ODOM", b"TRUEPOS"):
                 found.lengths[tag][len(tokens)] += 1
             if tag == b"ODOM":
-                pose, time = pose_at(tokens, 1), time_at(tokens, 7)
+                odom = pose_at(tokens, 1), time_at(tokens, 7)
                 since = {kind: count + 1 for kind, count in since.items()}
                 if waiting is not None:
-                    _count_restart(*waiting, pose, time)
+                    _count_restart(*waiting, odom)
                     waiting = None
-                odometer = pose, time
+                odometer = odom
             elif tag == b"PARAM":
                 found.parameters.update(parameters_of(tokens))
             elif tag in VERTICES and with_graph:
@@ -546,18 +547,13 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Findings:
     return found
 
 
-def _count_restart(
-    survey: Survey,
-    line: ScanLine,
-    before: tuple[Pose, float | None] | None,
-    pose: Pose,
-    time: float | None,
-) -> None:
+def _count_restart(survey: Survey, line: ScanLine, before: Odom | None, after: Odom) -> None:
     """Count whether the ODOM line after a scan repeats the pose of the scan."""
     if line.second is None or before is None or before[0] == line.second:
         return
     survey.moves += 1
     # The robot cannot have moved between two lines of the same time.
+    pose, time = after
     survey.restarts += pose == line.second and (before[1] == line.time or time != line.time)
 
 
