@@ -25,7 +25,7 @@ from scipy.spatial.distance import cdist
 
 from ssh_abduction import Solution, SSHMap, Trace
 from ssh_abduction.evaluation import told_poses
-from ssh_abduction.robot_logs.edges import edges_of, frechet, resampled
+from ssh_abduction.robot_logs.log_picture import edges_of, frechet, resampled
 
 Array = NDArray[np.float64]
 # Two visits are at one place if their middles are within ONE metres. Within SURE metres, no

@@ -22,9 +22,8 @@ from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.output.roads import place_of_steps, undecided_places
 from ssh_abduction.output.scene import ALARM
 from ssh_abduction.robot_logs import log_picture
-from ssh_abduction.robot_logs.edges import STEP, resampled
 from ssh_abduction.robot_logs.log_maps import LogMap, map_log
-from ssh_abduction.robot_logs.log_picture import BESIDE, EDGE, drawn_once, figure
+from ssh_abduction.robot_logs.log_picture import BESIDE, EDGE, STEP, drawn_once, figure, resampled
 from ssh_abduction.robot_logs.log_report import report
 from ssh_abduction.solver import Status
 

@@ -47,7 +47,7 @@ from ssh_abduction.data.drives import fingerprints_of, named_steps, pieces_in_wo
 from ssh_abduction.data.odometry import Closure
 from ssh_abduction.explain import explain_trace
 from ssh_abduction.rivals import DrivePair, Listing, compare, difference, joins_of_drives
-from ssh_abduction.rivals.drive_joins import DriveJoin
+from ssh_abduction.rivals.listing import DriveJoin
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.guesses.beam import Beam

@@ -18,8 +18,7 @@ from ssh_abduction.data.schema import attributes_of
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison
     from ssh_abduction.rivals.differences import SharedSides
-    from ssh_abduction.rivals.drive_joins import DrivePair
-    from ssh_abduction.rivals.listing import Listing
+    from ssh_abduction.rivals.listing import DrivePair, Listing
 
 # Values in run.json that differ between runs even if all settings and results are the same.
 UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
@@ -56,8 +55,7 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.cli.outcome import warn  # loads clingo
     from ssh_abduction.rivals.comparison import compare  # loads numpy
     from ssh_abduction.rivals.differences import difference, shared_sides
-    from ssh_abduction.rivals.drive_joins import joins_of_drives
-    from ssh_abduction.rivals.listing import Listing
+    from ssh_abduction.rivals.listing import Listing, joins_of_drives
 
     maps = maps_path(options.maps)
     others = None if options.other is None else maps_path(options.other)

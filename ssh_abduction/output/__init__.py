@@ -10,12 +10,12 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ssh_abduction.output.cards import map_card as map_card
     from ssh_abduction.output.cards import trace_card as trace_card
+    from ssh_abduction.output.drawing import plot as plot
+    from ssh_abduction.output.drawing import to_svg as to_svg
     from ssh_abduction.output.export import export_map as export_map
     from ssh_abduction.output.graphs import to_dot as to_dot
     from ssh_abduction.output.graphs import to_graphml as to_graphml
     from ssh_abduction.output.graphs import to_networkx as to_networkx
     from ssh_abduction.output.graphs import to_pandas as to_pandas
-    from ssh_abduction.output.plotting import plot as plot
-    from ssh_abduction.output.svg import to_svg as to_svg
 
 __getattr__, __dir__ = lazy_names(__name__)

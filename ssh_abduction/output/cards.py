@@ -27,7 +27,7 @@ DRAWN = 150  # dstates of a map that is drawn, as the layout of a larger one tak
 
 def map_card(ssh_map: SSHMap) -> str:
     """Make a card of a map as HTML: picture, faults, fit of displacements, and table of dstates."""
-    from ssh_abduction.output.svg import to_svg  # loads scipy
+    from ssh_abduction.output.drawing import to_svg  # loads scipy
 
     parts = [paragraph(f"not drawn, as it has more than {DRAWN} dstates")]
     if len(ssh_map.dstates) <= DRAWN:

@@ -30,6 +30,8 @@ from ssh_abduction.solver import Cost, Search, Solution, Start, Status, Watch, f
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
+Pair = tuple[int, int]
+
 
 def pair_explained(
     trace: Trace,
@@ -63,9 +65,6 @@ def solved_with(
     """
     search = Search(trace, theory, max_maps=maps, time_limit=limit, _start=Start(known=known))
     return search.solution(tuple(search))
-
-
-Pair = tuple[int, int]
 
 
 def assumptions(

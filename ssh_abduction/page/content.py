@@ -27,11 +27,10 @@ from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.output.layout import Layout, layout
-from ssh_abduction.output.map_scene import axes
+from ssh_abduction.output.scene import axes
 from ssh_abduction.page.replays import Run, replays
 from ssh_abduction.rivals.comparison import Choice, compare
-from ssh_abduction.rivals.drive_joins import DrivePair, joins_of_drives
-from ssh_abduction.rivals.listing import Listing, Maps, trusted
+from ssh_abduction.rivals.listing import DrivePair, Listing, Maps, joins_of_drives, trusted
 from ssh_abduction.solver import probability_in_words
 
 DRAWING = 3.0  # processor seconds for the drawings of all maps except the first
@@ -39,6 +38,9 @@ DRAWN = 10_000  # dstates of all drawings together; more would make the page too
 DOUBTED = 0.95  # joins of a smaller probability are listed
 JOINS = 20  # at most this many joins are listed
 CUT = 0.5  # the largest standard deviation of an ellipse, as a share of the extent of the map
+Steps: TypeAlias = tuple[int, ...]
+Spot: TypeAlias = tuple[float, float, float | None]
+Pair: TypeAlias = frozenset[Steps]
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,11 +327,6 @@ def _spots(first: SSHMap, found: Layout) -> list[Spot]:
             x, y = found.places[place]
         spots.append((x / unit, y / unit, heading))
     return spots
-
-
-Steps: TypeAlias = tuple[int, ...]
-Spot: TypeAlias = tuple[float, float, float | None]
-Pair: TypeAlias = frozenset[Steps]
 
 
 class _Counts:

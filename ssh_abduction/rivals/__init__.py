@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.differences import SharedSides as SharedSides
     from ssh_abduction.rivals.differences import difference as difference
     from ssh_abduction.rivals.differences import shared_sides as shared_sides
-    from ssh_abduction.rivals.drive_joins import DrivePair as DrivePair
-    from ssh_abduction.rivals.drive_joins import joins_of_drives as joins_of_drives
     from ssh_abduction.rivals.explore import Experiment as Experiment
     from ssh_abduction.rivals.explore import next_experiment as next_experiment
+    from ssh_abduction.rivals.listing import DrivePair as DrivePair
     from ssh_abduction.rivals.listing import Listing as Listing
+    from ssh_abduction.rivals.listing import joins_of_drives as joins_of_drives
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -58,6 +58,8 @@ SORTED_BY = {
 }
 # At most this many changes of one sort, and at most this many links, are put into words.
 LISTED = 12
+SHOWN = 2  # a sentence names at most this many sides
+_Side: TypeAlias = Literal["right", "left"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,11 +316,6 @@ def _listed(parts: Sequence[object]) -> str:
     """Join the first LISTED parts by commas, and say how many more there are."""
     more = [f"and {len(parts) - LISTED} more"] if len(parts) > LISTED else []
     return ", ".join([*map(str, parts[:LISTED]), *more])
-
-
-SHOWN = 2  # a sentence names at most this many sides
-
-_Side: TypeAlias = Literal["right", "left"]
 
 
 @dataclass(frozen=True, slots=True)

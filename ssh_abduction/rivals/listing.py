@@ -7,23 +7,38 @@
 >>> Listing.of([one, SSHMap((0,), (DState(0, "hall"),), ())])  # doctest: +ELLIPSIS
 Traceback (most recent call last):
 ssh_abduction.data.errors.MapError: maps[1]: expected 2 steps, as maps[0] has, got 1; ...
+
+In the maps of a joint trace, two drives share places: in all maps, in some, or in none.
+
+>>> from ssh_abduction import Theory, Trace, solve
+>>> monday = Trace.from_steps("abc", ["travel", "travel"], name="monday")
+>>> tuesday = Trace.from_steps("cd", ["travel"], name="tuesday")
+>>> solution = solve([monday, tuesday], Theory.causal())
+>>> print(*joins_of_drives(Listing.of(solution)))  # doctest: +NORMALIZE_WHITESPACE
+monday and tuesday: 1 dstate in common in all maps (monday:2 = tuesday:0);
+5 pairs of dstates joined in no map
 """
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations, product
 from typing import Any, TypeAlias
 
 from ssh_abduction.data.checks import a_path, a_text, an_instance
 from ssh_abduction.data.corrections import named_beside
 from ssh_abduction.data.drives import Drive, pieces_in_words
 from ssh_abduction.data.errors import MapError, brief, named
+from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.map_parts import Fault
 from ssh_abduction.data.maps import ID_LENGTH, SSHMap, checked_maps, maps_of
+from ssh_abduction.data.schema import PlainData
 from ssh_abduction.data.trace import View
+from ssh_abduction.data.words import counted
 from ssh_abduction.solver import (
     Backbone,
     Solution,
@@ -38,6 +53,9 @@ from ssh_abduction.theory.theory import Theory
 OF_SOLUTION = {"maps", "theory", "steps", "status", "complete"}
 # How to mend maps that show different views at a step.
 ONE_TRACE = "compare maps of one trace (if it has unknown views, give solutions, not their maps)"
+ALMOST = 1 - 1e-9  # the largest share of a join that some map lacks
+SHOWN = 6  # a sentence names at most this many joins of a kind
+_Placing: TypeAlias = Sequence[int]  # the place of each step by one map; without places, the dstate
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +141,7 @@ class Listing:
     def _of(cls, solution: Solution, where: str = "maps") -> Listing:
         """Make a listing from a solution. `where` is its name in messages."""
         minimal = solution.levels[0].count if solution.levels else solution.count
+        recorded = solution.support.recorded  # its drives have fingerprints
         listing = cls(
             solution.maps,
             minimal if solution.status is Status.OPTIMAL else None,
@@ -132,7 +151,7 @@ class Listing:
             where,
             solution.weighed,
             solution.by_minimality,
-            solution.drives,
+            recorded.drives if recorded else solution.drives,
             solution.warnings,
             _has_one_view(solution.theory),
         )
@@ -321,3 +340,136 @@ class PairInMap:
     def to_dict(self) -> dict[str, Any]:
         """Return the pair as plain data."""
         return {"same_place": self.is_one_place, "probability": self.probability}
+
+
+@dataclass(frozen=True, slots=True)
+class DriveJoin(PlainData):
+    """A step of one drive and a step of another drive that are at one place in some map."""
+
+    first: int  # the number of the step in its own drive
+    second: int  # the number of the other step in its own drive
+    # The share of the maps, 0 to 1, in which both are at one place. If maps were compared by cost
+    # in nats, and these costs can be trusted, this is the probability that they are.
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class DrivePair(PlainData):
+    """The places that two drives share.
+
+    A join is two steps, one of each drive, at one place. Many joins may be about the same two
+    places of the first map. Only the most probable one of these is listed.
+
+    Attributes:
+        first: The name of the earlier drive.
+        second: The name of the later drive.
+        of: "place"; or "dstate", if maps have no places.
+        forced: The joins in all maps.
+        possible: The joins in some maps, but not in all.
+        excluded: The number of pairs of places that are one place in no map.
+        proven: Whether all maps are known. If not, other maps may differ.
+        of_maps: The number of maps that were compared; None if joins have a probability instead.
+    """
+
+    first: str
+    second: str
+    of: str
+    forced: tuple[DriveJoin, ...]
+    possible: tuple[DriveJoin, ...]
+    excluded: int
+    proven: bool
+    of_maps: int | None
+
+    def how_sure(self, join: DriveJoin) -> str:
+        """Say in how many maps two drives have a join, or how probable the join is."""
+        if join in self.forced:
+            return "all maps" if self.proven else "all maps that were found"
+        if self.of_maps is None:
+            return probability_in_words(join.share)
+        return f"{round(join.share * self.of_maps)} of {self.of_maps} maps"
+
+    @property
+    def not_forced(self) -> str:
+        """Say how many joins are possible, and what is known of them."""
+        maps = "maps" if self.proven else "maps that were found"
+        each = "each with" if len(self.possible) > 1 else "with"
+        known = f"{each} its probability" if self.of_maps is None else f"in some {maps}"
+        return f"{counted(len(self.possible), 'possible joins')}, {known}"
+
+    def __str__(self) -> str:
+        maps = "maps" if self.proven else "maps that were found"
+        parts = []
+        if self.forced:
+            number = counted(len(self.forced), f"{self.of}s")
+            parts.append(f"{number} in common in all {maps} ({self._named(self.forced)})")
+        if self.possible:
+            parts.append(f"{self.not_forced} ({self._named(self.possible)})")
+        if parts and self.excluded:
+            parts.append(f"{counted(self.excluded, 'pairs')} of {self.of}s joined in no map")
+        text = "; ".join(parts) or f"nothing in common in any of the {maps}"
+        return f"{self.first} and {self.second}: {text}"
+
+    def _named(self, joins: Sequence[DriveJoin]) -> str:
+        """Put joins into words: "monday:2 = tuesday:0". At most SHOWN of them are named."""
+        shown = [
+            f"{self.first}:{join.first} = {self.second}:{join.second}"
+            + ("" if joins is self.forced else f", {self.how_sure(join)}")
+            for join in joins[:SHOWN]
+        ]
+        more = len(joins) - SHOWN
+        return "; ".join([*shown, *([f"and {more} more"] if more > 0 else [])])
+
+
+def joins_of_drives(listing: Listing) -> tuple[DrivePair, ...]:
+    """Find what each pair of drives has in common in the maps of a joint trace.
+
+    Args:
+        listing: The maps. If they are compared by cost, rivals with a higher cost count, too.
+
+    Returns:
+        A value for each pair of drives, in order; empty for the maps of a single drive.
+    """
+    an_instance("listing", listing, Listing, MapError, mend="make one with Listing.of")
+    placings, weights, proven = _placings(listing)
+    count = None if trusted(listing.weighed) else len(placings)
+    of = "place" if listing.maps[0].places else "dstate"
+
+    def share(steps: tuple[int, int]) -> float:
+        """The share of the maps in which two steps are at one place; 1.0 only for all maps."""
+        are_one = [at[steps[0]] == at[steps[1]] for at in placings]
+        sum_of_some = math.fsum(w for w, is_one in zip(weights, are_one, strict=True) if is_one)
+        return 1.0 if all(are_one) else min(sum_of_some, ALMOST)
+
+    def pair(one: Drive, other: Drive) -> DrivePair:
+        joins = []
+        for places in product(_visits(one, placings), _visits(other, placings)):
+            # Of the steps at both places, take the pair that is most often at one place.
+            steps = max(product(*places), key=share)
+            joins.append(DriveJoin(steps[0] - one.first, steps[1] - other.first, share(steps)))
+        forced = tuple(join for join in joins if join.share == 1)
+        possible = sorted((j for j in joins if 0 < j.share < 1), key=lambda join: -join.share)
+        excluded = len(joins) - len(forced) - len(possible)
+        names = one.name, other.name
+        return DrivePair(*names, of, forced, tuple(possible), excluded, proven, count)
+
+    return tuple(pair(*drives) for drives in combinations(listing.drives, 2))
+
+
+def _placings(listing: Listing) -> tuple[list[_Placing], list[float], bool]:
+    """Return the place of each step in each map, the weights of maps, and if all are listed."""
+    weighed = listing.weighed
+    if weighed is not None:
+        at: list[_Placing] = [rival.places or rival.dstates for rival in weighed.rivals]
+        weights = weighed.weights if trusted(weighed) else [1 / len(at)] * len(at)
+        return at, [*weights], weighed.within > 0
+    placings: list[_Placing] = [
+        [s if (place := ssh_map.dstates[s].place) is None else place for s in ssh_map.dstate_at]
+        for ssh_map in listing.maps[: listing.minimal]
+    ]
+    return placings, [1 / len(placings)] * len(placings), listing.complete is True
+
+
+def _visits(drive: Drive, placings: Sequence[_Placing]) -> list[list[int]]:
+    """List the first steps of a drive's visits to each place of the first map."""
+    first = firsts((tuple(at[t] for at in placings), t) for t in range(drive.first, drive.stop))
+    return list(gathered((names[0], t) for names, t in first.items()).values())

@@ -48,6 +48,12 @@ Row: TypeAlias = tuple[int, ...]
 UNKNOWN = -1  # the state after an action for which a machine has no link
 # The greatest number of entries in the rows that are moved at once. They take about ten megabytes.
 CHUNK = 2**21
+# A function from a step to a key of its star, and to the star. Stars that cannot be distinguished
+# share a key.
+_Reading: TypeAlias = Callable[[int], tuple[object, tuple[Any, ...] | None]]
+How: TypeAlias = Literal["link", "implied", "expected", "open"]
+OF_FRAMES = frozenset({"turn_rotates", "one_dstate_per_heading", "one_heading"})
+_OF_COURSES = frozenset({"turn_around_reverses", "one_dstate_per_course"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,11 +118,6 @@ class Observations:
         self.seen = list(found.values())  # the observation of each number
         # For each map, the number of the observation at each dstate.
         self.of = [[number[key] for key in of_map] for of_map in keys]
-
-
-# A function from a step to a key of its star, and to the star. Stars that cannot be distinguished
-# share a key.
-_Reading: TypeAlias = Callable[[int], tuple[object, tuple[Any, ...] | None]]
 
 
 def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> _Reading | None:
@@ -332,11 +333,6 @@ class Walk:
             row, action = self._came[row]
             found.append(action)
         return found[::-1]
-
-
-How: TypeAlias = Literal["link", "implied", "expected", "open"]
-OF_FRAMES = frozenset({"turn_rotates", "one_dstate_per_heading", "one_heading"})
-_OF_COURSES = frozenset({"turn_around_reverses", "one_dstate_per_course"})
 
 
 @dataclass(frozen=True, slots=True)

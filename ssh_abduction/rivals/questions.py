@@ -63,6 +63,9 @@ from ssh_abduction.solver import SORTS, Sort, key_of, sorts_of, stretches
 Matter: TypeAlias = Literal["faults", "dstates", "places", "paths", "courses"]
 
 MATTERS: tuple[Matter, ...] = ("faults", *SORTS)  # in the order of causes
+Ints: TypeAlias = NDArray[np.int32]
+Bools: TypeAlias = NDArray[np.bool_]
+NONE = -1  # no place, path or course
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,11 +204,6 @@ def _key(column: Bools) -> bytes:
 def _steps(steps: Sequence[int]) -> str:
     """Put the numbers of steps into words: "step 1", or "steps 1–3 and 7"."""
     return f"{noun_of('step', steps)} {stretches(steps)}"
-
-
-Ints: TypeAlias = NDArray[np.int32]
-Bools: TypeAlias = NDArray[np.bool_]
-NONE = -1  # no place, path or course
 
 
 class Table:

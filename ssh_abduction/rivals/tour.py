@@ -52,6 +52,16 @@ Copy: TypeAlias = tuple[int, int]
 # With more moves than this a flow takes about a second or more. Then the robot goes to the nearest
 # untried move instead.
 MOST_MOVES = 1500
+How: TypeAlias = Literal["known", "implied", "expected", "unknown"]
+# The cost of an unknown move in actions: go there, turn around, and come back.
+THERE_AND_BACK = 3
+AROUND = Action.of("around")
+T = TypeVar("T")
+# Seconds for the search for one flow. If it takes longer, the robot goes to the nearest untried
+# move instead.
+PATIENCE = 2.0
+# The greatest number of flows to seek. Later plans visit the parts that the last flow cuts off.
+ROUNDS = 8
 
 
 def next_tour(
@@ -164,12 +174,6 @@ def _copies(ssh_map: SSHMap, trace: Trace, believed: Collection[int]) -> list[Co
         came.setdefault(there, []).append(here)
         at.append(there)
     return at
-
-
-How: TypeAlias = Literal["known", "implied", "expected", "unknown"]
-# The cost of an unknown move in actions: go there, turn around, and come back.
-THERE_AND_BACK = 3
-AROUND = Action.of("around")
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,14 +363,6 @@ def _degrees(action: Action, frame: Frame | None) -> float | None:
         behind = next((slot for slot in range(frame.slots) if frame.has_behind(slot)), opposite)
         return 180.0 if behind is None else frame.bearings[behind if opposite is None else opposite]
     return 90.0 * QUARTERS[action.turn or "right"]
-
-
-T = TypeVar("T")
-# Seconds for the search for one flow. If it takes longer, the robot goes to the nearest untried
-# move instead.
-PATIENCE = 2.0
-# The greatest number of flows to seek. Later plans visit the parts that the last flow cuts off.
-ROUNDS = 8
 
 
 def shortest_walk(

@@ -22,8 +22,7 @@ from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.rungs import Rung
 from ssh_abduction.output.cards import html_table, html_text, paragraph
 from ssh_abduction.output.roads import place_of_steps
-from ssh_abduction.rivals.drive_joins import joins_of_drives
-from ssh_abduction.rivals.listing import Listing, trusted
+from ssh_abduction.rivals.listing import Listing, joins_of_drives, trusted
 from ssh_abduction.robot_logs.log_picture import SURE, doubtful_joins, figure
 from ssh_abduction.solver import Solution, Status
 from ssh_abduction.theory.joins import joins_in_words
