@@ -31,7 +31,7 @@ from perception.readers.logs import read_log
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.data.odometry import Odometry, Pose, displacement_between
 from ssh_abduction.robot_logs.log_maps import BARE
-from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

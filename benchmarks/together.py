@@ -40,8 +40,8 @@ from simulator.plan_tours import tour
 from simulator.plans import Plan
 from ssh_abduction import SSHMap, Theory
 from ssh_abduction.data import Odometry, together
-from ssh_abduction.solver.guesses.beam import Beam
-from ssh_abduction.solver.guesses.joint_maps import Joining
+from ssh_abduction.solver.sources.metric.beam import Beam
+from ssh_abduction.solver.sources.metric.drives import Joining
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

@@ -1,4 +1,4 @@
-"""Maps that a beam of hypotheses about the displacements finds (guesses/beam.py)."""
+"""Maps that a beam of hypotheses about the displacements finds (sources/metric/beam.py)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from ssh_abduction.explain.no_map import explain
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.guesses.beam import Beam
-from ssh_abduction.solver.guesses.completing import completed
+from ssh_abduction.solver.sources.metric.beam import Beam
+from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.fields import PATHS
 from ssh_abduction.theory.settle import settle
@@ -124,7 +124,7 @@ def test_beam_keeps_hypotheses_with_other_places() -> None:
         options = beam._extending.options_of(kept, t, joins=True)
         kept = list(beam._best(options, t, width))
         assert [found.nats for found in kept[:width]] == [o.nats for o in options[:width]]
-        at = [[found.places[s] for s in found.labels] for found in kept]
+        at = [[found.places[s] for s in found.labels.values()] for found in kept]
         assert all(at[k] not in at[:k] for k in range(width, len(at)))
         others += len(at) > width
     assert others

@@ -40,7 +40,7 @@ from ssh_abduction.data import (
 from ssh_abduction.explain import explain_place
 from ssh_abduction.page.content import content_of
 from ssh_abduction.robot_logs import log_report
-from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

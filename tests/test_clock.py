@@ -18,9 +18,9 @@ from ssh_abduction.runtime.clock import each_heeding, heeding, look_at_clock
 from ssh_abduction.solver import Status, candidates, fallback
 from ssh_abduction.solver.geometry import ranking
 from ssh_abduction.solver.geometry.fit import fit
-from ssh_abduction.solver.guesses.sketch import Sketch
-from ssh_abduction.solver.guesses.voting import Merging
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.sources.symbolic.sketch import Sketch
+from ssh_abduction.solver.sources.symbolic.voting import Merging
 from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.theory.evidence import Planar
 from ssh_abduction.theory.settle import Problem, settle

@@ -29,7 +29,7 @@ from ssh_abduction.data.odometry import (
 )
 from ssh_abduction.explain import explain_pair
 from ssh_abduction.solver.geometry.fit import Poses
-from ssh_abduction.solver.guesses.beam import Beam
+from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

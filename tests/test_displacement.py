@@ -27,8 +27,7 @@ from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.data.odometry import Closure
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.facts import causal_map
-from ssh_abduction.solver.geometry.fit import Poses, fit
-from ssh_abduction.solver.geometry.linear import inverse, least_squares, system_solved
+from ssh_abduction.solver.geometry.fit import Poses, fit, inverse, least_squares, system_solved
 from ssh_abduction.solver.geometry.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns

@@ -27,10 +27,10 @@ from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.front import fault_front
-from ssh_abduction.solver.guesses.robust import Explainer
 from ssh_abduction.solver.sources.exact import choosing, faulty, faulty_program
 from ssh_abduction.solver.sources.exact.blocks import Blocks
 from ssh_abduction.solver.sources.exact.engine import Task
+from ssh_abduction.solver.sources.symbolic.machines import Explainer
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import Problem
 

@@ -22,7 +22,6 @@ from ssh_abduction.solver import Search, Start, Status
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts import number_symbols
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.guesses.merging import merged
 from ssh_abduction.solver.sources.exact import choosing, engine, framed, framed_paths, visit_program
 from ssh_abduction.solver.sources.exact import visits as same
 from ssh_abduction.solver.sources.exact.framed import FramedEngine
@@ -36,6 +35,7 @@ from ssh_abduction.solver.sources.exact.path_facts import (
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
 from ssh_abduction.solver.sources.exact.visit_program import FramedSides, VisitProgram, visit_facts
 from ssh_abduction.solver.sources.exact.visits import VisitLabels
+from ssh_abduction.solver.sources.symbolic.merging import merged
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import Speedups, encodings

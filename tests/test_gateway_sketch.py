@@ -1,4 +1,4 @@
-"""Greedy maps for gateways at any angles (guesses/beam.py), and for rules of users."""
+"""Greedy maps for gateways at any angles (sources/metric/beam.py), and for rules of users."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Status, fallback
 from ssh_abduction.solver.asp.own_rules import can_be_asked, keeps_own_rules
-from ssh_abduction.solver.guesses.beam import Beam
-from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond, sketches_of
+from ssh_abduction.solver.sources.metric.beam import Beam
+from ssh_abduction.solver.sources.symbolic.gateway_sketch import sketch_beyond, sketches_of
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.settle import Problem, settle

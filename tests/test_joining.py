@@ -19,21 +19,18 @@ from ssh_abduction.checker.checker import violations
 from ssh_abduction.checker.cost_claims import false_costs
 from ssh_abduction.data import Action, Closure, Odometry, Step, together
 from ssh_abduction.data.drives import drives_of
-from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.data.star import Gateway, Star
 from ssh_abduction.solver.costs import beams
 from ssh_abduction.solver.costs.distrust import doubt_of
 from ssh_abduction.solver.costs.estimating import may_join_more, rival_of
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.costs.weighing import Weighing
-from ssh_abduction.solver.guesses.joint_maps import Joining
-from ssh_abduction.solver.guesses.kept_apart import KeptApart
-from ssh_abduction.solver.guesses.placed_map import Part
-from ssh_abduction.solver.guesses.reckoning import conditioned
-from ssh_abduction.solver.guesses.sights import Sights
-from ssh_abduction.solver.guesses.ties import relation_of, tied, ties_between
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.weighed import groups_of_drives
+from ssh_abduction.solver.sources.metric.drives import Joining
+from ssh_abduction.solver.sources.metric.hypothesis import conditioned
+from ssh_abduction.solver.sources.metric.overlay import KeptApart
+from ssh_abduction.solver.sources.metric.sights import Sights
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import theory
 from ssh_abduction.theory.settle import Problem, settle
@@ -316,38 +313,6 @@ def test_closures_say_how_drives_lie_on_each_other() -> None:
     assert all(places[closure.first] == places[closure.last] for closure in closures)
 
 
-def test_ties_relate_maps_whichever_of_them_stands() -> None:
-    exact = ((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 1e-4))
-    between = (0.4, 0.3, 1.0)
-    trace = replace(along("abc", "cba"), closures=(Closure(1, 4, between, exact),))
-    problem = settle(trace, Theory(star="none", boundary="none"))
-    log = Log(problem.trace, problem.theory, problem.pairs)
-    sights = Sights(problem.trace, problem.theory, misreads=False)
-    poses = np.array([0.0, 0.0, 5.0, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0]), np.identity(9) * 0.01
-    one, other = (
-        Part.of_steps({first + t: t for t in range(3)}, range(3), poses, 0.0, log, sights)
-        for first in (0, 3)
-    )
-    back = displacement_between(between, (0.0, 0.0, 0.0))
-    for first, second, relation in ((one, other, between), (other, one, back)):
-        both = first.beside(second)
-        ties = ties_between(problem.trace, both, 3)
-        new, at, angle = relation_of(both, ties)
-        assert new == 4  # the middle dstate of the second map
-        pose = moved((5.0, 0.0, 0.0), relation)
-        np.testing.assert_allclose([*at, angle], pose)
-        # From a wrong pose that may be anywhere, conditioning leads there, too.
-        middle = [*(both.position[both.places[new]] + [0, 1]), both.heading[new]]
-        mean = both.mean.copy()
-        mean[middle] = pose
-        mean[middle[:2]] += 0.5, -0.4
-        loose = both.covariance.copy()
-        loose[middle, middle] = 1e6
-        found, covariance = tied(both, ties, mean, loose)
-        np.testing.assert_allclose(found[middle], pose, atol=1e-3)
-        assert (np.diag(covariance)[middle] < 1).all()
-
-
 @pytest.mark.parametrize("seed", [312, 313])
 def test_joined_map_has_a_probability_without_a_broad_beam(seed: int) -> None:
     (known,) = of_mazes(3, 20, [seed], NOISE, drives=2)
@@ -394,7 +359,7 @@ def test_search_joins_drives_even_if_some_views_are_unknown(
 def test_unknown_view_does_not_join_two_known_ones() -> None:
     trace = Trace.from_steps(["a", None, "b"], ["travel", "travel"])
     sights = Sights(trace, settle(trace, Theory(star="none")).theory, misreads=False)
-    a, unknown, b = (frozenset([number]) for number in sights.seen)
+    a, unknown, b = (dict.fromkeys([number], math.inf) for number in sights.seen)
     assert sights.may_be_one(a, unknown)
     assert sights.may_be_one(a | unknown, a)
     assert not sights.may_be_one(a | unknown, b | unknown)

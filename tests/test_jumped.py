@@ -26,7 +26,7 @@ from ssh_abduction.solver import Misfit, Search
 from ssh_abduction.solver.costs import weighing
 from ssh_abduction.solver.costs.wrong_displacements import search_jumps
 from ssh_abduction.solver.front import fault_front
-from ssh_abduction.solver.guesses.outliers import wrong_displacements
+from ssh_abduction.solver.sources.symbolic.voting import wrong_displacements
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import settle

@@ -18,7 +18,7 @@ from ssh_abduction import Solution, Theory, Trace, check, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import Action
 from ssh_abduction.solver import Status
-from ssh_abduction.solver.drives import added_drives
+from ssh_abduction.solver import onto as added_drives
 
 
 def without_views(trace: Trace) -> Trace:

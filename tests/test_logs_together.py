@@ -40,7 +40,7 @@ from ssh_abduction.robot_logs import log_maps, log_report
 from ssh_abduction.robot_logs.log_maps import BARE, map_log
 from ssh_abduction.robot_logs.log_picture import ASIDE, colour_of, laid_over
 from ssh_abduction.solver import Solution, solve
-from ssh_abduction.solver.guesses.joint_maps import Joining
+from ssh_abduction.solver.sources.metric.drives import Joining
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory

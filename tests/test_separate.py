@@ -14,7 +14,7 @@ from ssh_abduction.cli import main, outcome
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.solver import Search, Status, candidates
 from ssh_abduction.solver.fallback import clash_in
-from ssh_abduction.solver.guesses.separate import separate_map
+from ssh_abduction.solver.sources.symbolic.sketched import separate_map
 from ssh_abduction.theory.settle import settle
 
 ACTIONS = ("travel", "around", "around", "around", "right", "left")

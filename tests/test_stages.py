@@ -16,10 +16,10 @@ from ssh_abduction import OnlineMapper, SSHMap, Theory, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.solver import fallback
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
-from ssh_abduction.solver.guesses.sketch import Sketch
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
+from ssh_abduction.solver.sources.symbolic.sketch import Sketch
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import ALL, SPEEDUPS

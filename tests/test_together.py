@@ -50,9 +50,8 @@ from ssh_abduction.rivals import DrivePair, Listing, compare, difference, joins_
 from ssh_abduction.rivals.listing import DriveJoin
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import Poses
-from ssh_abduction.solver.guesses.beam import Beam
-from ssh_abduction.solver.guesses.extending import Extending
-from ssh_abduction.solver.guesses.pieces import Pieces, headings_by_turn
+from ssh_abduction.solver.sources.metric.beam import Beam, Extending
+from ssh_abduction.solver.sources.metric.hypothesis import Pieces, headings_by_turn
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

@@ -3,10 +3,10 @@
 A fault is a step that a map treats as wrong. A minimal map is kept by replaying it: following its
 links along the steps of the trace, as long as it predicts what the robot sees.
 
-A *sketch* (`solver/guesses/sketch.py`) is made without a search: a step gets a new dstate (a place
-and a heading) unless the axioms imply at which known dstate it is. A *draft* is a sketch that
-begins with a good map of the first steps. It is used if finding a minimal map takes too long. A
-sketch that begins at the first step is mostly larger. It is used if there is no draft.
+A *sketch* (`solver/sources/symbolic/sketch.py`) is made without a search: a step gets a new dstate
+(a place and a heading) unless the axioms imply at which known dstate it is. A *draft* is a sketch
+that begins with a good map of the first steps. It is used if finding a minimal map takes too long.
+A sketch that begins at the first step is mostly larger. It is used if there is no draft.
 """
 
 from __future__ import annotations

@@ -21,23 +21,27 @@ from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import STARVED, LimitError, Watch, processor_clock
-from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond, sketches_of
-from ssh_abduction.solver.guesses.mended import first_contradiction, mended_sketch
-from ssh_abduction.solver.guesses.separate import has_no_frames, separate_map
-from ssh_abduction.solver.guesses.sketch import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.projecting import projected
 from ssh_abduction.solver.sources.exact import choosing
 from ssh_abduction.solver.sources.exact.engine import Task
+from ssh_abduction.solver.sources.symbolic.gateway_sketch import sketch_beyond, sketches_of
+from ssh_abduction.solver.sources.symbolic.sketch import Sketch
+from ssh_abduction.solver.sources.symbolic.sketched import (
+    first_contradiction,
+    has_no_frames,
+    mended_sketch,
+    separate_map,
+)
 from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.speedups import Speedups, row
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.solver.guesses.beam import Beam
-    from ssh_abduction.solver.guesses.joint_maps import Joining
+    from ssh_abduction.solver.sources.metric.beam import Beam
+    from ssh_abduction.solver.sources.metric.drives import Joining
 
 _log = log_of(__name__)
 
@@ -84,8 +88,7 @@ class Candidates:
 
         Later calls return the same beam, which goes on where it stopped. None without the speed-up
         `greedy`, if the trace is long, or if the checker cannot check all axioms. Also None
-        if the trace has neither displacements nor stars at any angles, as `guesses/sketch.py` makes
-        better maps then.
+        if the trace has neither displacements nor stars at any angles, as sketches are better then.
         """
         theory = self._task.theory
         if (
@@ -95,7 +98,7 @@ class Candidates:
             or not self._judging.can_accept
         ):
             return None
-        from ssh_abduction.solver.guesses.beam import Beam  # loads numpy
+        from ssh_abduction.solver.sources.metric.beam import Beam  # loads numpy
 
         if width not in self._beams:
             self._beams[width] = Beam(self._given.problem, self._given.log, width)
@@ -112,7 +115,7 @@ class Candidates:
         Return the first map that the checker accepts; None if there is none, or if it costs more
         than about `most` nats.
         """
-        from ssh_abduction.solver.guesses.beam import Beam  # loads numpy
+        from ssh_abduction.solver.sources.metric.beam import Beam  # loads numpy
 
         trace, theory = self._given.trace, self._given.theory
         mended = trace.without_displacements_at(wrong)
@@ -134,7 +137,7 @@ class Candidates:
         trusts_drives = not (theory.lifts or theory.replace(changed=0.0).has_faults)
         if self.beam(1) is None or not theory.several_drives or not trusts_drives:
             return None
-        from ssh_abduction.solver.guesses.joint_maps import Joining  # loads numpy
+        from ssh_abduction.solver.sources.metric.drives import Joining  # loads numpy
 
         return Joining(self._given.problem, self._given.log)
 
@@ -148,7 +151,7 @@ class Candidates:
         trusts_drives = not (theory.lifts or theory.replace(changed=0.0).has_faults)
         if theory.displacement != "use" or not trusts_drives or self.beam(1) is None:
             return None
-        from ssh_abduction.solver.guesses.smoothed import smoothed_map  # loads numpy
+        from ssh_abduction.solver.sources.metric.overlay import smoothed_map  # loads numpy
 
         found = smoothed_map(self._given.problem, self._given.log, begin)
         return found if found is not None and self._judging.accepts(found) else None

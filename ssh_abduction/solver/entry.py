@@ -23,9 +23,9 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import counting, heeding
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
-from ssh_abduction.solver.drives.added_drives import Solving, solve_onto
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.obeying import obeyed, with_correction_warnings, with_names
+from ssh_abduction.solver.onto import Solving, solve_onto
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing

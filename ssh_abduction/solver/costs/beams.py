@@ -1,8 +1,8 @@
-"""Guess maps of little cost by beams of hypotheses, narrow beams first (`guesses/beam.py`).
+"""Guess maps of little cost by beams of hypotheses, narrow beams first (`sources/metric/beam.py`).
 
-Before that, places are merged at poses that fit all closures (`guesses/smoothed.py`). After a long
-way this is better than a beam, which goes through the trace once. The places of the best map of a
-broad beam are merged in the same way.
+Before that, places are merged at poses that fit all closures (`sources/metric/overlay.py`). After a
+long way this is better than a beam, which goes through the trace once. The places of the best map
+of a broad beam are merged in the same way.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.candidates import SKETCH_SHARE
 from ssh_abduction.solver.costs.scatter import is_for
-from ssh_abduction.solver.guesses.beam import Beam
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.solution.weighed import EQUAL
+from ssh_abduction.solver.sources.metric.beam import Beam
 
 # The widths of the beams, and the share of the time after which each of them ends. The beam without
 # axioms ends at the share BREAKING.

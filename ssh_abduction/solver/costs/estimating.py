@@ -20,8 +20,8 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.guesses.completing import completed
 from ssh_abduction.solver.solution.weighed import CHANCE, Rival, groups_of_drives
+from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.solver.values import Cost, nats_of
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.overlap import groups_of_each

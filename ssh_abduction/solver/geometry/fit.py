@@ -23,12 +23,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Sequence
+from contextlib import suppress
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.linalg import solve_triangular
+from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.linalg import splu
 from scipy.special import gammaincc
 
 from ssh_abduction.data.maps import Fit, Pose, SSHMap
@@ -36,13 +39,6 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.geometry.equations import Equations
-from ssh_abduction.solver.geometry.linear import (
-    inverse,
-    least_squares,
-    matrix,
-    system_solved,
-    weighted,
-)
 from ssh_abduction.solver.work import FIT, FIT_OF_ONE
 from ssh_abduction.theory.evidence.loops import vectors_turned
 
@@ -60,6 +56,10 @@ SWEEPS, HELD = 20, 1e-2
 # a weight that keeps poses in place if no equation determines them.
 LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-12, 1e8, 100, 1e-10, 1e-4
 HELD_STILL = 1e-9
+# With at most this many unknowns, compute an inverse from a dense matrix.
+DENSE_INVERSE = 3000
+# The share of the diagonal that least squares add to it, far above the rounding errors.
+DAMPING = 1e-10
 
 
 def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
@@ -139,20 +139,24 @@ class Poses:
         squares = float((self._residuals(unknown) ** 2).sum())
         return squares, unknown, self._covariance(unknown, fixed, wanted)
 
-    def gaussian(self) -> tuple[list[int], Array, Array]:
+    def gaussian(self) -> tuple[list[int], Array, Array, Array]:
         """Find the poses of the dstates and their covariance, relative to a dstate of each part.
 
-        Returns, for each dstate, its part of the map; the means, as one vector; and the covariance.
-        The vector has x and y of each place, in the order of the first dstates there, and then the
-        heading of each dstate.
+        Returns, for each dstate, its part of the map; the means, as one vector; the covariance; and
+        the chi-square of each part. The vector has x and y of each place, in the order of the first
+        dstates there, and then the heading of each dstate.
         """
         place, facing = self._place[: self._dstates], 2 * self._positions
         part = self._parts()[place].tolist()
         first = [part.index(number) for number in dict.fromkeys(part)]
         fixed = [k for s in first for k in (2 * place[s], 2 * place[s] + 1, facing + s)]
         entries = [*range(2 * int(place.max()) + 2), *range(facing, facing + self._dstates)]
-        _, unknown, covariance = self.settled(None, fixed, entries)
-        return part, unknown[entries], covariance
+        unknown, of = self._best(), self._parts()
+        errors = (self._residuals(unknown)[:-2] ** 2).reshape(-1, 3).sum(axis=1)
+        squares = np.zeros(int(of.max()) + 1)
+        np.add.at(squares, of[self._place[self._from]], errors)
+        covariance = self._covariance(unknown, fixed, entries)
+        return part, unknown[entries], covariance, squares
 
     def _best(self, start: Array | None = None, still: float = STILL) -> Array:
         """Find the unknowns with the least sum of squares.
@@ -470,3 +474,66 @@ class Poses:
         covariance: Array = np.zeros((len(wanted), len(wanted)))
         covariance[np.ix_(is_free, is_free)] = inverse(information, np.full(len(free), held), rows)
         return covariance
+
+
+def matrix(entries: tuple[Any, tuple[Any, Any]], shape: tuple[int, int]) -> Any:
+    """Make a `csr_array`. Values at one position are added up."""
+    return coo_array(entries, shape=shape).tocsr()
+
+
+def weighted(some: Any, weights: Array) -> Any:
+    """Multiply each row of a matrix by its weight."""
+    return csr_array(some.multiply(weights[:, None]))
+
+
+def system_solved(square: Any, added: Array, right: Any) -> Any:
+    """Solve a linear system after adding n numbers to the diagonal of its n x n matrix."""
+    whole = (square + diags_array(added)).tocsc()
+    return splu(whole.astype(right.dtype)).solve(right)
+
+
+def least_squares(some: Any, values: Array, weights: Array) -> Array:
+    """Solve a system by weighted least squares. Of several solutions return nearly the smallest."""
+    system = weighted(some, weights)
+    normal = system.T @ system
+    scale = normal.diagonal()
+    # A little damping makes the matrix regular, even if there are no equations.
+    damping = DAMPING * (scale + (scale.max() or 1.0))
+    found: Array = system_solved(normal, damping, system.T @ values)
+    return found
+
+
+def inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
+    """Compute some rows, and the same columns, of the inverse of a symmetric n x n matrix.
+
+    The n numbers in `added` are added to its diagonal.
+    """
+    block = connected_components(csr_array(square), directed=False)[1]
+    found = np.zeros((len(rows), len(rows)))
+    for name in np.unique(block[rows]):
+        look_at_clock()
+        own, wanted = np.flatnonzero(block == name), np.flatnonzero(block[rows] == name)
+        part = square[own][:, own]
+        found[np.ix_(wanted, wanted)] = _block_inverse(
+            part, added[own], np.searchsorted(own, rows[wanted])
+        )
+    return found
+
+
+def _block_inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
+    """Compute the same as `inverse` at once."""
+    if square.shape[0] <= DENSE_INVERSE:
+        # If these rows come last, the wanted part of the inverse depends only on the last block of
+        # the Cholesky factor.
+        order = np.concatenate([np.setdiff1d(np.arange(len(added)), rows), rows])
+        with suppress(np.linalg.LinAlgError):
+            whole = square.toarray() + np.diag(added)
+            factor = np.linalg.cholesky(whole[np.ix_(order, order)])
+            first = len(order) - len(rows)
+            root = solve_triangular(factor[first:, first:], np.identity(len(rows)), lower=True)
+            part: Array = root.T @ root
+            return part
+    columns = np.zeros((len(added), len(rows)))
+    columns[rows, np.arange(len(rows))] = 1.0
+    found: Array = system_solved(square, added, columns)[rows]
+    return found

@@ -10,8 +10,8 @@ A Viterbi pass chooses the further steps (Viterbi 1967). It explains the whole t
 that clingo found, with the cheapest faults. Clingo gets the steps at fault and those around them.
 The explanation is also a map of the whole trace, so it may be the new incumbent.
 
-The first maps of a long trace are guessed (`guesses/robust.py`), and clingo is only asked for
-cheaper ones. The lower bound of a long trace comes from its blocks (`blocks.py`). For a
+The first maps of a long trace are guessed (`sources/symbolic/machines.py`), and clingo is only
+asked for cheaper ones. The lower bound of a long trace comes from its blocks (`blocks.py`). For a
 short trace clingo is asked first, and maps are guessed if it does not end soon.
 """
 
@@ -26,7 +26,6 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import StageTimeError
-from ssh_abduction.solver.guesses.robust import Explained, Explainer, PartialMachine, robust_maps
 from ssh_abduction.solver.sources.exact.blocks import Blocks
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.faulty_program import (
@@ -34,6 +33,12 @@ from ssh_abduction.solver.sources.exact.faulty_program import (
     FaultyAnswer,
     FaultyControl,
     faulty_names,
+)
+from ssh_abduction.solver.sources.symbolic.machines import (
+    Explained,
+    Explainer,
+    PartialMachine,
+    robust_maps,
 )
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.evidence import Equality

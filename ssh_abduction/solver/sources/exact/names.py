@@ -40,10 +40,10 @@ from itertools import islice
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import LimitError
-from ssh_abduction.solver.guesses.merging import dstates_merged, merged
-from ssh_abduction.solver.guesses.robust import machine_labels
 from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Task
 from ssh_abduction.solver.sources.exact.name_program import Fitting, NameProgram, Pinned, read_names
+from ssh_abduction.solver.sources.symbolic.machines import machine_labels
+from ssh_abduction.solver.sources.symbolic.merging import dstates_merged, merged
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.chart import Chart, Link
 from ssh_abduction.theory.pairs import pairs_in

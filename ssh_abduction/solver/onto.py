@@ -1,7 +1,7 @@
 """Add a drive to the map of old drives, in about the time that solving the new drive takes.
 
 The map of the old drives is the *existing map*: the joint map must keep its dstates and places. The
-solver does not get the old drives. It gets a digest of them (`digest.py`), and assertions about its
+solver does not get the old drives. It gets a digest of them (`laying.py`), and assertions about its
 steps: those at one dstate or place of the existing map are at one, and others are not. The search
 begins with the existing map, to which a sketch adds the new drives.
 
@@ -35,16 +35,15 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.limits import EARLY, LimitError, Watch
-from ssh_abduction.solver.drives.digest import Digest
-from ssh_abduction.solver.drives.laying import can_lay, laid, unproven
-from ssh_abduction.solver.guesses.gateway_sketch import sketch_beyond
-from ssh_abduction.solver.guesses.mended import first_contradiction
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.laying import Digest, can_lay, laid, unproven
 from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE
+from ssh_abduction.solver.sources.symbolic.gateway_sketch import sketch_beyond
+from ssh_abduction.solver.sources.symbolic.sketched import first_contradiction
 from ssh_abduction.solver.values import Cost, Level, Status
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups

@@ -2,7 +2,7 @@
 
 >>> from ssh_abduction import Theory
 >>> from ssh_abduction.data import Action, Step
->>> from ssh_abduction.solver.guesses.sketch import Sketch
+>>> from ssh_abduction.solver.sources.symbolic.sketch import Sketch
 >>> sketch = Sketch(Step("end"), Theory(star="none"))
 >>> travel, around = Action("travel", "travel"), Action("around", "turn", "around")
 >>> done = [(travel, "hall"), (around, "hall"), (travel, "end"), (around, "end")]

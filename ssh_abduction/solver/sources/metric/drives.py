@@ -1,18 +1,20 @@
 """Join the maps of several drives to one map of little cost, without a search of all steps.
 
-Each drive has a map of its own: a hypothesis with the poses of its places and dstates. An *anchor*
+Each drive has a map of its own: a hypothesis with the poses of its places and dstates. Drives that
+closures (matches of local maps) connect are mapped together, if that breaks no axiom. An *anchor*
 is a dstate of one map and a dstate of another map that may be one. It says how one map lies on the
 other. An anchor is good if many other dstates then coincide with dstates that show the same. Drives
 that cross may share places, but no dstate. So an anchor may also be two places whose stars agree if
 one map is turned. It is good if many other places then coincide with places that may be one.
 
-If closures (matches of local maps) connect two drives, they say how one map lies on the other.
-Anchors are then used only if the map that is joined in this way breaks an axiom.
+The two maps with the best anchor are joined first: `overlay.py` merges the places and dstates that
+coincide. Then the joint map may be joined to others. Maps that no anchor connects stay pieces.
 
-The two maps with most closures, or the best anchor, are joined first: `overlaying.py` merges the
-places and dstates that coincide. Then the joint map may be joined to others. Maps that no anchor
-connects stay pieces. Some of the maps may be the pieces of a map of old drives. Each of these
-pieces must be kept, but they may be joined to each other.
+New drives may be laid on the map of old drives (`ExistingMap`). Each piece of this map must be
+kept, but pieces may be joined to each other. The old drives are given by a *digest*: a trace in
+which each link of their map occurs once (`solver/onto.py`). The displacements of the old drives are
+fitted to the map. The fit gives the joint Gaussian distribution of the poses, and each link of the
+digest gets the displacement between the poses of its ends.
 
 Reference:
     Carpin 2008, "Fast and accurate map merging for multi-robot systems" (votes for a turn and a
@@ -22,7 +24,7 @@ Reference:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise, permutations
 from typing import NamedTuple, TypeAlias
@@ -35,26 +37,23 @@ from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.guesses.beam import Beam
-from ssh_abduction.solver.guesses.completing import map_of_part
-from ssh_abduction.solver.guesses.kept_apart import denied_pairs
-from ssh_abduction.solver.guesses.overlaying import Overlay
-from ssh_abduction.solver.guesses.placed_map import Part
-from ssh_abduction.solver.guesses.sights import Sights
+from ssh_abduction.runtime.threads import one_thread
+from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.sources.metric.beam import Beam
+from ssh_abduction.solver.sources.metric.hypothesis import Array, Hypothesis, parts_of
+from ssh_abduction.solver.sources.metric.overlay import Overlay, denied_pairs, smoothed
+from ssh_abduction.solver.sources.metric.sights import Sights
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence.loops import vectors_turned
 from ssh_abduction.theory.settle import Problem
 
-Array = NDArray[np.float64]
-_Pair: TypeAlias = tuple[Part, Part]
+_Pair: TypeAlias = tuple[Hypothesis, Hypothesis]
 
 
 class _Anchor(NamedTuple):
     """A way to lay a map on another one.
 
     Attributes:
-        ties: The number of closures between the two maps, which say how to lay them; or 0, and the
-            next fields say it.
         good: How many dstates (or places) coincide that may be one, minus those that may not.
         old: A dstate of the first map.
         new: A dstate of the second map, which is laid on `old`.
@@ -62,11 +61,10 @@ class _Anchor(NamedTuple):
         by_places: Whether only the places of the two dstates are one, and not the dstates.
     """
 
-    ties: int
-    good: int = 0
-    old: int = 0
-    new: int = 0
-    turn: float = 0.0
+    good: int
+    old: int
+    new: int
+    turn: float
     by_places: bool = False
 
 
@@ -105,7 +103,7 @@ class Joining:
         # The ways that fit, each with its cost in nats.
         self._laid: dict[_Pair, list[tuple[float, _Anchor]]] = {}
 
-    def maps(self, standing: Sequence[Part] = ()) -> Iterator[SSHMap]:
+    def maps(self, standing: Sequence[Hypothesis] = ()) -> Iterator[SSHMap]:
         """Yield a map in which no drives are joined, and last the cheapest map found.
 
         If the cheapest map has pieces, also yield the cheapest map in which two of them are joined.
@@ -118,7 +116,7 @@ class Joining:
         found = [self._alone(drive) for drive in drives]
         if not all(found):
             return
-        alone = [*standing, *(part for part, *_ in found)]
+        alone = [*standing, *self._connected([part for part, *_ in found])]
         anchors = {
             (first, second): self._anchors(first, second)
             for first, second in combinations(alone, 2)
@@ -146,7 +144,24 @@ class Joining:
                 yield from self._beside([*rest, otherwise])
         yield from self._beside(best)
 
-    def _all_joined(self, parts: list[Part], anchors: _Anchors, start: _Pair) -> list[Part]:
+    def _connected(self, alone: list[Hypothesis]) -> list[Hypothesis]:
+        """Map drives together that closures connect, if that costs less and breaks no axiom.
+
+        `alone` has a map of each new drive alone.
+        """
+        if not self._problem.trace.closures:
+            return alone
+        for both in smoothed(self._problem, self._log, self.sights, None):
+            parts = [part for part in alone if part.labels.keys() <= both.labels.keys()]
+            covers = sum(len(part.labels) for part in parts) == len(both.labels)
+            saves = covers and len(parts) > 1 and self._nats(both) < self._nats_of(parts)
+            if saves and self._map(both):
+                alone = [*(part for part in alone if part not in parts), both]
+        return alone
+
+    def _all_joined(
+        self, parts: list[Hypothesis], anchors: _Anchors, start: _Pair
+    ) -> list[Hypothesis]:
         """Join maps: first the pair `start`, then pairs with the best anchor (way to lay them)."""
         pair = start
         while anchors:
@@ -160,8 +175,8 @@ class Joining:
         return parts
 
     def _joined_by_others(
-        self, parts: Sequence[Part], others: Mapping[Part, Sequence[Part]]
-    ) -> Iterator[list[Part]]:
+        self, parts: Sequence[Hypothesis], others: Mapping[Hypothesis, Sequence[Hypothesis]]
+    ) -> Iterator[list[Hypothesis]]:
         """Yield ways to join a drive that is apart, if another map of it is taken.
 
         `others` has the other maps of each drive that cost little more. One of them may be the true
@@ -173,7 +188,7 @@ class Joining:
                 if (both := self._joined(second, other, most)) is not None:
                     yield [*(kept for kept in parts if kept not in (part, second)), both]
 
-    def _beside(self, parts: Sequence[Part]) -> Iterator[SSHMap]:
+    def _beside(self, parts: Sequence[Hypothesis]) -> Iterator[SSHMap]:
         """Yield a map with these parts as separate pieces, unless it breaks an axiom."""
         whole = parts[0]
         for part in parts[1:]:
@@ -181,7 +196,7 @@ class Joining:
         if ssh_map := self._map(whole):
             yield ssh_map
 
-    def _alone(self, drive: Drive) -> list[Part]:
+    def _alone(self, drive: Drive) -> list[Hypothesis]:
         """Map a drive alone. Return its cheapest maps, the best first; none if none is found.
 
         Without stars there is one, as so many ways to join maps would make some look good by
@@ -197,9 +212,17 @@ class Joining:
         found = beam.hypotheses[: 1 if theory.star == "none" else 1 + OTHERS]
         if beam.refuses:
             self.broken += found[0].nats - beam.nats_without_axioms()
-        return [Part.of(one, drive.first, self._log, self.sights) for one in found]
+        return [self._of_drive(one, drive.first) for one in found]
 
-    def _anchors(self, first: Part, second: Part) -> list[_Anchor]:
+    def _of_drive(self, found: Hypothesis, first: int) -> Hypothesis:
+        """Return a hypothesis about a drive alone as one about the steps of the whole trace."""
+        poses = np.array([*(i + k for i in found.position for k in (0, 1)), *found.heading])
+        gaussian = found.mean[poses], found.covariance[np.ix_(poses, poses)]
+        labels = {first + t: label for t, label in found.labels.items()}
+        places, log, sights = found.places, self._log, self.sights
+        return Hypothesis.of_steps(labels, places, gaussian, found.nats, log, sights)
+
+    def _anchors(self, first: Hypothesis, second: Hypothesis) -> list[_Anchor]:
         """List the anchors (ways to lay one map on the other) of two maps, the best first."""
         if (first, second) in self._ways:
             return self._ways[first, second]
@@ -212,19 +235,11 @@ class Joining:
             *self._by_dstates(first, second, changes, near),
             *self._by_places(first, second, changes == 0, near),
         ]
-        # Closures between the two maps say by themselves how to lay them.
-        ties = sum(
-            (c.first in first.labels and c.last in second.labels)
-            or (c.first in second.labels and c.last in first.labels)
-            for c in self._problem.trace.closures
-        )
-        if ties:
-            found.append(_Anchor(ties))
         self._ways[first, second] = sorted(found, reverse=True)
         return self._ways[first, second]
 
     def _by_dstates(
-        self, first: Part, second: Part, changes: Array, near: float
+        self, first: Hypothesis, second: Hypothesis, changes: Array, near: float
     ) -> Iterator[_Anchor]:
         """Yield ways to lay one map on another that make two dstates one.
 
@@ -234,15 +249,16 @@ class Joining:
         """
         may_be_one = self.sights.may_be_one
         alike = np.array(
-            [[may_be_one(seen, other) for other in second.seen] for seen in first.seen]
+            [[may_be_one(seen, others) for others in second.seen] for seen in first.seen]
         )
         denied = denied_pairs(self._problem.theory, first, second)
         (at, facing), (there, turned) = first.poses, second.poses
+        shown, step, other = self.sights.shown, first.step_at, second.step_at
         ways = [
             (s, x, facing[s] - turned[x])
             for s, x in np.argwhere(alike).tolist()
             if changes[first.places[s], second.places[x]] < math.inf
-            and self.sights.are_alike(first.stars[s], second.stars[x])
+            and self.sights.are_alike(shown[step[s]], shown[other[x]])
             and (s, x) not in denied
         ]
         for s, x, turn in _voted(first, second, ways, near):
@@ -251,10 +267,10 @@ class Joining:
             meets = _meeting(at, at[s] + vectors_turned(there - there[x], turn), near)
             meets &= np.abs(twist) < TURNED
             good = (meets & alike).sum() - (meets & ~alike).sum()
-            yield _Anchor(0, int(good), s, x, turn)
+            yield _Anchor(int(good), s, x, turn)
 
     def _by_places(
-        self, first: Part, second: Part, same: NDArray[np.bool_], near: float
+        self, first: Hypothesis, second: Hypothesis, same: NDArray[np.bool_], near: float
     ) -> list[_Anchor]:
         """List the best ways to lay one map on another that make two places one, by their gateways.
 
@@ -274,33 +290,31 @@ class Joining:
             moved = first.poses[0][s] + vectors_turned(second.positions - second.poses[0][x], turn)
             meets = _meeting(first.positions, moved, near)
             good = (meets & same).sum() - (meets & ~same).sum()
-            found.append(_Anchor(0, int(good), s, x, turn, by_places=True))
+            found.append(_Anchor(int(good), s, x, turn, by_places=True))
         least = 1 if same.sum() == 1 else 2
         return sorted((way for way in found if way.good >= least), reverse=True)[:CROSSED]
 
-    def _joined(self, first: Part, second: Part, most: float) -> Part | None:
+    def _joined(self, first: Hypothesis, second: Hypothesis, most: float) -> Hypothesis | None:
         """Join two maps in the cheapest way that breaks no axiom and costs less than `most` nats.
 
         None if there is no such way.
         """
         overlay = Overlay(first, second, self._problem, self.sights)
         if (first, second) not in self._laid:
-            ways = self._anchors(first, second)
-            tied = [way for way in ways if way.ties]
-            laid = self._fitting(overlay, tied, self._map)
-            laid = laid or self._fitting(overlay, [way for way in ways if not way.ties])
-            self._laid[first, second] = sorted(laid, key=lambda told: told[0])
+            laid = ((_laid(overlay, way), way) for way in self._anchors(first, second))
+            told = [(self._nats(part), way) for part, way in laid if part]
+            self._laid[first, second] = sorted(told, key=lambda told: told[0])
         cheap = (way for nats, way in self._laid[first, second] if nats < most)
         joined = (_laid(overlay, way) for way in cheap)
         return next((part for part in joined if part and self._map(part)), None)
 
-    def _otherwise(self, part: Part) -> Iterator[Part]:
-        """Yield parts with the same drives, joined in the next cheapest ways without closures."""
+    def _otherwise(self, part: Hypothesis) -> Iterator[Hypothesis]:
+        """Yield parts with the same drives, joined in the next cheapest ways."""
         ways = [
             (nats, pair, way)
             for pair, found in self._laid.items()
             for nats, way in found
-            if {*pair[0].labels, *pair[1].labels} == {*part.labels} and not way.ties
+            if {*pair[0].labels, *pair[1].labels} == {*part.labels}
         ]
         known = [_dstates(part)]
         for _, pair, way in sorted(ways, key=lambda told: told[0]):
@@ -311,28 +325,21 @@ class Joining:
                 if len(known) > OTHERS:
                     break
 
-    def _fitting(
-        self, overlay: Overlay, ways: Sequence[_Anchor], suits: Callable[[Part], object] = bool
-    ) -> list[tuple[float, _Anchor]]:
-        """Lay one map on another in each way. List those that fit and suit, with their costs."""
-        laid = ((_laid(overlay, way), way) for way in ways)
-        return [(self._nats(part), way) for part, way in laid if part and suits(part)]
-
-    def _nats_of(self, parts: Sequence[Part]) -> float:
+    def _nats_of(self, parts: Sequence[Hypothesis]) -> float:
         """Compute the cost of parts as separate pieces, in nats."""
         return sum(map(self._nats, parts))
 
-    def _nats(self, part: Part) -> float:
+    def _nats(self, part: Hypothesis) -> float:
         """Compute the cost of a part in nats, with the price of places at one position."""
         at = part.poses[0].tolist()
         return part.nats + self._problem.overlap.crowding(part.labels, part.places, at)
 
-    def _map(self, part: Part) -> SSHMap | None:
+    def _map(self, part: Hypothesis) -> SSHMap | None:
         """Make the map of a part; None if it breaks an axiom."""
         look_at_clock()
-        return map_of_part(self._trace_of(part), self._bare, part)
+        return part.ssh_map(self._trace_of(part), self._bare)
 
-    def _trace_of(self, part: Part) -> Trace:
+    def _trace_of(self, part: Hypothesis) -> Trace:
         """Return the trace of the drives of a part."""
         trace, steps = self._problem.trace, sorted(part.labels)
         if len(steps) < len(trace):
@@ -345,24 +352,20 @@ class Joining:
         return trace
 
 
-def _dstates(part: Part) -> list[int]:
+def _dstates(part: Hypothesis) -> list[int]:
     """Return the dstate of each step of a part, numbered by first visit."""
     return numbered(part.labels[t] for t in sorted(part.labels))
 
 
-def _laid(overlay: Overlay, way: _Anchor) -> Part | None:
+def _laid(overlay: Overlay, way: _Anchor) -> Hypothesis | None:
     """Lay one map on another in one way, and merge what coincides; None if it does not fit."""
     look_at_clock()
-    fits = (
-        overlay.merge_by_closures()
-        if way.ties
-        else overlay.merge(way.old, way.new, way.turn if way.by_places else None)
-    )
+    fits = overlay.merge(way.old, way.new, way.turn if way.by_places else None)
     return overlay.part() if fits else None
 
 
 def _voted(
-    first: Part, second: Part, ways: Iterable[tuple[int, int, float]], near: float
+    first: Hypothesis, second: Hypothesis, ways: Iterable[tuple[int, int, float]], near: float
 ) -> Iterator[tuple[int, int, float]]:
     """Yield one way of each group of similar ways to lay a map on another, largest groups first.
 
@@ -388,3 +391,55 @@ def _meeting(here: Array, there: Array, near: float) -> NDArray[np.bool_]:
     """Flag the pairs of a point `here` and a point `there` that are nearer than `near`."""
     met: NDArray[np.bool_] = np.hypot(*np.moveaxis(here[:, None] - there, -1, 0)) < near
     return met
+
+
+class ExistingMap:
+    """The map of old drives, with the poses of its dstates and places.
+
+    Attributes:
+        broken: How many nats the new drives cost less if each is mapped alone, without axioms. It
+            is known after `maps`.
+    """
+
+    def __init__(self, old: Trace, ssh_map: SSHMap) -> None:
+        """Fit the poses to the old drives and their map."""
+        self.broken = 0.0
+        with one_thread("blas"):
+            self._fitted = Poses.of_map(old, ssh_map).gaussian()
+        self._piece = ssh_map.piece_of
+        self._places = numbered(-1 - s.id if s.place is None else s.place for s in ssh_map.dstates)
+
+    def with_displacements(self, digest: Trace, labels: Sequence[int]) -> Trace:
+        """Give each action of a digest the displacement between the steps before and after it.
+
+        It stays unknown if no displacement of the old drives connects these steps.
+        """
+        part, mean, *_ = self._fitted
+        positions = 2 * (max(self._places) + 1)
+        at = mean[:positions].reshape(-1, 2)[self._places][list(labels)]
+        facing = mean[positions:][list(labels)]
+        gone = vectors_turned(at[1:] - at[:-1], -facing[:-1])
+        turns = np.remainder(facing[1:] - facing[:-1] + np.pi, 2 * np.pi) - np.pi
+        moves = zip(*gone.T.tolist(), turns.tolist(), strict=True)
+        known = [
+            part[s] == part[x] and not action.starts
+            for (s, x), action in zip(pairwise(labels), digest.actions, strict=True)
+        ]
+        steps = [
+            replace(step, displacement=move) if is_known else step
+            for step, is_known, move in zip(digest.steps[1:], known, moves, strict=True)
+        ]
+        return replace(digest, steps=(digest.steps[0], *steps))
+
+    def maps(self, problem: Problem, labels: Sequence[int]) -> Iterator[SSHMap]:
+        """Yield maps of a digest and new drives. They keep the pieces of this map.
+
+        The cheapest one is last. The caller has to check them. The trace of the problem is a digest
+        of the old drives, and then the new ones. `labels` has the dstate of each step of the
+        digest.
+        """
+        log = Log(problem.trace, problem.theory, problem.pairs)
+        joining = Joining(problem, log)
+        parts = parts_of(self._fitted, labels, self._places, log, joining.sights, self._piece)
+        yield from joining.maps([replace(part, nats=0.0) for part in parts])  # they must be kept
+        self.broken = joining.broken

@@ -1,36 +1,48 @@
-"""Merge the places and dstates of two maps that coincide when one is laid on the other.
+"""Merge the places and dstates of hypotheses that coincide.
 
-An `Overlay` has two parts (`placed_map.py`) whose frames are unrelated at first. Merging two
-dstates fixes the frames to each other. From then on the two places that most surely coincide are
-merged first, and the poses are conditioned on each merge. Dstates at one place are merged after all
-places, or at once if an axiom demands it. Dstates that one action leads to from merged dstates are
-merged, too. If gateways may change between drives, places with different gateways may be merged, at
-a price for each change. Dstates and places of one piece of a map that must be kept are never
-merged.
+An `Overlay` lays one hypothesis on another one, whose frame is unrelated at first. Merging two
+dstates, or two places with a known turn, fixes the frames to each other. From then on the two
+places that most surely coincide are merged first, and the poses are conditioned on each merge.
+Dstates at one place are merged after all places, or at once if an axiom demands it. Dstates that
+one action leads to from merged dstates are merged, too. If gateways may change between drives,
+places with different gateways may be merged, at a price for each change. Dstates and places of one
+piece of a map that must be kept are never merged.
+
+*Smoothing* guesses a map of all steps that displacements and closures connect. A beam goes through
+the trace once, so it does not know the closures of later steps. After a long way it may join places
+that only the drift brings together. Smoothing first fits the poses of all visits to the
+displacements and closures, as if no two visits were to one place, and then merges them. It may also
+begin with a map, such as one of a beam, whose places are then merged further.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ssh_abduction.data.groups import gathered, numbered
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.geometry.equations import spreads_of
-from ssh_abduction.solver.guesses.kept_apart import KeptApart, denied_pairs
-from ssh_abduction.solver.guesses.pieces import poses_turned
-from ssh_abduction.solver.guesses.placed_map import Part
-from ssh_abduction.solver.guesses.reckoning import BLUR, conditioned
-from ssh_abduction.solver.guesses.sights import Sight, Sights
-from ssh_abduction.solver.guesses.ties import relation_of, tied, ties_between
+from ssh_abduction.solver.geometry.equations import spreads_of, visits_by_turns
+from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.sources.metric.hypothesis import (
+    BLUR,
+    Array,
+    Hypothesis,
+    conditioned,
+    parts_of,
+    rotated,
+)
+from ssh_abduction.solver.sources.metric.sights import Sight, Sights
+from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.pairs import pairs_in
 from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.theory import Theory
 
-Array = NDArray[np.float64]
 # The standard deviations of the frame of a drive, in metres and radians, before it is joined.
 ANYWHERE = np.array([1e3, 1e3, 3.0])
 # Poses that are one may differ by this standard deviation in radians, and by this share of a usual
@@ -49,14 +61,14 @@ class _State:
     Attributes:
         dstate: For each dstate, the first dstate that it is merged with.
         place: For each place, the first place that it is merged with.
-        seen: For each first dstate, what steps there show, as numbers (`Sights.seen`).
+        seen: For each first dstate, what steps there show, as in `Hypothesis`.
         sights: For each first place, what each drive saw of it.
         links: For each first dstate, the dstate that each of its actions leads to.
     """
 
     dstate: list[int]
     place: list[int]
-    seen: list[frozenset[int]]
+    seen: list[Mapping[int, float]]
     sights: list[Mapping[int, Sight]]
     links: list[dict[int, int]]
     mean: Array
@@ -77,13 +89,15 @@ class Overlay:
     """Merges the dstates and places of two maps, such as an old map and the map of a drive."""
 
     def __init__(
-        self, standing: Part, drive: Part | None, problem: Problem, sights: Sights
+        self, standing: Hypothesis, drive: Hypothesis | None, problem: Problem, sights: Sights
     ) -> None:
         """Prepare the merges. Without a second map, the first one is merged with itself."""
         self._theory = theory = problem.theory
         both = standing if drive is None else standing.beside(drive)
         self._both, self._sights, self._overlap = both, sights, problem.overlap
         self._old = len(standing.places), len(standing.sights)
+        self._position, self._heading = np.array(both.position), np.array(both.heading)
+        self._step_at = both.step_at
         self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
         slack = SLACK * both.usual_travel(problem.trace)
         self._spreads = spreads_of(problem.trace).max(axis=0) + np.array([slack, slack, SLACK]) ** 2
@@ -111,7 +125,6 @@ class Overlay:
         old = len(standing.places) if drive else 0
         denied = denied_pairs(theory, standing, drive or standing)
         self._denied = {(s, old + x) for s, x in denied}
-        self._ties = ties_between(problem.trace, both, len(standing.places))
         # These change while the two maps are merged.
         self._state, self._changes = self._apart, self._costs
 
@@ -134,24 +147,13 @@ class Overlay:
         self._state = self._apart
         new += self._old[0]
         both, places = self._both, (self._both.places[old], self._both.places[new])
-        at = both.mean[both.position[places[0]] :][:2]
-        equal = float(both.mean[both.heading[old]] - both.mean[both.heading[new]])
+        at = both.mean[self._position[places[0]] :][:2]
+        equal = float(both.mean[self._heading[old]] - both.mean[self._heading[new]])
         self._lay(new, at, equal if turn is None else turn, is_turn_known=turn is not None)
         if not (self._tried([(old, new)]) if turn is None else self._tried([], places)):
             return False
         self.merge_all()
         return True
-
-    def merge_by_closures(self) -> bool:
-        """Lay the drive on the old map by the closures between them. Then merge what coincides.
-
-        An earlier merge is undone first. Returns whether anything was merged.
-        """
-        self._state = self._apart
-        self._lay(*relation_of(self._both, self._ties))
-        mean, covariance = tied(self._both, self._ties, self._state.mean, self._state.covariance)
-        self._state = replace(self._state, mean=mean, covariance=covariance)
-        return self.merge_all()
 
     def merge_all(self) -> bool:
         """Merge all places that coincide. Return whether there was one."""
@@ -168,33 +170,32 @@ class Overlay:
         self._merge_coinciding(set(self._state.place))
         return self._state is not first
 
-    def part(self) -> Part:
+    def part(self) -> Hypothesis:
         """Return the part that all merges so far make of the two parts."""
         both, state = self._both, self._state
         dstates, places = sorted(set(state.dstate)), sorted(set(state.place))
         number = {s: i for i, s in enumerate(dstates)}
         place = {p: i for i, p in enumerate(places)}
-        position = both.position[places]
-        poses = [*np.stack([position, position + 1], 1).ravel(), *both.heading[dstates]]
+        position = self._position[places]
+        poses = [*np.stack([position, position + 1], 1).ravel(), *self._heading[dstates]]
         # The state of the new part: x and y of each place, then the heading of each dstate.
         n = 2 * len(places)
-        return Part(
+        return Hypothesis(
             {t: number[state.dstate[s]] for t, s in both.labels.items()},
             [place[state.place[both.places[s]]] for s in dstates],
             [state.seen[s] for s in dstates],
-            [both.stars[s] for s in dstates],
             {
                 (number[s], action): number[state.dstate[x]]
                 for s in dstates
                 for action, x in state.links[s].items()
             },
             [state.sights[p] for p in places],
-            2 * np.arange(len(places)),
-            n + np.arange(len(dstates)),
+            [*range(0, n, 2)],
+            [*range(n, n + len(dstates))],
             state.mean[poses],
             state.covariance[np.ix_(poses, poses)],
             state.nats,
-            frozenset((number[state.dstate[s]], piece) for s, piece in both.kept),
+            kept=frozenset((number[state.dstate[s]], piece) for s, piece in both.kept),
         )
 
     def _lay(self, new: int, at: Array, angle: float, is_turn_known: bool = False) -> None:
@@ -204,10 +205,10 @@ class Overlay:
         If the turn is known, it is known up to TURNED.
         """
         both, state = self._both, self._state
-        headings = both.heading[self._old[0] :]
-        x = both.position[self._old[1] :]
-        there = both.position[both.places[new]]
-        mean, covariance = poses_turned(both.mean, both.covariance, x, headings, there, angle)
+        headings = self._heading[self._old[0] :]
+        x = self._position[self._old[1] :]
+        there = self._position[both.places[new]]
+        mean, covariance = rotated(both.mean, both.covariance, x, headings, there, angle)
         dx, dy = mean[x] - mean[there], mean[x + 1] - mean[there + 1]
         mean[x], mean[x + 1] = at[0] + dx, at[1] + dy
         by = np.zeros((len(mean), 3))
@@ -221,7 +222,7 @@ class Overlay:
         """Find the two places that most surely coincide; None if there are none."""
         state = self._state
         places = np.array(sorted(set(state.place)))
-        at = np.stack([self._both.position[places], self._both.position[places] + 1], 1)
+        at = np.stack([self._position[places], self._position[places] + 1], 1)
         c = state.covariance
         across = c[at[:, None, :, None], at[None, :, None, :]]
         own = c[at[:, :, None], at[:, None, :]]
@@ -260,7 +261,7 @@ class Overlay:
         """Return the price of two places at one position. It is saved if they become one place."""
         if not places or {*before.sights[places[0]]} & {*before.sights[places[1]]}:
             return 0.0
-        here, there = (before.mean[k : k + 2].tolist() for k in self._both.position[[*places]])
+        here, there = (before.mean[k : k + 2].tolist() for k in self._position[[*places]])
         return self._overlap.crowded_price * self._overlap.share(here, there)
 
     def _merge_coinciding(self, places: set[int]) -> None:
@@ -298,10 +299,10 @@ class Overlay:
                     pairs.append((state.links[s][action], there))
                 else:
                     state.links[s][action] = there
-            state.seen[s] |= state.seen[x]
+            state.seen[s] = {**state.seen[s], **state.seen[x]}
             state.dstate = [s if i == x else i for i in state.dstate]
             p, q = sorted(state.place[self._both.places[i]] for i in (s, x))
-            headings = self._both.heading[s], self._both.heading[x]
+            headings = self._heading[s], self._heading[x]
             if p == q:
                 self._condition([headings], self._prices[0])
             else:
@@ -311,7 +312,7 @@ class Overlay:
 
     def _merge_places(self, p: int, q: int, heading: tuple[int, int] | None) -> None:
         """Merge two places, and perhaps two headings there. Raises _ClashError."""
-        state, position = self._state, self._both.position
+        state, position = self._state, self._position
         changes = self._sights.merged(state.sights[p], state.sights[q])
         if math.isinf(changes) or self._places_apart.includes(state.place, p, q):
             raise _ClashError
@@ -337,14 +338,13 @@ class Overlay:
         if self._theory.changed:
             return True
         (s, *_), (x, *_) = self._dstates_at(p), self._dstates_at(q)
-        step_at = self._both.step_at
-        turns = self._sights.turns(step_at[s], step_at[x])
+        turns = self._sights.turns(self._step_at[s], self._step_at[x])
         twists = [self._twist(s, x, turn) for turn in turns]
         return not twists or any(abs(off) < TURNED or square < FAR for off, square in twists)
 
     def _twist(self, s: int, x: int, turn: float = 0.0) -> tuple[float, float]:
         """Compute how far, in radians, s faces off x after a turn of s, and its chi-square."""
-        state, i, j = self._state, self._both.heading[s], self._both.heading[x]
+        state, i, j = self._state, self._heading[s], self._heading[x]
         c = state.covariance
         off = math.remainder(state.mean[i] + turn - state.mean[j], math.tau)
         return off, off * off / float(c[i, i] + c[j, j] - 2 * c[i, j] + self._spreads[2])
@@ -369,8 +369,9 @@ class Overlay:
 
     def _look_alike(self, s: int, x: int) -> bool:
         """Whether two dstates show the same, except for gateways that changed."""
-        seen, stars, sights = self._state.seen, self._both.stars, self._sights
-        return sights.may_be_one(seen[s], seen[x]) and sights.are_alike(stars[s], stars[x])
+        seen, sights = self._state.seen, self._sights
+        first, second = (sights.shown[self._step_at[i]] for i in (s, x))
+        return sights.may_be_one(seen[s], seen[x]) and sights.are_alike(first, second)
 
     def _coinciding(self, place: int) -> list[tuple[float, tuple[int, int]]]:
         """List pairs of dstates at a place that show the same and may face the same way.
@@ -388,3 +389,101 @@ class Overlay:
             ):
                 found.append((square, (s, x)))
         return found
+
+
+def smoothed(problem: Problem, log: Log, sights: Sights, begin: SSHMap | None) -> list[Hypothesis]:
+    """Merge visits, or the places and dstates of the map `begin`.
+
+    There is a hypothesis for each part of the trace that displacements and closures connect.
+    """
+    trace, theory = problem.trace, problem.theory
+    if begin is None:
+        labels, places = [*range(len(trace))], numbered(visits_by_turns(trace, theory))
+    else:
+        labels = [*begin.dstate_at]
+        places = numbered(-1 - s.id if s.place is None else s.place for s in begin.dstates)
+    of_dstate, of_place = theory.prices[0], theory.prices[1] * (theory.level == "topological")
+    found = []
+    for apart in parts_of(Poses(trace, labels, places).gaussian(), labels, places, log, sights):
+        price = of_dstate * len(apart.places) + of_place * len(apart.position)
+        overlay = Overlay(replace(apart, nats=apart.nats + price), None, problem, sights)
+        overlay.merge_all()
+        found.append(overlay.part())
+    return found
+
+
+def smoothed_map(problem: Problem, log: Log, begin: SSHMap | None = None) -> SSHMap | None:
+    """Make a map of a trace by smoothing, see `smoothed`.
+
+    None if it breaks an axiom, or if displacements and closures do not connect all visits.
+    """
+    bare = problem.theory.replace(displacement="none", weigh="count")
+    found = smoothed(problem, log, Sights(problem.trace, bare, misreads=False), begin)
+    return found[0].ssh_map(problem.trace, bare) if len(found) == 1 else None
+
+
+class KeptApart:
+    """The dstates (or the places) of a map that are two, because two of their steps are apart.
+
+    Those of one piece of a map that must be kept are two, as well.
+    """
+
+    def __init__(
+        self,
+        labels: Mapping[int, int],
+        pairs: Iterable[tuple[int, int]],
+        kept: Iterable[tuple[int, int]] = (),
+    ) -> None:
+        """Read pairs of steps that are apart. `labels` numbers steps; other steps are left out.
+
+        `kept` has the numbers that a map keeps apart from each other, each with its piece.
+        """
+        size = max(labels.values()) + 1
+        self._apart = np.zeros((size, size), bool)
+        for of_piece in gathered((piece, number) for number, piece in kept).values():
+            self._apart[np.ix_(of_piece, of_piece)] = True
+        for t, u in pairs:
+            if t in labels and u in labels:
+                self._apart[labels[t], labels[u]] = self._apart[labels[u], labels[t]] = True
+
+    @staticmethod
+    def of_places(
+        problem: Problem, labels: Mapping[int, int], kept: Iterable[tuple[int, int]]
+    ) -> KeptApart:
+        """List the places that are apart by evidence, or as a travel leads from one to the other.
+
+        Travels are ignored if they may stay at a place, or if actions may have slipped.
+        """
+        theory, actions = problem.theory, enumerate(problem.trace.actions)
+        leaves = theory.level == "topological" and "travel_leaves" in theory.hard
+        travels = [(t, t + 1) for t, action in actions if action.kind == "travel"]
+        known = travels if leaves and not theory.slipped else []
+        return KeptApart(labels, [*pairs_in(problem.pairs.elsewhere), *known], kept)
+
+    def includes(self, merged: Sequence[int], first: int, second: int) -> bool:
+        """Whether any number merged into `first` is apart from any that is merged into `second`.
+
+        `merged` has, for each number, the number that it is merged into.
+        """
+        into = np.asarray(merged)
+        return self._apart[np.ix_(into == first, into == second)].any().item()
+
+
+def denied_pairs(theory: Theory, first: Hypothesis, second: Hypothesis) -> set[tuple[int, int]]:
+    """List the pairs of dstates of two maps that a person says are different.
+
+    If one action leads from two dstates to such a pair, they are different, too.
+    """
+    here, there = first.labels, second.labels
+    said = (pair for i, j in (*theory.different, *theory.elsewhere) for pair in ((i, j), (j, i)))
+    todo = {(here[i], there[j]) for i, j in said if i in here and j in there}
+    found = set[tuple[int, int]]()
+    while todo:
+        found.add(pair := todo.pop())
+        todo |= {
+            (s, x)
+            for (s, action), y in first.links.items()
+            for (x, other), z in second.links.items()
+            if action == other and (y, z) == pair
+        } - found
+    return found

@@ -1,7 +1,7 @@
 """Sketches (maps without a search) of traces whose stars have any number of gateways.
 
 >>> from ssh_abduction import Theory, Trace
->>> from ssh_abduction.solver.guesses.gateway_sketch import sketches_of
+>>> from ssh_abduction.solver.sources.symbolic.gateway_sketch import sketches_of
 >>> from ssh_abduction.theory.settle import settle
 >>> there_and_back = ["travel", "around", "travel"]
 >>> ends = [[0], [180], [0], [180]]
@@ -40,7 +40,7 @@ from ssh_abduction.data.gateways import (
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solver.guesses.sketch import Contradiction, Sketch
+from ssh_abduction.solver.sources.symbolic.sketch import Contradiction, Sketch
 from ssh_abduction.theory.theory import Theory
 
 # A dstate, and a star that is seen there.

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.guesses.merging import thinned_map
+from ssh_abduction.solver.sources.symbolic.merging import thinned_map
 from ssh_abduction.solver.steps.chart import Link
 
 # The number of states of each view, for each start of EM. With more states than needed, EM finds

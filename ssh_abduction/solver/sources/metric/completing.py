@@ -1,7 +1,7 @@
 """Complete the dstates and places of a trace to a map: find its links, headings, paths and orders.
 
 >>> from ssh_abduction import Theory, Trace
->>> from ssh_abduction.solver.guesses.completing import completed
+>>> from ssh_abduction.solver.sources.metric.completing import completed
 >>> from ssh_abduction.theory.settle import settle
 >>> trace = Trace.from_steps("abab", ["travel", "around", "travel"])
 >>> theory = settle(trace, Theory(boundary="none")).theory
@@ -23,20 +23,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from graphlib import CycleError, TopologicalSorter
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import gateways
 from ssh_abduction.data.gateways import Facing
-from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.facts import views_of
 from ssh_abduction.solver.steps.faults import with_changes
 from ssh_abduction.theory.theory import Theory
-
-if TYPE_CHECKING:
-    from ssh_abduction.solver.guesses.placed_map import Part
 
 # A path and one of its directions, 1 or -1.
 _Course = tuple[int, int]
@@ -96,14 +91,6 @@ def valid_map(
     ssh_map = completed(trace, theory, labels, places, facing)
     found = None if ssh_map is None else with_changes(ssh_map, trace, theory)
     return None if found is None or next(violations(trace, found, theory), None) else found
-
-
-def map_of_part(trace: Trace, theory: Theory, part: Part) -> SSHMap | None:
-    """Make the map of a part, whose steps are those of the trace; None if it breaks an axiom."""
-    labels = [part.labels[t] for t in sorted(part.labels)]
-    order = list(dict.fromkeys(labels))  # of first visits
-    places, facing = numbered(part.places[s] for s in order), part.poses[1][order].tolist()
-    return valid_map(trace, theory, numbered(labels), places, facing)
 
 
 def _on(

@@ -15,7 +15,6 @@ from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Step, Trace
-from ssh_abduction.solver.guesses.reckoning import Hypothesis
 from ssh_abduction.solver.steps.frames import may_face, members, rotation_bits
 from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
@@ -64,10 +63,13 @@ class Sights:
         self._misreads, self._price = misreads, theory.prices[0] * theory.changed
         self.dearest = DEAREST + CHANGES * self._price
 
-    def changes(self, found: Hypothesis, place: int, t: int) -> float:
-        """Return the nats for changed gateways if step t is at a place; inf if it cannot be."""
-        before, now = found.drives[place], self.drive[t]
-        return self._between(found.sights[place], self.shown[t], is_one_drive=before == now)
+    def changes(self, seen: Mapping[int, Sight], t: int) -> float:
+        """Return the nats for changed gateways if step t is at a place; inf if it cannot be.
+
+        `seen` has what each drive saw of the place, the last drive last.
+        """
+        *_, (drive, last) = seen.items()
+        return self._between(last, self.shown[t], is_one_drive=drive == self.drive[t])
 
     def misread(self, seen: Mapping[int, float]) -> float:
         """Return the cost in nats of the misread views at a dstate; inf if they are not allowed.
@@ -77,11 +79,11 @@ class Sights:
         """
         return self._wrong(seen, self.right(seen)) if len(seen) > 1 else 0.0
 
-    def may_be_one(self, first: frozenset[int], second: frozenset[int]) -> bool:
+    def may_be_one(self, first: Mapping[int, float], second: Mapping[int, float]) -> bool:
         """Whether steps that saw this (`seen`) may be at one dstate, if no view is misread."""
-        if first == second or not self._has_unknown:
-            return first == second
-        return self.misread(dict.fromkeys(first | second, math.inf)) == 0.0
+        if first.keys() == second.keys() or not self._has_unknown:
+            return first.keys() == second.keys()
+        return self.misread(dict.fromkeys([*first, *second], math.inf)) == 0.0
 
     def right(self, seen: Mapping[int, float]) -> int:
         """Return what steps at a dstate saw rightly, if the misread views cost the least nats."""
@@ -111,7 +113,7 @@ class Sights:
                 return math.inf
         if any(not agree(first[drive], second[drive]) for drive in first.keys() & second.keys()):
             return math.inf
-        return self._along({**first, **second}) - self._along(first) - self._along(second)
+        return self.along({**first, **second}) - self.along(first) - self.along(second)
 
     def are_alike(self, first: Sight, second: Sight) -> bool:
         """Whether two steps that see these stars, not turned, may be at one dstate of a place."""
@@ -137,7 +139,7 @@ class Sights:
                         angles = np.radians(degrees)
                         yield -math.atan2(np.sin(angles).sum(), np.cos(angles).sum())
 
-    def _along(self, seen: Mapping[int, Sight]) -> float:
+    def along(self, seen: Mapping[int, Sight]) -> float:
         """Return the cost in nats of the changes from each drive to the next at one place."""
         between = pairwise(seen[drive] for drive in sorted(seen))
         return sum(self._between(was, now, is_one_drive=False) for was, now in between)

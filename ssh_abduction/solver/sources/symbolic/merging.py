@@ -1,7 +1,7 @@
 """Finds small maps of the causal theory without a search: it merges steps by evidence.
 
 >>> from ssh_abduction.solver.steps.chart import Chart
->>> from ssh_abduction.solver.guesses.merging import merged
+>>> from ssh_abduction.solver.sources.symbolic.merging import merged
 >>> links = ((0, 0, 1), (1, 0, 2), (2, 0, 3))
 >>> merged(Chart((0, 1, 0, 1), links, range(4)), [0, 1])
 [0, 1, 0, 1]

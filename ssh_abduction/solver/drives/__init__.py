@@ -1,1 +1,0 @@
-"""Add new drives to the map of old drives."""
