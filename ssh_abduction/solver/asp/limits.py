@@ -26,7 +26,7 @@ TICK = 0.5
 WAITING = 4.0
 # The work for the first map may wait this many times as long: without a map there is no answer.
 STARVED = 30.0
-# More conflicts of clasp than this count as no limit: they take days, and clasp reads no huge number.
+# More conflicts of clasp than this count as no limit: they take days.
 MOST_CONFLICTS = 2**31 - 1
 
 Stop: TypeAlias = Literal[
