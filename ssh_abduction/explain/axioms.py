@@ -88,9 +88,7 @@ class Axioms:
         `relaxed`, each axiom can be switched on or off at each step. If not, all hold.
         """
         trace, theory = piece.trace, piece.theory
-        self._trace, self._theory, self._names = trace, theory, piece.steps
-        self._problem = piece.problem
-        self._evidence = piece.problem.evidence
+        self._piece = piece
         self._stop = stop
         self._refusals = 0  # constraints added so far, because evidence rejected a map
         self._conclusions: list[clingo.Symbol] = []
@@ -269,7 +267,7 @@ class Axioms:
         found: list[_ModelMap] = []
 
         def keep(model: clingo.Model) -> None:
-            ssh_map = facts.read_map(model, self._trace, self._theory)
+            ssh_map = facts.read_map(model, self._piece.trace, self._piece.theory)
             found.append(_ModelMap(*facts.read_steps(model), ssh_map))
 
         return found[0] if self._solve(keep, active, assumed) else None
@@ -300,12 +298,12 @@ class Axioms:
         If axioms are relaxed, a rejection counts only if its axiom is active at the step that
         `_judged_at` returns.
         """
-        for evidence in self._evidence:
+        for evidence in self._piece.problem.evidence:
             steps = [t for axiom, t in sorted(active) if axiom == evidence.axiom]
             if self._pairs and isinstance(evidence, Displacement):
                 found = [self._refused_together(evidence, answer, t) for t in steps]
             elif steps or not self._pairs:
-                found = [evidence.refuse(self._trace, answer.ssh_map)]
+                found = [evidence.refuse(self._piece.trace, answer.ssh_map)]
             else:
                 continue
             for refusal in filter(None, found):
@@ -318,7 +316,7 @@ class Axioms:
 
     def _judged_at(self, axiom: str, refusal: Refusal) -> int:
         """Return the step at which the axiom has to be active for a rejection to count."""
-        return len(self._trace) - 1 if axiom == Planar.axiom else _last_step(refusal)
+        return len(self._piece.trace) - 1 if axiom == Planar.axiom else _last_step(refusal)
 
     def _refused_together(
         self, displacement: Displacement, answer: _ModelMap, step: int
@@ -326,7 +324,9 @@ class Axioms:
         """Find two returns that displacements reject together. The later one ends at `step`."""
         if displacement.joint == 1:
             return None
-        return displacement.returns_of(self._trace).refused_at(answer.labels, answer.places, step)
+        return displacement.returns_of(self._piece.trace).refused_at(
+            answer.labels, answer.places, step
+        )
 
     def _forbid(self, refusal: Refusal, where: clingo.Symbol | None = None) -> None:
         """Add a constraint: while the atom `where` is true, these equalities do not all hold."""
@@ -342,11 +342,11 @@ class Axioms:
         describes the return that is rejected most clearly, forbids it, and repeats this until no
         model is left.
         """
-        displacement = displacement_of(self._problem)
+        displacement = displacement_of(self._piece.problem)
         steps = [t for axiom, t in clash if displacement and axiom == displacement.axiom]
         if not displacement or not steps:
             return ()
-        returns = displacement.returns_of(self._trace)
+        returns = displacement.returns_of(self._piece.trace)
         said: dict[int, list[tuple[float, str]]] = {t: [] for t in steps}
         kept = {pair for pair in clash if pair[0] != displacement.axiom}
         others = [symbol for symbol, pair in self._pairs.items() if pair in kept]
@@ -358,12 +358,12 @@ class Axioms:
             if alone:
                 clearest = max(alone, key=returns.excess)
                 refusal: Refusal | None = frozenset([clearest])
-                why = returns.why_apart(clearest.first, clearest.second, self._names)
+                why = returns.why_apart(clearest.first, clearest.second, self._piece.steps)
                 found = returns.excess(clearest), why or ""
             else:
                 both = (self._refused_together(displacement, answer, t) for t in steps)
                 refusal = next(filter(None, both), None)
-                found = 0.0, returns.why_not_both(refusal or (), self._names)
+                found = 0.0, returns.why_not_both(refusal or (), self._piece.steps)
             if refusal is None:
                 break
             said[_last_step(refusal)].append(found)
