@@ -545,7 +545,7 @@ def test_ctrl_c_prints_finished_answers_that_waited_for_their_turn(
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 @pytest.mark.parametrize(
     ("jobs", "send"),
-    [("1", os.killpg), ("2", os.kill)],
+    [pytest.param("1", os.killpg, marks=pytest.mark.slow), ("2", os.kill)],
     ids=["1", "2, from another program"],
 )
 def test_ctrl_c_ends_the_processes_and_prints_their_maps(

@@ -52,7 +52,7 @@ def test_beam_finds_the_true_map_of_aces3(stars: bool) -> None:
     assert any(truth.is_true(ssh_map, known) for ssh_map in maps_of(known.trace, theory, 16))
 
 
-@pytest.mark.parametrize("misread", [0.0, 1.5])
+@pytest.mark.parametrize("misread", [0.0, pytest.param(1.5, marks=pytest.mark.slow)])
 def test_beam_joins_steps_of_unknown_view_with_known_ones(misread: float) -> None:
     known = truth.random_walk(4, 40, 16302, DRIFTING)
     trace = known.trace.with_views([v if t % 4 else None for t, v in enumerate(known.trace.views)])

@@ -153,7 +153,10 @@ def test_map_of_least_cost_has_no_probability_if_it_fits_badly(last: int, fits: 
     assert ("the best map does not fit the displacements" in solution.weighed.sentence) is not fits
 
 
-@pytest.mark.parametrize(("step", "seconds"), [(1, None), (1, 1e-9), (2, None)])
+@pytest.mark.parametrize(
+    ("step", "seconds"),
+    [(1, None), (1, 1e-9), pytest.param(2, None, marks=pytest.mark.slow)],
+)
 def test_explanation_names_the_closure_of_the_two_visits(step: int, seconds: float | None) -> None:
     """Also without a proof, and for another step of the same visit."""
     trace = closed(1, 9, (0.05, 0.05, 0.0))

@@ -162,7 +162,7 @@ def test_displacements_tell_equal_corners_of_a_square_apart() -> None:
     assert solution.maps[0].labels == tuple(step % 8 for step in range(11))
 
 
-@pytest.mark.parametrize("corners", [3, 6])
+@pytest.mark.parametrize("corners", [3, pytest.param(6, marks=pytest.mark.slow)])
 def test_displacements_tell_corners_of_polygons_apart(corners: int) -> None:
     trace = circuit(corners, 2 * corners + 1, 1.0, seed=corners)
     solution = solve(trace, Theory.causal())

@@ -226,7 +226,7 @@ def test_good_drive_gets_no_laser_warning(coarse: tuple[Scan, ...]) -> None:
     assert doubt(coarse) == ""
 
 
-@pytest.mark.parametrize("fov", [120.0, 270.0])
+@pytest.mark.parametrize("fov", [120.0, pytest.param(270.0, marks=pytest.mark.slow)])
 def test_warning_names_the_likely_field_of_view(coarse: tuple[Scan, ...], fov: float) -> None:
     """The true one is 180 degrees."""
     said = doubt(tuple(LaserOptions(fov=fov).placed(scan) for scan in coarse))

@@ -85,7 +85,11 @@ def street_tour(route: str, at: Mapping[str, tuple[float, float]], streets: set[
     return Trace(tuple(steps))
 
 
-@pytest.mark.parametrize("stars", [True, False], ids=["stars", "no stars"])
+@pytest.mark.parametrize(
+    "stars",
+    [True, pytest.param(False, marks=pytest.mark.slow)],
+    ids=["stars", "no stars"],
+)
 @pytest.mark.parametrize("known", [MAZES[0], pytest.param(MAZES[1], marks=pytest.mark.slow)])
 def test_joined_map_costs_at_most_as_much_as_the_true_one(known: truth.Known, stars: bool) -> None:
     problem = settle(known.trace, Theory(star="auto" if stars else "none"))
@@ -313,7 +317,7 @@ def test_closures_say_how_drives_lie_on_each_other() -> None:
     assert all(places[closure.first] == places[closure.last] for closure in closures)
 
 
-@pytest.mark.parametrize("seed", [312, 313])
+@pytest.mark.parametrize("seed", [312, pytest.param(313, marks=pytest.mark.slow)])
 def test_joined_map_has_a_probability_without_a_broad_beam(seed: int) -> None:
     (known,) = of_mazes(3, 20, [seed], NOISE, drives=2)
     weighing = Weighing(Search(known.trace)._parts)

@@ -311,7 +311,7 @@ def test_json_output_is_separate_from_progress_on_a_terminal(room: str, tmp_path
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals")
-@pytest.mark.parametrize("traces", [1, 2])
+@pytest.mark.parametrize("traces", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_json_is_not_wrapped_on_a_narrow_terminal(traces: int, room: str) -> None:
     """All output goes to stdout. Rich redirects stdout while it shows progress."""
     import pty

@@ -107,8 +107,14 @@ def blocks(page: Path) -> list[Block]:
     ]
 
 
+# Learning from images takes seconds. Tests of the learner do it, too.
+LONG = {"images"}
 RUN = [
-    pytest.param(block, id=f"{page.stem}-{number}")
+    pytest.param(
+        block,
+        id=f"{page.stem}-{number}",
+        marks=[pytest.mark.slow] if page.stem in LONG else [],
+    )
     for page in PAGES
     if page not in TUTORIALS
     for number, block in enumerate(blocks(page))

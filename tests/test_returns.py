@@ -108,7 +108,12 @@ def joint_excess(returns: Returns, rows: np.ndarray, thresholds: dict[int, float
 
 
 @pytest.mark.parametrize(
-    ("noise", "bend"), [("usual", 0.0), ("steady drift", 0.006), ("white", 0.0)]
+    ("noise", "bend"),
+    [
+        pytest.param("usual", 0.0, marks=pytest.mark.slow),
+        ("steady drift", 0.006),
+        ("white", 0.0),
+    ],
 )
 def test_bounds_on_returns_change_no_refusal(noise: str, bend: float) -> None:
     """Each return in turn is the only new one.

@@ -403,7 +403,9 @@ def test_narrow_beam_finds_a_joint_map_as_cheap_as_the_true_one(known: truth.Kno
     assert min(found) <= nats(known.dstates, known.places) + 1e-6
 
 
-@pytest.mark.parametrize(("seed", "steps"), [(405, 20), (400, 30)])
+@pytest.mark.parametrize(
+    ("seed", "steps"), [(405, 20), pytest.param(400, 30, marks=pytest.mark.slow)]
+)
 def test_beam_keeps_a_true_join_that_costs_more_at_first(seed: int, steps: int) -> None:
     """A true join may cost more than false ones for some steps."""
     (known,) = of_mazes(3, steps, [seed], truth.Noise(Odometry(**truth.NOISE)))
