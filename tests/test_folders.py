@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from ssh_abduction.cli import cluster_jobs, main, run_folders
+from ssh_abduction.cli import jobs, main, run_folders
 from ssh_abduction.cli.import_log import named_after
 from ssh_abduction.cli.jobs import FileAnswer
 from ssh_abduction.cli.mapping import MapQuestion
@@ -212,7 +212,7 @@ def test_run_that_cannot_be_written_does_not_stop_other_logs(
             raise OSError(errno.ENOSPC, "No space left on device")
         path.write_bytes(data)
 
-    monkeypatch.setattr(cluster_jobs, "answers_here", here)
+    monkeypatch.setattr(jobs, "answers_here", here)
     monkeypatch.setattr(run_folders, "write_file", write)
     monkeypatch.setattr(tempfile, "mkdtemp", lambda prefix: str(tmp_path / prefix))
     assert main(["map", *logs, "-o", str(tmp_path / "runs")]) == 1

@@ -39,7 +39,7 @@ SOON = 60  # seconds, enough on a slow and busy machine
 PROGRAM = """
 import sys, time
 from ssh_abduction import __main__
-from ssh_abduction.cli import batch, cluster_jobs, explain, facts, guard, solve
+from ssh_abduction.cli import batch, explain, guard, jobs, solve
 guard.DEAF = 0.2
 exec(sys.argv.pop(1))
 __main__.run()
@@ -103,7 +103,7 @@ LONG = "lambda *_: iter([batch.FileAnswer(0, 'much' * 10**5, 0)])"
 
 
 def test_ctrl_c_ends_many_solutions_that_nobody_reads(room: str) -> None:
-    with started(f"cluster_jobs.answers_here = {LONG}", "solve", room, room) as process:
+    with started(f"jobs.answers_here = {LONG}", "solve", room, room) as process:
         assert process.stdout
         assert process.stdout.read(4) == b"much"
         process.send_signal(signal.SIGTERM)

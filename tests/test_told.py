@@ -21,7 +21,7 @@ from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.cli import main, parser, verbosity
-from ssh_abduction.cli.completion import SHELLS
+from ssh_abduction.cli.about import SHELLS
 
 ACES = str(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
 VERBS = sorted(parser().verbs)

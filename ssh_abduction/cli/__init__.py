@@ -1,4 +1,4 @@
-"""The command line, with one module for each verb.
+"""The command line, with a module for each verb or a few related verbs.
 
 Exit codes:
     0: Success, or a map that is proven minimal.
@@ -20,63 +20,72 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
-from types import ModuleType
 from typing import Any
 
 from ssh_abduction.cli import (
+    about,
     check,
-    cluster,
     compare,
-    completion,
     correct,
     evaluate,
-    examples,
     explain,
-    export,
-    facts,
     import_log,
-    ladder,
-    list_axioms,
+    learn,
     localise,
-    map_logs,
-    naming,
-    next_experiment,
-    route,
+    mapping,
     show,
     simulate,
     solve,
-    train,
     view,
 )
-from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import check_inputs_are_kept
-from ssh_abduction.cli.outcome import warn
+from ssh_abduction.cli.outcome import EXIT_ERROR, unwritten, warn
 from ssh_abduction.cli.parsing import Parser, Verbs
 from ssh_abduction.cli.verbosity import add_verbosity, telling
-from ssh_abduction.data.errors import AbductionError, named, printable
-from ssh_abduction.data.files import json_line, mend_of
+from ssh_abduction.data.errors import AbductionError, printable
+from ssh_abduction.data.files import json_line
 from ssh_abduction.runtime import program
 
-EXIT_ERROR = 1
-# The verbs, grouped by purpose as the help lists them.
-VERBS: Mapping[str, tuple[ModuleType, ...]] = {
-    "map: find the maps of a trace or a log": (solve, map_logs, import_log, cluster),
-    "ask: judge, compare and explain maps": (
-        check,
-        compare,
-        explain,
-        evaluate,
-        ladder,
-        next_experiment,
+# The functions that add the verbs, grouped by purpose as the help lists them.
+VERBS: Mapping[str, tuple[Callable[[Verbs], None], ...]] = {
+    "map: find the maps of a trace or a log": (
+        solve.add_parser,
+        mapping.add_parser,
+        import_log.add_parser,
+        learn.add_cluster,
     ),
-    "use: drive and localise by a map": (localise, route, show, export, view, naming, correct),
-    "learn: recognise places from images": (train,),
-    "make: simulated robots and the paper's experiments": (simulate, reproduction, examples),
-    "about: the axioms, their input, and your shell": (list_axioms, facts, completion),
+    "ask: judge, compare and explain maps": (
+        check.add_parser,
+        compare.add_compare,
+        explain.add_parser,
+        evaluate.add_evaluate,
+        evaluate.add_ladder,
+        compare.add_next,
+    ),
+    "use: drive and localise by a map": (
+        localise.add_localise,
+        localise.add_route,
+        show.add_show,
+        show.add_export,
+        view.add_parser,
+        correct.add_name,
+        correct.add_correct,
+    ),
+    "learn: recognise places from images": (learn.add_train,),
+    "make: simulated robots and the paper's experiments": (
+        simulate.add_simulate,
+        simulate.add_reproduce,
+        simulate.add_examples,
+    ),
+    "about: the axioms, their input, and your shell": (
+        about.add_axioms,
+        about.add_facts,
+        about.add_completion,
+    ),
 }
 WORDS = (
     "A trace lists the steps of a drive. Each step has a view (the class of the image there), the "
@@ -106,22 +115,17 @@ def parser() -> Parser:
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
     verbs = top.add_subparsers(action=Verbs, metavar="VERB", dest="verb", required=True)
-    for title, modules in VERBS.items():
+    assert isinstance(verbs, Verbs)
+    for title, adders in VERBS.items():
         known = set(verbs.choices)
-        for verb in modules:
-            verb.add_parser(verbs)
+        for add in adders:
+            add(verbs)
         top.groups[title] = tuple(set(verbs.choices) - known)
     for each in (top, *verbs.choices.values()):
         add_verbosity(each)
     for each in verbs.choices.values():
         each.epilog = "\n\n".join(filter(None, (each.epilog, SEE_WORDS)))
     return top
-
-
-def unwritten(error: OSError, output: object) -> str:
-    """Say that a file cannot be written: the one that the error names, or else `output`."""
-    what = named(error.filename or output)
-    return f"{what}: cannot be written: {error.strerror or error}; {mend_of(error)}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

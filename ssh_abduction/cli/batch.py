@@ -17,12 +17,11 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
-from ssh_abduction.cli import EXIT_ERROR
-from ssh_abduction.cli.cluster_jobs import answers_of
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, final_code, in_a_line
+from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, answers_of, final_code, in_a_line
 from ssh_abduction.cli.options import check_jobs, theory_of
 from ssh_abduction.cli.outcome import (
+    EXIT_ERROR,
     StopFlag,
     Warnings,
     all_given,
@@ -67,7 +66,8 @@ class Known(NamedTuple):
         cls, search: Search, solution: Solution, explanation: Explanation | None = None
     ) -> Known:
         """Collect what is known from a search and its solution."""
-        return cls(solution, search.count, explanation, Warnings(search).of(solution))
+        found = max(search.count, len(solution.maps))
+        return cls(solution, found, explanation, Warnings(search).of(solution))
 
 
 @dataclass(frozen=True, slots=True)

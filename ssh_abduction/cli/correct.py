@@ -1,20 +1,48 @@
-"""ssh-abduction correct MAPS: say what is wrong in an existing map."""
+"""ssh-abduction correct and name: say what is wrong in an existing map, and name its places."""
 
 from __future__ import annotations
 
 import argparse
+import math
+import os
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
-from ssh_abduction.cli.obeyed_corrections import clash_alone, misreading, seen_at
-from ssh_abduction.cli.options import add_map, add_maps, at_comma, trace_beside
+from ssh_abduction.cli.obeyed_corrections import clash_alone, misreading, seen_at, sentences_of
+from ssh_abduction.cli.options import (
+    add_map,
+    add_maps,
+    at_comma,
+    maps_path,
+    read_maps,
+    trace_beside,
+    trace_of_maps,
+)
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
-from ssh_abduction.cli.saved_map import SavedMap, sentences_of
-from ssh_abduction.data.corrections import ASSERTIONS, Corrections, Said
-from ssh_abduction.data.errors import MapError, brief, named, printable
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.corrections import (
+    ASSERTIONS,
+    FILE,
+    Corrections,
+    Naming,
+    Said,
+    beside,
+    direction,
+    load_corrections,
+    number_at,
+    save_corrections,
+)
+from ssh_abduction.data.drives import Drive, step_name, step_of
+from ssh_abduction.data.errors import MapError, TraceError, brief, named, printable
+from ssh_abduction.data.map_parts import NAMED, region_of, thing_named
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.words import counted, meant
+from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.theory.theory import Theory
 
 HELPS = {
@@ -32,10 +60,10 @@ HELPS = {
 }
 
 
-def add_parser(verbs: Verbs) -> None:
+def add_correct(verbs: Verbs) -> None:
     parser = verbs.add(
         "correct",
-        run,
+        run_correct,
         "say what is wrong in a map",
         "Correct a map. The corrections are saved in corrections.yaml beside the map. solve obeys "
         "them if it writes into that folder (solve --output) or is given the file "
@@ -65,7 +93,7 @@ class _InOrder(argparse.Action):
         options.said = (*options.said, (self.dest, value))
 
 
-def run(options: argparse.Namespace) -> int:
+def run_correct(options: argparse.Namespace) -> int:
     saved = SavedMap.load(options.maps, options.map)
     before = said = saved.corrections
     for kind, value in options.said:
@@ -139,3 +167,254 @@ def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
         what = places if about_places else others
         raise MapError(f"{flag}: expected two different {what}, got {brief(pair)}; name two")
     return steps[0], steps[1]
+
+
+def add_name(verbs: Verbs) -> None:
+    parser = verbs.add(
+        "name",
+        run_name,
+        "name a place, path or region",
+        "Name a place, a path or a region of a map. The name is written to corrections.yaml beside "
+        "the map, for a step at this place. Solving again may renumber the places, but the name "
+        "stays with the place of that step.",
+    )
+    add_maps(parser)
+    parser.add(
+        "what",
+        "a place such as p4, a path such as path2, a region such as region3, or its name so far; "
+        "or a step such as monday:12, for its place",
+    )
+    parser.add("name", 'the name, such as "kitchen"; write -- before a name that begins with -')
+    add_map(parser)
+
+
+def run_name(options: argparse.Namespace) -> int:
+    saved = SavedMap.load(options.maps, options.map)
+    kind, step = saved.thing_to_name(options.what)
+    file = saved.save(saved.corrections.with_name(options.name, kind, step))
+    print(printable(f"the {kind} of {step} is {options.name.strip()!r}, in {named(file)}"))
+    return 0
+
+
+# Directions on the map as it is drawn, in degrees counterclockwise from east.
+_WINDS = ("east", "northeast", "north", "northwest", "west", "southwest", "south", "southeast")
+COMPASS = {name: 45.0 * k for k, name in enumerate(_WINDS)}
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """A map and the drives that it was made of."""
+
+    map: SSHMap
+    drives: tuple[Drive, ...]
+    file: Path  # the file of maps
+    corrections: Corrections  # what a person said about it
+    theory: Mapping[str, Any]  # the theory of the map, as data; empty if the file does not say
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], number: int | str = 1) -> SavedMap:
+        """Read a map, by its number from 1 or its id, and the corrections beside it.
+
+        Raises MapError if a file cannot be read, the maps do not name their drives, or the
+        corrections are of another map.
+        """
+        file = Path(maps_path(str(path)))
+        data = read_maps(str(file), "give a file that solve -o wrote")
+        listing = Listing.from_dict(data, named(file))
+        known = {drive.name: drive.fingerprint for drive in listing.drives}
+        if not known or None in known.values():
+            raise MapError(
+                f"{named(file)}: drives: expected the drives that were mapped, each with its "
+                "fingerprint, got none; solve again, with -o"
+            )
+        ssh_map = listing.maps[listing.number(str(number))]
+        if (corrections := beside(file)) is not None:
+            said = load_corrections(corrections)
+            said.check_drives(known)
+        else:  # keep the names that the map has
+            said = Corrections.of_names(ssh_map, listing.drives)
+        drives = {**said.drives, **{name: str(mark) for name, mark in known.items()}}
+        theory = data.get("theory") if isinstance(data, dict) else None
+        theory = theory if isinstance(theory, dict) else {}
+        found = cls(ssh_map, listing.drives, file, replace(said, drives=drives), theory)
+        return found.named(found.corrections)
+
+    def named(self, said: Corrections) -> SavedMap:
+        """Return the same map with these corrections, and with their names."""
+        return replace(self, map=said.named(self.map, self.drives), corrections=said)
+
+    @cached_property
+    def trace(self) -> Trace | None:
+        """The trace of the map; None if it is not beside the map, nor in its file."""
+        own = trace_beside(str(self.file))
+        return Trace.load(own) if own else trace_of_maps(str(self.file))
+
+    @property
+    def in_quarters(self) -> bool:
+        """Whether stars have four directions."""
+        return self.theory.get("star") == "frame"
+
+    def save(self, corrections: Corrections) -> Path:
+        """Write the corrections beside the map, after a check. Returns their file.
+
+        Raises MapError if a gateway contradicts the trace, or a drive or a step is unknown.
+        """
+        corrections.known_in(self.drives)
+        if self.trace is not None:
+            corrections.corrected(self.trace)
+        file = self.file.parent / FILE
+        save_corrections(corrections, file)
+        return file
+
+    def thing(self, text: str) -> tuple[str, str]:
+        """Find what a person names: return its kind, and a step there. Raises MapError.
+
+        The text is a place, path or region by its number, such as "p4" or "path 2", or by its name,
+        such as "kitchen"; or a step such as "monday:12", for the place where the robot was.
+        """
+        if found := self._numbered_or_named(text):
+            return found
+        try:
+            return "place", self.step(text)
+        except MapError as error:
+            names = {name.text for name in self.map.names} | {n.name for n in self._names}
+            hint = meant(text, names, 3) or "; or a place such as p4"
+            raise MapError(f"{error}{hint}") from None
+
+    @property
+    def _names(self) -> tuple[Naming, ...]:
+        """The names that a person gave in the drives of this map."""
+        return self.corrections.known_in(self.drives).names
+
+    def _numbered_or_named(self, text: str) -> tuple[str, str] | None:
+        """Find a place, path or region by its number or name, as `thing`; None for a step."""
+        # A place may have two names, each of a step. So return the step of this name.
+        for naming in self._names:
+            if naming.name == text:
+                return naming.kind, naming.step
+        kind, number = thing_named(text, self.map.names) or ("", -1)
+        if kind not in NAMED:
+            return None
+        for t, label in enumerate(self.map.dstate_at):
+            if number_at(self.map, kind, label) == number:
+                return kind, step_name(self.drives, t)
+        region = next((r for r in self.map.regions or () if r.id == number), None)
+        if kind == "region" and region is not None:
+            others = {f"region{region_of(self.map.regions, place)}" for place in region.places}
+            raise MapError(
+                f"{text}: expected a region to which some step belongs, got {brief(text)}, whose "
+                "places all belong to regions that are smaller or behind a door; name one of "
+                f"{', '.join(sorted(others))}"
+            )
+        raise MapError(
+            f"{text}: expected a {kind} of the map, got {brief(text)}, but the map has none of "
+            "this number; ssh-abduction show lists them"
+        )
+
+    def thing_to_name(self, text: str) -> tuple[str, str]:
+        """Find what a person names, as `thing`. If it has a name, return the step of this name."""
+        kind, step = self.thing(text)
+        number = self._at(kind, step)
+        there = [n.step for n in self._names if (n.kind, self._at(kind, n.step)) == (kind, number)]
+        return kind, step if step in there or not there else there[0]
+
+    def step(self, text: str) -> str:
+        """Return the name of a step, such as "monday:12". Raise MapError if there is none."""
+        try:
+            return step_name(self.drives, step_of(self.drives, text))
+        except TraceError as error:
+            raise MapError(str(error)) from None
+
+    def step_at_place(self, text: str) -> str:
+        """Return a step at a place, named as for `thing`. Raise MapError for anything else."""
+        kind, step = self.thing(text)
+        if kind != "place":
+            raise MapError(
+                f"expected a place or a step, got the {kind} {brief(text)}; name a place"
+            )
+        return step
+
+    def gateway(self, text: str) -> tuple[tuple[str, float], ...]:
+        """Return the steps at the place of a gateway, each with the gateway's direction.
+
+        Directions are degrees clockwise from ahead. The text is a place and a direction on the
+        drawn map, such as "p4 north" or "kitchen north"; or a step and a direction from the robot,
+        such as "monday:12 left" or "monday:12 135". Raises MapError if the map has no such place or
+        step, or no headings there.
+        """
+        where, _, way = text.strip().rpartition(" ")
+        kind, step = self.thing(where.strip()) if where else ("", "")
+        if kind != "place":
+            raise MapError(
+                "gateway: expected a place and a direction such as 'p4 north' or 'monday:12 left', "
+                f"got {brief(text)}; write both"
+            )
+        if way not in COMPASS and self._numbered_or_named(where.strip()):
+            raise MapError(
+                f"gateway: expected {', '.join(COMPASS)} after a place, got {brief(way)}; take one "
+                f"of them, or name a step, such as '{step} left'"
+            )
+        label = self.map.dstate_at[step_of(self.drives, step)]
+        if way not in COMPASS:
+            return self._seen_from(label, self._rounded(direction(way), text))
+        drawn = self._drawn(self.map.dstates[label].place)
+        # In a drawing that is not at right angles, start at the dstate that is drawn best.
+        off = {s: (heading - COMPASS[way]) % 90 for s, heading in drawn.items()}
+        best = min(off, key=lambda s: min(off[s], 90 - off[s]), default=None)
+        if best is None:
+            raise MapError(
+                f"gateway: expected a place with known headings for {brief(text)}; say it by a "
+                "step, such as 'monday:12 left'"
+            )
+        return self._seen_from(best, self._rounded(drawn[best] - COMPASS[way], text))
+
+    def _seen_from(self, label: int, way: float) -> tuple[tuple[str, float], ...]:
+        """List the steps at a dstate's place, each with the direction of a gateway from there.
+
+        Directions are degrees clockwise from ahead. `way` is the direction from the dstate.
+        """
+        here = self.map.dstates[label]
+        unit = 90 if self.in_quarters else 1
+        ways = {
+            s.id: (way + unit * (here.heading - s.heading)) % 360
+            for s in self.map.dstates
+            if s.place == here.place and s.heading is not None and here.heading is not None
+        }
+        drawn = self._drawn(here.place) if self.map.fit and not ways else {}
+        if label in drawn:  # as in maps of logs
+            ways = {s: round(way + drawn[s] - drawn[label]) % 360.0 for s in drawn}
+        ways = ways or {label: way}
+        steps = [(t, s) for t, s in enumerate(self.map.dstate_at) if s in ways]
+        return tuple((step_name(self.drives, t), ways[s]) for t, s in steps)
+
+    def _drawn(self, place: int | None) -> dict[int, float]:
+        """The drawn headings of the dstates at a place, in degrees counterclockwise from east."""
+        return {
+            s.id: math.degrees(heading)
+            for s in self.map.dstates
+            if s.place == place
+            and place is not None
+            and (heading := self._layout[s.id][2]) is not None
+        }
+
+    @cached_property
+    def _layout(self) -> Sequence[tuple[float, float, float | None]]:
+        """The position and heading of each dstate as it is drawn."""
+        from ssh_abduction.output.layout import layout  # loads scipy
+
+        return layout(self.map).dstates
+
+    def _rounded(self, degrees: float, text: str) -> float:
+        """Round a direction to whole degrees or, if stars have four directions, to one of these."""
+        if not self.in_quarters:
+            return round(degrees) % 360.0
+        quarter = round(degrees / 90)
+        if abs(degrees - 90 * quarter) > 30:
+            raise MapError(
+                f"gateway: expected a direction ahead, right, back or left of the robot, got "
+                f"{brief(text)}, which is between two; give a step, such as 'monday:12 left'"
+            )
+        return 90.0 * (quarter % 4)
+
+    def _at(self, kind: str, step: str) -> int | None:
+        return number_at(self.map, kind, self.map.dstate_at[step_of(self.drives, step)])

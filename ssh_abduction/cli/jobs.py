@@ -1,21 +1,32 @@
-"""Answer the same question about many files, in processes of this machine.
+"""Answer the same question about many files, in processes here or on a Dask cluster.
 
-`cluster_jobs.py` does so on a Dask cluster. Both yield each answer as soon as it is ready.
+Each answer comes as soon as it is ready.
 """
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import logging
+import re
 import sys
+import time
+import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol, TypeAlias
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
 
-from ssh_abduction.cli import EXIT_ERROR
-from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c
+from ssh_abduction.cli.outcome import EXIT_ERROR, StopFlag, on_ctrl_c, warn
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import AbductionError, SolverError, printable
+from ssh_abduction.data.checks import needed
+from ssh_abduction.data.errors import AbductionError, SolverError, brief, printable
 from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
-from ssh_abduction.solver import workers
+from ssh_abduction.solver import POLL, workers
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
 
 # The number of a file, its path, and its content; None to read it in the process.
 Task: TypeAlias = tuple[int, str, Any]
@@ -181,3 +192,220 @@ def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> 
         print(f"ssh-abduction: errors in {where}", file=sys.stderr)
         return EXIT_ERROR
     return max(codes, default=0)
+
+
+File: TypeAlias = tuple[int, str]  # the number of a file, and its path
+PATIENCE = 10  # seconds to wait for a Dask scheduler, and for its first worker
+LOOK = 1.0  # seconds between two checks that the cluster still has a worker
+LOST = (
+    "scheduler: expected an answer, got a lost connection; see whether it runs, and solve this "
+    "trace again"
+)
+
+
+def answers_of(
+    question: FileQuestion, paths: Sequence[str], options: argparse.Namespace, stop: StopFlag
+) -> Generator[Any]:
+    """Yield answers from processes here, or from the scheduler that the options name."""
+    if options.scheduler is None:
+        return answers_here(question, paths, options.jobs or 1, stop)
+    return answers_on_cluster(question, paths, options.scheduler, options.jobs, stop)
+
+
+def answers_on_cluster(
+    question: FileQuestion, paths: Sequence[str], address: str, jobs: int | None, stop: StopFlag
+) -> Generator[Any]:
+    """Yield answers from the workers of a Dask scheduler, in the order in which they are ready.
+
+    At most `jobs` files are on the cluster at a time; None or -1 takes twice the number of its
+    cores. The work ends early when `stop` is set. Raises AbductionError if the package
+    `distributed`, the scheduler or its workers are missing.
+    """
+    with needed("--scheduler", "distributed", "'ssh-abduction[cluster]'"):
+        from distributed import Client
+    if not re.search(r"^inproc:|:\d+$", address):
+        raise AbductionError(
+            "--scheduler: expected an address with a port, such as tcp://host:8786, got "
+            f"{brief(address)}; take the one that dask scheduler prints"
+        )
+    # The answers report errors. The warning about large graphs does not apply: each file is sent
+    # to one worker, once.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "Sending large graph")
+    try:
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
+    except Exception as error:  # another program at this address may answer anything
+        raise AbductionError(
+            f"--scheduler: expected a Dask scheduler at {address}, got none ({error}); start one "
+            "with: dask scheduler"
+        ) from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError:
+            raise AbductionError(
+                f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask "
+                f"worker {address}"
+            ) from None
+        most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
+        absence = Absence(lambda: len(client.ncores()), question.limit, address)
+        attempt = partial(_on_workers, question, client, most, absence)
+        for answer in _answers(question, paths, attempt, stop.is_set):
+            yield answer
+            if stop.is_set():
+                return
+
+
+def _answers(
+    question: FileQuestion,
+    paths: Sequence[str],
+    attempt: Callable[[list[File], list[File]], Iterator[Any]],
+    stopped: Callable[[], bool],
+) -> Iterator[Any]:
+    """Yield answers in any order, and find out which files kill their workers.
+
+    When a worker is killed, all files that it was working on are suspects. Try each suspect again
+    alone. If its worker is killed again, the file is to blame, and a process here makes some map
+    soon. `attempt` appends the suspects to its second argument.
+    """
+    suspects: list[File] = []
+    yield from attempt([*enumerate(paths)], suspects)
+    for task in suspects:
+        again: list[File] = []
+        yield from attempt([task], again)
+        for _ in again:
+            lost = workers.Lost(task[0], late=False)
+            yield from hurried_answer(question, (*task, None), lost, stopped)
+
+
+class Absence:
+    """Measures how long a cluster has had no worker, because Dask itself would wait for ever.
+
+    It warns after PATIENCE seconds. If there is a time limit in seconds, waiting should end after
+    this limit, but not before PATIENCE seconds. `workers` returns the number of workers.
+    """
+
+    def __init__(
+        self,
+        workers: Callable[[], int],
+        limit: float | None,
+        address: str,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._workers, self._limit, self._clock, self._address = workers, limit, clock, address
+        self._looks_at = self._last_seen = clock()
+        self._warned = False
+
+    @property
+    def sentence(self) -> str:
+        """A message that says for how long there was no worker, and what to do."""
+        seconds = self._clock() - self._last_seen
+        return (
+            f"scheduler: expected a worker, got none for {seconds:.0f} s; start one with: dask "
+            f"worker {self._address}"
+        )
+
+    def is_too_long(self) -> bool:
+        """Check for workers, at most once in LOOK seconds. Return whether to stop waiting."""
+        now = self._clock()
+        if now >= self._looks_at:
+            self._looks_at = now + LOOK
+            with contextlib.suppress(Exception):  # the scheduler may be gone
+                if self._workers():
+                    self._last_seen, self._warned = now, False
+        absent = now - self._last_seen
+        if absent >= PATIENCE and not self._warned:
+            self._warned = True
+            warn([f"{self.sentence}, or end this with Ctrl-C"])
+        return self._limit is not None and absent >= max(PATIENCE, self._limit)
+
+
+def _on_workers(
+    question: FileQuestion,
+    client: Client,
+    most: int,
+    absence: Absence,
+    tasks: list[File],
+    killed: list[File],
+) -> Iterator[Any]:
+    """Yield the answers for some files from the workers of a cluster, at most `most` at a time.
+
+    Files are read here, so that workers need not share the disk. Files whose worker was killed are
+    appended to `killed`. This uses Dask directly, because joblib's backend for Dask hangs when a
+    worker is killed.
+    """
+    from distributed import as_completed
+
+    sent: dict[Future[Any], File] = {}
+    ready = as_completed(loop=client.loop)
+
+    def received(left: int) -> Iterator[Any]:
+        """Yield answers until at most `left` files are on the cluster."""
+        while len(sent) > left:
+            if ready.is_empty():  # the scheduler is gone
+                return
+            if not ready.has_ready():
+                if not absence.is_too_long():
+                    time.sleep(POLL)
+                    continue
+                for future, task in sent.items():
+                    future.cancel()
+                    yield question.failed(*task, SolverError(absence.sentence))
+                sent.clear()
+                return
+            future = next(ready)
+            task = sent.pop(future)
+            yield from _result(question, future, task, killed)
+
+    for number, path in tasks:
+        try:
+            if client.status != "running":
+                raise SolverError(LOST)
+            if absence.is_too_long():
+                raise SolverError(absence.sentence)
+            work = question, number, path, question.load(path)
+            future = client.submit(_on_worker, *work, pure=False)
+        except Exception as error:
+            yield question.failed(number, path, error)
+            continue
+        sent[future] = number, path
+        ready.add(future)
+        yield from received(most - 1)
+    yield from received(0)
+    for task in sent.values():  # tasks that were under way when the scheduler was lost
+        yield question.failed(*task, SolverError(LOST))
+
+
+def _result(
+    question: FileQuestion, future: Future[Any], task: File, killed: list[File]
+) -> Iterator[Any]:
+    """Yield the answer of a task that is done. If its worker was killed, append it to `killed`."""
+    from distributed import KilledWorker
+
+    try:
+        yield future.result()
+    except KilledWorker:
+        killed.append(task)
+    except CancelledError:
+        yield question.failed(*task, SolverError(LOST))
+    except Exception as error:  # an error of the cluster: `answer` catches all others
+        mend = "install the same ssh-abduction where the scheduler and its workers run"
+        said = f"cluster: expected an answer, got {type(error).__name__}: {error}; {mend}"
+        yield question.failed(*task, SolverError(said))
+
+
+def _on_worker(question: FileQuestion, number: int, path: str, content: Any) -> Any:
+    """Answer the question about one file on a Dask worker. Stop if the client disconnects."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    task = worker.state.tasks[worker.get_current_task()]
+
+    def given_up() -> bool:
+        return bool(task.state == "cancelled")
+
+    if not question.has_limits:
+        return question.answer(number, path, content, given_up)
+    # A task that exceeds its limits is killed together with its process. So it gets its own
+    # process, as other tasks may run in this one.
+    return next(answers_of_processes(question, [(number, path, content)], 1, given_up), None)

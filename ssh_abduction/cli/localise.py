@@ -1,15 +1,16 @@
-"""ssh-abduction localise MAPS TRACE: where in a known map the robot was at each step."""
+"""ssh-abduction localise and route: follow a robot in a known map, and find its way."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import (
+    add_map,
     add_maps,
     check_number,
     check_picture,
@@ -23,7 +24,7 @@ from ssh_abduction.cli.options import (
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.show import named_maps
 from ssh_abduction.cli.text import steps_in_words, table
-from ssh_abduction.data.errors import LocaliserError, MapError, named, said_of
+from ssh_abduction.data.errors import LocaliserError, MapError, named, printable, said_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.schema import only_known
@@ -47,10 +48,10 @@ CHANCES = {
 NOWHERE = "–"
 
 
-def add_parser(verbs: Verbs) -> None:
+def add_localise(verbs: Verbs) -> None:
     parser = verbs.add(
         "localise",
-        run,
+        run_localise,
         "follow a robot in a known map",
         "Find where in a known map the robot was at each step of another trace. Markov "
         "localisation computes a belief over dstates after each step. The robot may start "
@@ -90,7 +91,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add("--json", "print the answer as JSON")
 
 
-def run(options: argparse.Namespace) -> int:
+def run_localise(options: argparse.Namespace) -> int:
     check_picture(options.plot)
     localiser, trace = _localiser(options)
     beliefs = [belief.to_dict() for belief in localiser.beliefs(trace)]
@@ -185,3 +186,84 @@ def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
         cells.append(NOWHERE if place is None else ssh_map.numbered("place", place))
     shares = [f"{belief[name]:.3f}" for name in ("probability", "nowhere")]
     return [*cells, *shares, f"{belief['entropy']:.2f}", f"{belief['normaliser']:.3g}"]
+
+
+def add_route(verbs: Verbs) -> None:
+    parser = verbs.add(
+        "route",
+        run_route,
+        "find the actions that lead to a place",
+        "Find the shortest route through a map: the actions from one dstate or place to "
+        "another, and the views to expect on the way. If the map lists regions, say first which "
+        "regions the route leaves and enters, and which paths it passes.",
+        "ssh-abduction show lists the dstates and places of a map. docs/reference/formats.md "
+        "describes the JSON.",
+    )
+    add_maps(parser)
+    parser.add(
+        "--from A",
+        "start: the number of a dstate, a step such as monday:12, or a place or region by number "
+        "or name, such as p3, region2 or kitchen (default: the robot's last dstate)",
+        dest="start",
+    )
+    parser.add(
+        "--to B", "goal: a dstate, place or region, named as for --from", dest="goal", required=True
+    )
+    said = "dstates, places and regions that the route must not visit"
+    parser.add("--avoid X", said, nargs="+", action="extend")
+    parser.add(
+        "--by",
+        "what to minimise (default: actions). With actions or metres, a route uses only moves "
+        "that the robot has made. With places, it may use any move along a path of the "
+        "map, and drive back where it came from",
+        choices=("actions", "places", "metres"),
+        default="actions",
+    )
+    add_map(parser)
+    parser.add("--json", "print the answer as JSON")
+
+
+def run_route(options: argparse.Namespace) -> int:
+    from ssh_abduction.online.routes import action_in_words, route  # loads networkx
+    from ssh_abduction.rivals.listing import Listing
+
+    listing = Listing.load(options.maps)
+    given = {name.text for ssh_map in listing.maps for name in ssh_map.names}
+    avoid = _names(options.avoid, given)
+    with said_of(listing.source, MapError):
+        how: dict[str, Any] = {"by": options.by, "map": options.map}
+        found = route(listing, options.start, options.goal, avoid=avoid, **how)
+    if options.json:
+        print(json_line(found.to_dict()))
+        return 0
+    print(printable(found.sentence))
+    if found.legs:
+        called = listing.maps[found.map - 1].called
+        print(printable(f"by regions: {'; '.join(leg.in_words(called) for leg in found.legs)}"))
+    if found.moves:
+        chosen = listing.maps[found.map - 1]
+        rows = [
+            [
+                action_in_words(move),
+                "" if move.dstate is None else move.dstate,
+                "not known" if move.view is None else move.view,
+                "" if move.place is None else chosen.numbered("place", move.place),
+                move.course,
+                *([] if move.metres is None else [f"{move.metres:.2f}"]),
+                "" if move.known else "never tried",
+            ]
+            for move in found.moves
+        ]
+        metres = [] if found.metres is None else ["metres"]
+        print(table(["action", "dstate", "expect", "place", "path", *metres, ""], rows))
+    return 0
+
+
+def _names(words: list[str] | None, given: Collection[str]) -> list[str]:
+    """Split words at commas, to list what to avoid. Names that a person gave may have commas."""
+    return [
+        name
+        for word in words or ()
+        for name in ([word] if word in given else word.split(","))
+        if name
+    ]

@@ -18,14 +18,21 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ssh_abduction.cli import EXIT_ERROR, unwritten
-from ssh_abduction.cli.cluster_jobs import answers_of
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.import_log import WIDTH, named_after, reading_of
-from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, final_code, in_a_line
+from ssh_abduction.cli.import_log import WIDTH, add_reading, named_after, reading_of
+from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, answers_of, final_code, in_a_line
 from ssh_abduction.cli.obeyed_corrections import say_obeyed
-from ssh_abduction.cli.options import check_jobs, choices_of, theory_of
-from ssh_abduction.cli.outcome import StopFlag, exit_code, on_ctrl_c, warn
+from ssh_abduction.cli.options import (
+    add_jobs,
+    add_max_maps,
+    add_theory,
+    check_jobs,
+    choices_of,
+    output,
+    theory_of,
+)
+from ssh_abduction.cli.outcome import EXIT_ERROR, StopFlag, exit_code, on_ctrl_c, unwritten, warn
+from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.run_folders import (
     check_folder,
     digest,
@@ -53,6 +60,51 @@ from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from ssh_abduction.robot_logs.log_maps import LogMap, LogMapping
+
+
+def add_parser(verbs: Verbs) -> None:
+    parser = verbs.add(
+        "map",
+        run,
+        "map a building from a robot's log",
+        "Find the minimal maps of a building from a robot's log. Writes trace.jsonl, maps.json, "
+        "page.html, report.html and run.json into a folder. With several logs, each gets its own "
+        "folder, and its result is one line. Logs that are already mapped with the same settings "
+        "are skipped. With --together, the logs are drives through one building, and get one map.",
+    )
+    parser.add(
+        "logs",
+        "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
+        "compressed by gzip, bzip2, xz or zstd",
+        nargs="+",
+        metavar="log",
+    )
+    parser.add("--together", "the logs are drives through one building: find their joint maps")
+    said = "folder to write; each of several logs gets a folder inside it"
+    parser.add("-o --output FOLDER", said, type=output, required=True)
+    add_max_maps(parser, "minimal maps", 300)
+    parser.add(
+        "--work-limit W",
+        "units of work for the search, each about a second of a quiet core; the same map on each "
+        "machine (default: the time limit or, without one, a unit for 20 seconds that the robot "
+        "drove, less a quarter for the ladder, and at least 30; a search that has no map then goes "
+        "on for up to 64 times as long)",
+        type=float,
+    )
+    parser.add("--time-limit S", "end the search after S seconds in any case", type=float)
+    said = (
+        "whether to compute how much each kind of evidence helps; this takes up to a quarter of "
+        "the work limit after the search, or a few units if that is more (default: true)"
+    )
+    parser.add_setting("ladder", said, default=True)
+    parser.add_setting(
+        "again", "whether to map also logs that are already mapped (default: false)", default=False
+    )
+    add_jobs(parser, "map", "logs")
+    add_reading(parser)
+    left_out = "the axioms of stars, sides and paths, as logs do not show these reliably"
+    add_theory(parser, default=f"topological, but without {left_out}")
+
 
 GIVEN_UP = "expected time to map this log, got an interruption; map it again"
 HURRY = 0.5  # seconds for the search, after the process that mapped the log was killed
@@ -254,6 +306,7 @@ class MapQuestion(FileQuestion):
             # A part of a log after a jump of the odometer has another name than any log.
             drive["source"] = path = sources.get(drive["name"], path)
         files["run.json"] = (json.dumps(run, indent=2, ensure_ascii=False) + "\n").encode()
+
         cost, solution = done.solution.cost, done.solution
         found = "no map"
         if cost is not None:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli.outcome import warn
-from ssh_abduction.cli.saved_map import sentences_of
 from ssh_abduction.data.corrections import (
     ASSERTIONS,
     FILE,
@@ -228,3 +227,8 @@ def seen_at(said: Said | Passage, trace: Trace) -> str:
         seen = ("no view" if step.view is None else step.view for step in (first, second))
         return f" ({', '.join(f'{s} shows {v}' for s, v in zip(said.steps, seen, strict=True))})"
     return " (their stars differ)" if first.star != second.star else ""
+
+
+def sentences_of(corrections: Corrections) -> Iterator[str]:
+    """Put corrections into words: yield one sentence for each."""
+    yield from map(str, (*corrections.names, *corrections.pairs, *corrections.gateways))

@@ -16,6 +16,7 @@ from types import FrameType
 from typing import Any, TypeAlias
 
 from ssh_abduction.data.errors import MapError, named
+from ssh_abduction.data.files import mend_of
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.explain.axioms import Interrupted
@@ -36,6 +37,7 @@ Given: TypeAlias = tuple[SSHMap, Cost | None]
 EXPLAINING = 0.5
 LEAST_LEFT = 0.2  # seconds that must be left to solve the trace with the runner-up's views
 
+EXIT_ERROR = 1
 EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
 
 
@@ -137,6 +139,12 @@ def warn(warnings: Iterable[str]) -> None:
     """Print warnings on stderr."""
     for warning in warnings:
         print(f"ssh-abduction: warning: {warning}", file=sys.stderr)
+
+
+def unwritten(error: OSError, output: object) -> str:
+    """Say that a file cannot be written: the one that the error names, or else `output`."""
+    what = named(error.filename or output)
+    return f"{what}: cannot be written: {error.strerror or error}; {mend_of(error)}"
 
 
 def save_solution(solution: Solution, file: str | None) -> None:

@@ -1,4 +1,4 @@
-"""ssh-abduction simulate WORLD: drive a robot through a world, and write a trace or a log."""
+"""ssh-abduction simulate, reproduce and examples: simulated robots and the paper's experiments."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import simulator
-from ssh_abduction.cli.options import add_output, seed, write
+from ssh_abduction.cli.options import add_output, check_jobs, output, seed, write
 from ssh_abduction.cli.parsing import Verbs
-from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import AbductionError, named, printable
-from ssh_abduction.data.files import save_file
+from ssh_abduction.cli.text import counted, table
+from ssh_abduction.cli.verbosity import progress_bar
+from ssh_abduction.data.errors import AbductionError, brief, named, printable
+from ssh_abduction.data.files import save_file, shipped, write_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,14 +29,14 @@ ENDINGS = (".log", ".clf", ".bag", ".mcap")
 SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").glob("*.json"))
 
 
-def add_parser(verbs: Verbs) -> None:
+def add_simulate(verbs: Verbs) -> None:
     text = (
         "Drive a robot through a world, and write a trace with an image, an action and the "
         "odometry at each dstate. Run cluster on the trace to get views. With --format, write a "
         "log of scans and odometry, as a real robot records it, and a file with the "
         "truth beside it."
     )
-    parser = verbs.add("simulate", run, "drive a robot through a world", text)
+    parser = verbs.add("simulate", run_simulate, "drive a robot through a world", text)
     parser.add(
         "world",
         f"the world: {', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or "
@@ -115,7 +116,7 @@ def add_parser(verbs: Verbs) -> None:
     add_output(parser)
 
 
-def run(options: argparse.Namespace) -> int:
+def run_simulate(options: argparse.Namespace) -> int:
     from simulator.robot import Body
     from simulator.tours import simulate
     from simulator.world import World
@@ -244,3 +245,118 @@ def _with_table(trace: Trace, target: str) -> Trace:
     save_images(path, images_of(trace))
     steps = tuple(replace(step, image=i) for i, step in enumerate(trace.steps))
     return replace(trace, steps=steps, images=path.name)
+
+
+# Each seed takes seconds. More than this many seeds are a typing error, and would fill the memory.
+MOST_SEEDS = 10_000
+
+
+def add_reproduce(verbs: Verbs) -> None:
+    parser = verbs.add(
+        "reproduce",
+        run_reproduce,
+        "run the paper's experiments",
+        "Reproduce an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn. "
+        "Writes figures, data and a page into a folder.",
+    )
+    said = "which experiment of the paper to repeat"
+    parser.add("experiment", said, choices=("notched-rectangle", "taylor-hall"))
+    parser.add("--seeds", "random seeds, such as 0-19 or 1,5,7 (default: 0-19)", default="0-19")
+    parser.add("--json", "print each claim, with the paper's value and ours for each seed, as JSON")
+    parser.add(
+        "--jobs N", "the number of processes; -1 for one per core (default: 2)", type=int, default=2
+    )
+    parser.add_setting(
+        "outcomes",
+        "for notched-rectangle, whether to try other depths of the notch and other spreads of the "
+        "robot's poses, too (default: true)",
+        True,
+    )
+    parser.add("-o --output FOLDER", "folder to write (default: out/EXPERIMENT)", type=output)
+
+
+def run_reproduce(options: argparse.Namespace) -> int:
+    from ssh_abduction.evaluation.paper_report import reproduce, steps
+
+    seeds, name = _seeds(options.seeds), options.experiment
+    check_jobs(options.jobs, "processes", default=2)
+    folder = Path(options.output or f"out/{name}")
+    with progress_bar() as progress:
+        task = progress.add_task(name, total=steps(name, seeds, options.outcomes))
+
+        def done(what: str) -> None:
+            progress.update(task, advance=1, description=f"{name}: {what}")
+
+        def show(rows: list[dict[str, Any]]) -> None:
+            progress.stop()  # or the bar would be drawn into the table
+            _print(options, rows)
+            progress.start()
+
+        shown: dict[str, Any] = {"on_done": done, "on_table": show}
+        reproduce(name, seeds, folder, options.jobs, options.outcomes, **shown)
+    if not options.json:
+        print(f"\nThe page with the figures is {named(folder / 'report.html')}")
+    return 0
+
+
+def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
+    from ssh_abduction.evaluation.paper_report import claimed, spread_of
+
+    if options.json:
+        record = {"experiment": options.experiment, "claims": rows}
+        print(json.dumps(record, ensure_ascii=False, indent=1), flush=True)
+        return
+    cells = [[claimed(r), r["paper"], spread_of(r), f"{r['holds']} of {r['seeds']}"] for r in rows]
+    print(table(["claim", "paper", "here", "holds"], cells), flush=True)
+
+
+def _seeds(text: str) -> list[int]:
+    """List the seeds in a text such as "0-19" or "1,5,7". Raise AbductionError for others."""
+    try:
+        found: list[int] = []
+        for part in text.split(","):
+            first, _, last = part.partition("-")
+            numbers = range(int(first), int(last or first) + 1)
+            if not numbers or numbers[-1] >= 2**32 or len(found) + len(numbers) > MOST_SEEDS:
+                raise ValueError
+            found += numbers
+    except (ValueError, OverflowError):
+        raise AbductionError(
+            f"--seeds: expected numbers as 0-19 or 1,5,7, at most {MOST_SEEDS:,} and below "
+            f"{2**32:,}, got {brief(text)}; write fewer"
+        ) from None
+    return found
+
+
+def add_examples(verbs: Verbs) -> None:
+    parser = verbs.add(
+        "examples",
+        run_examples,
+        "copy the examples into a folder",
+        "Copy the examples of the package into a folder: traces, programs and a notebook. If a "
+        "file of the same name has other content, nothing is copied.",
+    )
+    parser.add(
+        "-o --output FOLDER", "folder to write (default: examples)", type=output, default="examples"
+    )
+
+
+def run_examples(options: argparse.Namespace) -> int:
+    folder = Path(options.output)
+    examples = {
+        folder / path.name: path.read_bytes()
+        for path in sorted(shipped("examples").iterdir())
+        if path.is_file()
+    }
+    for path, data in examples.items():
+        if path.exists() and not (path.is_file() and path.read_bytes() == data):
+            raise AbductionError(
+                f"{named(path)}: expected no file, or the example of this name, got another one; "
+                "nothing was copied: move it away, or take another folder (-o FOLDER)"
+            )
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, data in examples.items():
+        write_file(path, data)
+    listed = ", ".join(path.name for path in examples)
+    print(f"{counted(len(examples), 'examples')} in {named(folder)}: {listed}")
+    return 0

@@ -1,4 +1,8 @@
-"""ssh-abduction solve TRACE: find the minimal maps of a trace. batch.py solves many traces."""
+"""ssh-abduction solve TRACE: find the minimal maps of a trace. batch.py solves many traces.
+
+With --onto, add a drive to an existing map, which keeps its places. With --front, find the fewest
+dstates for 0, 1, … K faults. A fault is an observation or action that the map treats as wrong.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.obeyed_corrections import Obeying
+from ssh_abduction.cli.obeyed_corrections import (
+    Obeying,
+    corrections_of,
+    keep_corrections,
+    say_obeyed,
+)
 from ssh_abduction.cli.options import (
     add_jobs,
     add_limits,
@@ -42,31 +51,39 @@ from ssh_abduction.cli.outcome import (
 )
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import (
+    counted,
     describe,
     describe_backbone,
     findings,
     first_map,
     headline,
+    table,
     told_apart,
 )
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.explain.no_map import Explanation
+from ssh_abduction.runtime import program
 from ssh_abduction.runtime.loggers import PROGRESS
 from ssh_abduction.solver import (
     Backbone,
+    Front,
     Search,
     Solution,
     Start,
     Status,
     Stop,
+    fault_front,
+    solve,
     summary_of,
     written_map,
 )
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
+from ssh_abduction.theory.theory import Theory
 
 # At most this many maps are kept in memory, to compare them on the terminal or to sort them for
 # JSON. If there are more, only the first ones are compared, and JSON has all in the order found.
@@ -142,9 +159,7 @@ def run(options: argparse.Namespace) -> int:
     if options.output is not None:
         check_output(options.output, "the solution")
     if options.onto is not None:
-        from ssh_abduction.cli import solve_onto
-
-        return solve_onto.run(options)
+        return _onto(options)
     # Many traces are solved each by itself, by `batch`.
     many = options.jobs is not None or options.scheduler is not None
     alone = many or (len(options.traces) > 1 and not options.together)
@@ -159,9 +174,7 @@ def run(options: argparse.Namespace) -> int:
             "faults; give --time-limit"
         )
     if options.front is not None:
-        from ssh_abduction.cli import solve_front
-
-        return solve_front.run(options)
+        return _front(options)
     if options.together and many:
         raise AbductionError(
             "--together: expected one search for all traces, got --jobs or --scheduler; leave "
@@ -424,3 +437,106 @@ def _progress(prints_meanwhile: bool) -> Iterator[Any]:
     as_is = {"redirect_stdout": False, "redirect_stderr": False}
     with Live(status, console=Console(stderr=True), transient=True, **as_is):
         yield lambda progress: status.update(text=progress.sentence)
+
+
+def _onto(options: argparse.Namespace) -> int:
+    for name in ("front", "jobs", "scheduler", "joint_trace"):
+        if getattr(options, name) is not None:
+            flag = f"--{name.replace('_', '-')}"
+            raise AbductionError(
+                f"{flag}: expected no such option when a drive is added to a map; leave it out"
+            )
+    existing = Solution.load(options.onto)
+    trace = together([Trace.load(path) for path in options.traces])
+    said = corrections_of(options)
+    # Steps of options such as --same are named by the drives of the old and the new traces.
+    if existing.trace is not None:
+        number_steps(options, together([existing.trace, trace]))
+    solution = solve(
+        trace,
+        theory_of(options, existing.theory.replace(returns=0)),
+        onto=existing,
+        time_limit=options.time_limit,
+        work_limit=options.work_limit,
+        max_maps=options.maps or None,
+        within=options.within,
+        memory_limit=options.memory_limit,
+        speedups=Speedups.without(options.without_speedups),
+        corrections=said,
+    )
+    if said is not None and solution.trace is not None:
+        say_obeyed(said, solution.trace)
+    warn(solution.warnings)
+    save_solution(solution, options.output)
+    keep_corrections(said, options.output)
+    if options.json:
+        print(json_line(solution.to_dict()))
+        return exit_code(solution)
+    count = len(solution.maps)
+    print(headline(solution, count, None))
+    lines = (
+        *findings(solution, existing.maps[0]),
+        first_map(solution, count),
+        *told_apart(solution, count),
+    )
+    print("\n".join(lines))
+    return exit_code(solution)
+
+
+def _front(options: argparse.Namespace) -> int:
+    """Print the front: the fewest dstates for each number of faults.
+
+    The exit code is 0 if the search was completed, 20 if no map has so few faults, and 10 if
+    the search was stopped.
+    """
+    several = len(options.traces) > 1 or options.together
+    if several or options.jobs is not None or options.scheduler is not None:
+        raise AbductionError(
+            "--front: expected one trace, got several, or --together, --jobs or --scheduler; ask "
+            "for each trace by itself"
+        )
+    front = fault_front(
+        Trace.load(options.traces[0]),
+        theory_of(options, Theory.causal()),
+        options.front,
+        options.time_limit,
+    )
+    if options.json:
+        points = [attributes_of(p, "faults", "dstates", "proven", "map") for p in front.points]
+        print(json_line(attributes_of(front, "knee", "prices") | {"front": points}))
+    else:
+        print(_front_as_text(front, options.front))
+    return 10 if front.stopped else 0 if front.points else 20
+
+
+def _front_as_text(front: Front, most: int) -> str:
+    """Write a front of at most `most` faults as a table, with sentences below it."""
+    if not front.points:
+        return (
+            f"no map has at most {counted(most, 'faults')}: the asserted pairs of steps (--same, "
+            "--different, --elsewhere) contradict what was seen and done; "
+            "allow more faults (--front), or assert less"
+        )
+    rows = []
+    for point in front.points:
+        faults = "; ".join(map(str, point.map.faults)) if point.map else "–"
+        shown = str(point.dstates) if point.proven else f"at least {point.dstates}"
+        knee = "knee" if point.faults == front.knee else ""
+        rows.append([point.faults, shown, knee, faults or "none"])
+    lines = [table(["faults", "dstates", "", "of the map found"], rows)]
+    if front.prices:
+        lines.append(
+            f"if a fault costs more than {front.prices[0]:g} and less than {front.prices[1]:g} "
+            "dstates, the map at the knee costs least of these"
+        )
+    elif not front.stopped and len({point.dstates for point in front.points}) == 1:
+        lines.append("no fault saves a dstate")
+    elif not front.stopped:
+        lines.append("no knee: each further fault saves about as many dstates")
+    if front.stopped:
+        why = "interrupted" if program.raised else "stopped by the time limit"
+        lines.append(f"{why} at {counted(front.points[-1].faults, 'faults')}")
+    if first := front.points[0].faults:
+        fewest = counted(first, "faults")
+        lines.append(f"no map with the asserted pairs of steps has fewer than {fewest}")
+    return "\n".join(lines)

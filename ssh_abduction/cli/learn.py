@@ -1,11 +1,15 @@
-"""ssh-abduction train, learning-curve, tell-apart and recognise: learn dstates from images."""
+"""ssh-abduction cluster, train, learning-curve, tell-apart and recognise: learn from images."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
-from typing import Any
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import (
     add_maps,
@@ -17,17 +21,196 @@ from ssh_abduction.cli.options import (
     seed,
     trace_of,
     trace_path,
+    write,
 )
+from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Verbs
+from ssh_abduction.cli.run_folders import check_folder
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.data.errors import MapError, named, said_of
+from ssh_abduction.data.errors import AbductionError, MapError, named, said_of
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, check_labels, maps_of
 from ssh_abduction.data.schema import attributes_of
-from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.trace import Trace, with_images_named_from
+from ssh_abduction.learning.runner_up import SECONDS, runner_up, second_map
+from ssh_abduction.solver import solve
+from ssh_abduction.theory.theory import Theory
+
+if TYPE_CHECKING:
+    from perception.views import ViewClusterer
+    from ssh_abduction.learning.traces import Traces
+
+IMAGES = "images.npz"  # the common sidecar file of traces that are clustered together
 
 
-def add_parser(verbs: Verbs) -> None:
+def add_cluster(verbs: Verbs) -> None:
+    parser = verbs.add(
+        "cluster",
+        run_cluster,
+        "cluster images into views",
+        "Cluster the images of a trace into views, and write the trace with its views. With "
+        "--together, cluster the images of several traces as one table, so that a view means the "
+        "same in all of them. The number "
+        "of views k is chosen by M, the smallest distance between clusters divided by the largest "
+        "distance within a cluster: the largest M wins. If another number of views is about as "
+        "good, the trace also keeps those views, and a warning says whether they give another map.",
+    )
+    parser.add(
+        "traces", "trace file with images, or - for standard input", nargs="+", metavar="trace"
+    )
+    parser.add("--together", "the traces are drives through one building: give them common views")
+    parser.add(
+        "-o --output FILE",
+        "trace file to write, or - for standard output; with --together, the folder to write, "
+        "where each trace keeps its file name",
+        type=output,
+        required=True,
+    )
+    said = "number of views (default: the number that the measure M of the paper rates best)"
+    parser.add("--k K", said, type=int)
+    parser.add_setting("k_max K", "largest number of views to try (default: 20)", type=int)
+    parser.add_setting(
+        "by",
+        "choose k by M, or by trimmed M (default: M). Trimmed M uses medians instead of the "
+        "smallest and largest distances, so that no single image decides",
+        "M",
+        choices=("M", "trimmed"),
+    )
+    parser.add("--seed", "random seed of k-means (default: 0)", type=seed, default=0)
+    parser.add(
+        "--plot PNG",
+        "draw the measure M against the number of views, into this file. If the truth is known, "
+        "also draw U, which says how well the views agree with the true dstates",
+        type=picture_file,
+    )
+
+
+def run_cluster(options: argparse.Namespace) -> int:
+    from perception.quality import uncertainty_coefficient, warn_of_doubts
+    from perception.views import ViewClusterer
+    from ssh_abduction.learning.traces import Traces
+
+    check_picture(options.plot)
+    files = _files(options)
+    traces = Traces(tuple(Trace.load(file) for file in files))
+    sources = ", ".join(named(file) for file in files)
+    logged, features = traces.images, traces.features
+    how: dict[str, Any] = {"k": options.k, "k_max": options.k_max, "by": options.by}
+    try:
+        images = features.fit_transform(logged)
+        clusterer = ViewClusterer(**how, random_state=options.seed).fit(images)
+    except AbductionError as error:
+        raise AbductionError(f"{sources}: {error}") from None
+    except ValueError as error:  # the message of scikit-learn says why it cannot cluster them
+        raise AbductionError(
+            f"{sources}: images: {error}; log more images, or different ones"
+        ) from None
+    truth = true_dstate_names(traces.each)
+    by_k = {} if truth is None else clusterer.labels_by_k_
+    uncertainty = {k: uncertainty_coefficient(labels, truth or ()) for k, labels in by_k.items()}
+    clustered = traces.with_views(
+        images, clusterer.labels_, clusterer.runner_up_labels_, clusterer.confidence_
+    )
+    said = f"{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}"
+    _write(clustered, files, options, f"{_choice_of_k(clusterer, uncertainty)}\n{said}")
+    warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
+    warn(runner_up_doubts(clustered))
+    if options.plot:
+        sys.stdout.flush()  # print first, in case drawing fails
+        from ssh_abduction.evaluation.figures import draw_quality
+
+        draw_quality(options.plot, clusterer.quality_, uncertainty, clusterer.k_)
+    return 0
+
+
+def _choice_of_k(clusterer: ViewClusterer, uncertainty: dict[int, float]) -> str:
+    """Return a table of the measures by which k was chosen."""
+    columns = {"M": clusterer.quality_, "trimmed": clusterer.trimmed_}
+    columns |= {"U": uncertainty} if uncertainty else {}
+    words = {clusterer.k_: "chosen", clusterer.runner_up_: "runner-up"}
+    rows = []
+    for k in clusterer.quality_:
+        measures = [column[k] for column in columns.values()]
+        cells = ("–" if math.isnan(m) else f"{m:.3f}" for m in measures)
+        rows.append([k, *cells, words.get(k, "")])
+    return table(["k", *columns, ""], rows)
+
+
+def _files(options: argparse.Namespace) -> dict[str, str]:
+    """Return the file to write for each file to read. Raise AbductionError if two are the same."""
+    if not options.together:
+        if len(options.traces) > 1:
+            raise AbductionError(
+                "traces: expected one trace, or --together, got several; add --together if their "
+                "views shall have the same meaning, or cluster each alone"
+            )
+        return {options.traces[0]: options.output}
+    if "-" in [*options.traces, options.output]:
+        raise AbductionError(
+            "--together: expected files to read and a folder to write, got -; name them"
+        )
+    folder = Path(options.output)
+    check_folder(folder)
+    files: dict[str, str] = {}
+    for file in options.traces:
+        target = str(folder / Path(file).name)
+        if target in files.values():
+            raise AbductionError(
+                f"{named(file)}: expected traces with different file names, as each is written to "
+                f"{named(options.output)} under its name, got two; rename one of them"
+            )
+        files[file] = target
+    return files
+
+
+def _write(traces: Traces, files: dict[str, str], options: argparse.Namespace, said: str) -> None:
+    """Write each trace to its file, and print a message.
+
+    With --together, images in sidecar files go to one file, so that the traces can be joined.
+    """
+    if not options.together:
+        (trace,) = traces.each
+        write(with_images_named_from(trace, Path(options.output).parent), options.output, said)
+        return
+    from perception.images import save_images
+
+    folder = Path(options.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(trace.images for trace in traces.each):
+        save_images(folder / IMAGES, traces.images)
+        traces = traces.with_images_in(IMAGES)
+    for trace, target in zip(traces.each, files.values(), strict=True):
+        trace.save(target)
+    print(f"{said} in {named(options.output)}")
+
+
+def runner_up_doubts(traces: Traces) -> list[str]:
+    """Return a warning if the second best number of views (the runner-up) gives another map.
+
+    The theory is the topological one, or the causal one if some action is of unknown kind.
+    Without a reason to warn, the list is empty.
+    """
+    found = None
+    with suppress(AbductionError):  # the traces lack what the theory needs; `solve` reports that
+        trace = traces.joint
+        known = all(action.kind for action in trace.actions)
+        theory = Theory.topological() if known else Theory.causal()
+        if runner_up(trace):
+            found = second_map(trace, solve(trace, theory, time_limit=SECONDS).maps, theory)
+    return [found.sentence] if found else []
+
+
+def true_dstate_names(traces: Sequence[Trace]) -> list[str] | None:
+    """The name of the true dstate of each step; None if some step has none."""
+    found = [
+        step.truth.get("dstate") if isinstance(step.truth, dict) else None
+        for trace in traces
+        for step in trace.steps
+    ]
+    return [str(name) for name in found] if all(name is not None for name in found) else None
+
+
+def add_train(verbs: Verbs) -> None:
     train = verbs.add(
         "train",
         run_train,
