@@ -20,7 +20,7 @@ from unittest.mock import patch
 from instances import maze
 from truth import NOISE
 
-import ssh_abduction.checker.geometry
+import ssh_abduction.checker.displacements
 import ssh_abduction.solver.geometry.fit
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data import Odometry
@@ -32,7 +32,7 @@ BEGINS = (
     (displacement.Displacement, "pairs"),
     (displacement.Displacement, "refuse"),
     (displacement.Displacement, "count_returns"),
-    (ssh_abduction.checker.geometry, "refused_returns"),
+    (ssh_abduction.checker.displacements, "refused_returns"),
     (ssh_abduction.solver.geometry.fit, "fit"),
 )
 

@@ -20,7 +20,7 @@ from arguments import add_number
 from instances import Walk, maze
 
 from ssh_abduction import SSHMap, Theory
-from ssh_abduction.checker.geometry import refused_returns
+from ssh_abduction.checker.displacements import refused_returns
 from ssh_abduction.data import DState, Odometry
 from ssh_abduction.theory.settle import settle
 

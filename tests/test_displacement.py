@@ -21,8 +21,7 @@ from test_property import agree
 
 from ssh_abduction import Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.checker.dead_reckoning import ErrorFilter
-from ssh_abduction.checker.geometry import _square_together
+from ssh_abduction.checker.displacements import ErrorFilter, _square_together
 from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.data.odometry import Closure
 from ssh_abduction.runtime.clock import heeding

@@ -15,7 +15,7 @@ from strategies import STARS, step_pairs
 
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.checker.proof import check_bound
+from ssh_abduction.checker.claims import check_bound
 from ssh_abduction.data.action import QUARTERS, Action
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Start, Status

@@ -32,7 +32,7 @@ from worlds import rectangle
 
 import ssh_abduction
 from ssh_abduction import Solution, Theory, Trace, solve
-from ssh_abduction.checker.proof import check_bound
+from ssh_abduction.checker.claims import check_bound
 from ssh_abduction.cli import guard, main
 from ssh_abduction.explain import explain, explain_pair, explain_trace
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece

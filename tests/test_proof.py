@@ -19,7 +19,7 @@ from test_speedups import machines
 from worlds import rectangle
 
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
-from ssh_abduction.checker.proof import check_bound
+from ssh_abduction.checker.claims import check_bound
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.solver import Search

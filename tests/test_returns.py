@@ -13,8 +13,7 @@ from instances import maze
 from strategies import traces
 
 from ssh_abduction import SSHMap, Theory, Trace
-from ssh_abduction.checker import geometry
-from ssh_abduction.checker.geometry import refused_returns
+from ssh_abduction.checker.displacements import refused_returns
 from ssh_abduction.data import DState, Odometry, together
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns
 from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares
@@ -204,7 +203,7 @@ def test_bounds_change_no_verdict_of_the_checker(noise: str) -> None:
             ssh_map = seen(walk.trace, walk.truth, dstates)
             bounded = list(refused_returns(walk.trace, ssh_map, theory))
             with patch.object(
-                geometry,
+                displacements,
                 "_is_safe",
                 lambda share, squares, most: np.zeros_like(squares, dtype=bool),
             ):

@@ -35,7 +35,8 @@ from ssh_abduction.explain.no_map import explain
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.solver import Progress, Search, Status, fallback, map_list
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.sources.exact import engine_module, prefixes, readable
+from ssh_abduction.solver.sources.exact import engine as engine_module
+from ssh_abduction.solver.sources.exact import prefixes, readable
 from ssh_abduction.solver.sources.exact.causal import CausalEngine
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.framed import FramedEngine

@@ -15,7 +15,7 @@ from worlds import TOURS, drive
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.checker.proof import check_bound
+from ssh_abduction.checker.claims import check_bound
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import MapError, TraceError
 from ssh_abduction.output import to_dot, to_graphml, to_svg

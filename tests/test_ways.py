@@ -15,7 +15,7 @@ from strategies import step_pairs, traces
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.checker.proof import check_bound
+from ssh_abduction.checker.claims import check_bound
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Search, Start, Status
 from ssh_abduction.solver.asp.facts import most_paths

@@ -9,8 +9,7 @@ import math
 from collections.abc import Sequence
 
 from ssh_abduction.checker.crossings import Edges
-from ssh_abduction.checker.moves import MapLink, heading_of
-from ssh_abduction.checker.reading import Found, Reading
+from ssh_abduction.checker.reading import Found, MapLink, Reading, heading_of
 from ssh_abduction.checker.stars import stars_of
 from ssh_abduction.data.groups import minimal_part, parts
 from ssh_abduction.data.odometry import Closure, Odometry, match_in_words
@@ -154,7 +153,7 @@ def asserted(m: Reading) -> Found:
 
 def one_pose(m: Reading) -> Found:
     """Check that displacements agree with one pose per dstate and one position per place."""
-    from ssh_abduction.checker.geometry import refused_returns  # loads numpy
+    from ssh_abduction.checker.displacements import refused_returns  # loads numpy
 
     trusted = m.trace.without_displacements_at(
         [fault.step for fault in m.map.faults if fault.kind == "jumped"]

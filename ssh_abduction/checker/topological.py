@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 
-from ssh_abduction.checker.moves import Course, course_of, going, opposite
-from ssh_abduction.checker.reading import Found, Reading
+from ssh_abduction.checker.reading import Course, Found, Reading, course_of, going, opposite
 from ssh_abduction.data.groups import reached
 from ssh_abduction.data.map_parts import course_named
 from ssh_abduction.data.trace import View

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ssh_abduction.checker.checker import Violation, check, unchecked
-from ssh_abduction.checker.claims import false_claims
-from ssh_abduction.checker.proof import ProvenBound, check_bound
+from ssh_abduction.checker.claims import ProvenBound, check_bound, false_claims
 from ssh_abduction.cli.obeyed_corrections import as_corrected
 from ssh_abduction.cli.options import (
     add_maps,

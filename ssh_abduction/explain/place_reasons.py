@@ -16,10 +16,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, TypeAlias, Unpack
 
-from ssh_abduction.checker.moves import Course
-from ssh_abduction.checker.reading import Reading
-from ssh_abduction.checker.region_axioms import known_sides
-from ssh_abduction.checker.side_axioms import RightBranch
+from ssh_abduction.checker.reading import Course, Reading
+from ssh_abduction.checker.sides import RightBranch, known_sides
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.map_parts import course_named, list_in_words, regions_at

@@ -34,7 +34,7 @@ from typing import Any, Literal, TypeAlias
 
 import networkx as nx
 
-from ssh_abduction.checker.moves import course_of
+from ssh_abduction.checker.reading import course_of
 from ssh_abduction.data.checks import a_list, a_text, all_instances, an_instance
 from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.errors import MapError, brief, printable

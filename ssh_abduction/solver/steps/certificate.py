@@ -1,6 +1,6 @@
 """A certificate that proves a lower bound on the number of dstates.
 
-`checker/proof.py` checks certificates without a solver.
+`checker/claims.py` checks certificates without a solver.
 
 >>> from ssh_abduction import Trace, solve
 >>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
