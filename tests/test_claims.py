@@ -29,7 +29,7 @@ def check(
     trace: str, data: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[str], *words: str
 ) -> tuple[int, str]:
     (folder / "maps.json").write_text(json.dumps(data))
-    code = main(["check", "--bound", trace, str(folder / "maps.json"), *words])
+    code = main(["check", "--bound", str(folder / "maps.json"), trace, *words])
     return code, capsys.readouterr().out
 
 
@@ -143,8 +143,8 @@ LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = 
     ),
     "no such reason to stop": (
         {"complete": False, "stopped": "lunch"},
-        "stopped: expected one of time limit, memory limit, interrupted, maps limit, no proof, "
-        "got 'lunch'",
+        "stopped: expected one of work limit, time limit, memory limit, interrupted, maps "
+        "limit, no proof, got 'lunch'",
     ),
     "no such status": (
         {"status": "perfect"},

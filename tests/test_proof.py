@@ -178,7 +178,7 @@ def test_check_bound_prints_the_bound(tmp_path: Path, capsys: pytest.CaptureFixt
     wandering(1, rooms=12, length=300, views=3).save(trace)
     assert main(["solve", str(trace), "--theory", "causal", "--json"]) == 0
     maps.write_text(capsys.readouterr().out)
-    assert main(["check", "--bound", str(trace), str(maps)]) == 0
+    assert main(["check", "--bound", str(maps), str(trace)]) == 0
     shown = capsys.readouterr().out
     data = json.loads(maps.read_text())
     assert f"at least {len(data['certificate']['clique'])} dstates: no two of " in shown
@@ -187,7 +187,7 @@ def test_check_bound_prints_the_bound(tmp_path: Path, capsys: pytest.CaptureFixt
         range(len(data["certificate"]["clique"]), data["cost"]["dstates"] + 1)
     )
     maps.write_text(json.dumps(data))
-    assert main(["check", "--bound", str(trace), str(maps)]) == 20
+    assert main(["check", "--bound", str(maps), str(trace)]) == 20
     assert "fewer than that, so this bound or a map is wrong" in capsys.readouterr().out
     clique = data["certificate"]["clique"]
     clique.append(
@@ -195,16 +195,16 @@ def test_check_bound_prints_the_bound(tmp_path: Path, capsys: pytest.CaptureFixt
     )  # as it is a largest one, this step is not apart from all of it
     data["certificate"]["refuted"] = list(range(len(clique), data["cost"]["dstates"]))
     maps.write_text(json.dumps(data))
-    assert main(["check", "--bound", str(trace), str(maps)]) == 20
+    assert main(["check", "--bound", str(maps), str(trace)]) == 20
     assert "bound: steps " in capsys.readouterr().out
     del data["certificate"]
     maps.write_text(json.dumps(data))
-    assert main(["check", "--bound", str(trace), str(maps)]) == 1
+    assert main(["check", "--bound", str(maps), str(trace)]) == 1
     assert (
         "certificate: expected one in the file of maps, got none; leave out --bound"
         in capsys.readouterr().err
     )
-    assert main(["check", "--bound", "--set", "without=deterministic", str(trace), str(maps)]) == 0
+    assert main(["check", "--bound", "--set", "without=deterministic", str(maps), str(trace)]) == 0
     assert "its proof rests on axioms that are left out" in capsys.readouterr().out
 
 
@@ -217,9 +217,9 @@ def test_check_bound_refuses_refutations_of_another_theory(
     assert main(["solve", str(trace), "--json"]) == 0
     solved = capsys.readouterr().out
     maps.write_text(solved)
-    assert main(["check", "--bound", "--set", "prefer=dstates", str(trace), str(maps)]) == 0
+    assert main(["check", "--bound", "--set", "prefer=dstates", str(maps), str(trace)]) == 0
     assert "the maps have 8: no map has fewer" in capsys.readouterr().out
-    assert main(["check", "--bound", "--set", "boundary=none", str(trace), str(maps)]) == 0
+    assert main(["check", "--bound", "--set", "boundary=none", str(maps), str(trace)]) == 0
     shown = capsys.readouterr().out
     assert "regions are not checked: the file is of another theory" in shown
     assert (
@@ -229,14 +229,14 @@ def test_check_bound_refuses_refutations_of_another_theory(
     data = json.loads(maps.read_text())
     data["maps"][0]["regions"][0]["bounds"] = []
     maps.write_text(json.dumps(data))
-    assert main(["check", str(trace), str(maps)]) == 20
+    assert main(["check", str(maps), str(trace)]) == 20
     assert "map 1: region_beside" in capsys.readouterr().out
-    assert main(["check", "--set", "boundary=none", str(trace), str(maps)]) == 0
+    assert main(["check", "--set", "boundary=none", str(maps), str(trace)]) == 0
     data = json.loads(solved)
     del data["theory"]
     maps.write_text(json.dumps(data))
-    assert main(["check", "--bound", str(trace), str(maps)]) == 0
+    assert main(["check", "--bound", str(maps), str(trace)]) == 0
     assert "left out: the file names no theory" in capsys.readouterr().out
     rectangle(400, turn="L").save(trace)
-    assert main(["check", "--bound", str(trace), str(maps)]) == 20
+    assert main(["check", "--bound", str(maps), str(trace)]) == 20
     assert "no map has fewer" not in capsys.readouterr().out

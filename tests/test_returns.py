@@ -13,6 +13,7 @@ from instances import maze
 from strategies import traces
 
 from ssh_abduction import SSHMap, Theory, Trace
+from ssh_abduction.checker import displacements
 from ssh_abduction.checker.displacements import refused_returns
 from ssh_abduction.data import DState, Odometry, together
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns
