@@ -38,8 +38,7 @@ from ssh_abduction.solver import (
 )
 from ssh_abduction.solver.solution.result import summary_of
 from ssh_abduction.solver.solution.sharing import Backbone, Shared
-from ssh_abduction.solver.sources.exact.framed import FramedEngine
-from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
+from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 
 ACES3 = "examples/aces3-route.jsonl"
@@ -162,7 +161,7 @@ def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
 
 @pytest.mark.parametrize(
     ("frame_after", "engine"),
-    [pytest.param(60.0, StepEngine, marks=pytest.mark.slow), (0.0, FramelessEngine)],
+    [pytest.param(60.0, StepEngine, marks=pytest.mark.slow), (0.0, LabelsFirst)],
 )
 def test_each_engine_can_prove_the_backbone_from_one_map(frame_after: float, engine: type) -> None:
     """32 maps that also differ in dstates. A prefix of the readable encodings finds them, or labels
@@ -192,7 +191,7 @@ def test_backbone_of_a_maze_with_stars_comes_from_its_labels() -> None:
     )
     first = search.solution(tuple(search))
     assert every.count == 7
-    assert type(search._parts.prefixes.engine) is FramedEngine
+    assert type(search._parts.prefixes.engine) is LabelsFirst
     assert find_backbone(first) == first.backbone == every.backbone
     assert find_backbone(solve(trace, max_maps=1)) == every.backbone
     assert "7 minimal maps: the dstates of steps 80, 83–84, 97 and 99–100 differ" in every.summary

@@ -19,21 +19,27 @@ from ssh_abduction.checker.claims import check_bound
 from ssh_abduction.data.action import QUARTERS, Action
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Start, Status
+from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts import number_symbols
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.sources.exact import choosing, engine, framed, framed_paths, visit_program
-from ssh_abduction.solver.sources.exact import visits as same
-from ssh_abduction.solver.sources.exact.framed import FramedEngine
-from ssh_abduction.solver.sources.exact.framed_paths import FramedPaths
-from ssh_abduction.solver.sources.exact.path_facts import (
-    read_contrary,
-    settled_labels,
-    sides_framed_facts,
-    turn_facts,
+from ssh_abduction.solver.sources.exact import (
+    choosing,
+    engine,
+    fitting,
+    labels_first,
+    visit_program,
 )
+from ssh_abduction.solver.sources.exact import visits as same
+from ssh_abduction.solver.sources.exact.fitting import Fitting
+from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
-from ssh_abduction.solver.sources.exact.visit_program import FramedSides, VisitProgram, visit_facts
+from ssh_abduction.solver.sources.exact.visit_program import (
+    FramedSides,
+    VisitProgram,
+    turn_facts,
+    visit_facts,
+)
 from ssh_abduction.solver.sources.exact.visits import VisitLabels
 from ssh_abduction.solver.sources.symbolic.merging import merged
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
@@ -102,7 +108,7 @@ def test_framed_maps_equal_those_of_the_plain_encoding(
     said = {kind: data.draw(step_pairs(len(trace)), label=kind) for kind in ("same", "same_place")}
     theory = theory.replace(**said)
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
-    first = data.draw(st.sampled_from([2, engine.FIRST_PREFIXES]), label="first prefixes")
+    first = data.draw(st.sampled_from([2, labels_first.FIRST_PREFIXES]), label="first prefixes")
     at_a_time = data.draw(st.sampled_from([1, visit_program.AT_A_TIME]), label="at a time")
     cores = {
         "FIRST_PAIRS": data.draw(
@@ -110,24 +116,23 @@ def test_framed_maps_equal_those_of_the_plain_encoding(
         ),
     }
     fitted = {
-        "BETTERING": data.draw(st.sampled_from([0, framed_paths.BETTERING]), label="bettering"),
-        "CLASHES": data.draw(st.sampled_from([1, framed_paths.CLASHES]), label="clashes"),
+        "BETTERING": data.draw(st.sampled_from([0, fitting.BETTERING]), label="bettering"),
+        "CLASHES": data.draw(st.sampled_from([1, fitting.CLASHES]), label="clashes"),
     }
-    many_pairs = data.draw(st.sampled_from([5, framed.MANY_PAIRS]), label="many pairs")
+    many_pairs = data.draw(st.sampled_from([5, same.MANY_PAIRS]), label="many pairs")
     off = off - {"names"}
-    prefixes = patch.object(engine, "FIRST_PREFIXES", first)
+    prefixes = patch.object(labels_first, "FIRST_PREFIXES", first)
     with (
         patch.object(choosing, "FEW_STEPS", 0),
         prefixes,
-        patch.multiple(same, **cores),
+        patch.multiple(same, MANY_PAIRS=many_pairs, **cores),
         patch.object(visit_program, "AT_A_TIME", at_a_time),
-        patch.multiple(framed_paths, **fitted),
-        patch.multiple(framed, MANY_PAIRS=many_pairs),
+        patch.multiple(fitting, **fitted),
     ):
         search = Search(trace, theory, max_maps=None, speedups=Speedups.without(off))
         maps = tuple(search)
     found = search.solution(maps)
-    assert isinstance(search._parts.prefixes.engine, FramedEngine)
+    assert isinstance(search._parts.prefixes.engine, LabelsFirst)
     assert found.status is expected.status
     assert set(maps) == set(expected.maps)
     assert len(set(maps)) == len(maps)
@@ -157,7 +162,7 @@ def test_framed_maps_join_places_that_a_person_joins(
     with patch.object(choosing, "FEW_STEPS", 0):
         search = Search(trace, theory, max_maps=None)
         assert set(search) == set(expected.maps)
-    assert isinstance(search._parts.prefixes.engine, FramedEngine)
+    assert isinstance(search._parts.prefixes.engine, LabelsFirst)
 
 
 @settings(max_examples=5)
@@ -216,8 +221,8 @@ def test_framed_mapper_maps_a_maze_step_by_step() -> None:
             assert isinstance(mapper._keeper, MapKeeper)
             search = mapper._keeper.search
             engine = search and search._parts.prefixes.engine
-            if isinstance(engine, FramedEngine):
-                paths.add((engine._visits.program.batch, len(engine._sides._said)))
+            if isinstance(engine, LabelsFirst):
+                paths.add((engine._labels.program.batch, len(engine._labels._sides._said)))
     assert max(paths)[0] > 5
     assert any(told for _, told in paths)
 
@@ -333,14 +338,14 @@ def test_pinning_segments_keeps_all_maps() -> None:
     def rivals(
         among: Sequence[int],
         pairs: Sequence[tuple[int, int]],
-        sought: Callable[..., list[int]] = framed_paths.pairwise_distinct,
+        sought: Callable[..., list[int]] = fitting.pairwise_distinct,
     ) -> list[int]:
         found = sought(among, pairs)
         assert set(combinations(found, 2)) <= set(pairs)
         given.append((found, among))
         return found
 
-    with patch.object(framed_paths, "pairwise_distinct", rivals):
+    with patch.object(fitting, "pairwise_distinct", rivals):
         maps = solve(trace, max_maps=None).maps
     assert any((len(found), len(among)) == (3, 5) for found, among in given)
     assert len(maps) > 1
@@ -354,7 +359,7 @@ def test_lazy_rules_for_order_and_sides_give_the_same_maps() -> None:
     expected = solve(walk.trace, Theory.topological(), max_maps=None)
     for off, kind, asked in (
         ("", FramedSides, "say_of_path"),
-        ("sides", FramedPaths, "clashing"),
+        ("sides", Fitting, "clashes"),
     ):
         finding = patch.object(kind, asked, autospec=True, side_effect=getattr(kind, asked))
         with finding as found:
@@ -370,15 +375,17 @@ def test_refused_path_becomes_a_rule_for_clingo() -> None:
     separately."""
     trace = maze(3, 3, steps=60, seed=0, stars=True).trace
     asked = Search(trace, Theory(star="frame"))._parts.prefixes.engine
-    assert isinstance(asked, FramedEngine)
+    assert isinstance(asked, LabelsFirst)
     asked.grow(len(trace))
-    labels, chart = asked._visits.fewest(), asked._chart
+    assert isinstance(asked._labels, VisitLabels)
+    assert asked._fitting
+    labels = asked._labels.fewest()
     assert isinstance(labels, list)
-    contrary, twice = asked._fitting.contrary(chart, labels)
-    standing = asked._visits.program.standing(labels)
+    contrary, twice = asked._fitting.contrary(labels)
+    standing = asked._labels.program.standing(labels)
     assert contrary
-    assert asked._sides.say_of_path(contrary, twice, standing)
-    (told,) = asked._sides._said
+    assert asked._labels.give_sides(labels, contrary, twice)
+    (told,) = asked._labels._sides._said
     assert told in {("path", standing[dstate]) for dstate in contrary}
 
 
@@ -391,20 +398,20 @@ def test_refused_path_becomes_a_rule_for_clingo() -> None:
     ],
 )
 def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
-    """Compare sides_framed.lp (one path and visits) with paths_framed.lp (all paths and fixed
-    dstates)."""
+    """Compare sides_framed.lp (one path and visits) with paths.lp (all paths and fixed dstates)."""
     contradicted = 0
     for seed in (0, 2):
         trace = maze(3, 3, steps=45, seed=seed, stars=True).trace
         engine = Search(trace, theory)._parts.prefixes.engine
-        assert isinstance(engine, FramedEngine)
+        assert isinstance(engine, LabelsFirst)
         engine.grow(len(trace))
-        labels = engine._visits.fewest()
+        assert isinstance(engine._labels, VisitLabels)
+        assert engine._fitting
+        labels = engine._labels.fewest()
         assert labels
-        chart = engine._chart
-        control = engine._fitting._control(chart, settled_labels(enumerate(labels)))
-        control.ground([("base", []), ("contrary", [])])
-        contrary, _ = next(engine.asker.answers(read_contrary, "ignore", 1, control=control))
+        chart = engine._labels.chart
+        control = engine._fitting._base(labels, engine._fitting._members(labels))
+        contrary, _ = engine._fitting.contrary(labels)
         contradicted += len(contrary)
 
         def atoms(name: str, arity: int, control: Control = control) -> set[tuple[int, ...]]:
@@ -438,7 +445,7 @@ def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
                 [],
                 turn_facts(0, chart, range(len(chart.stars)), chart.turns(trace)),
             )
-            control.add("visits", [], sides_framed_facts(theory))
+            control.add("visits", [], "\n".join(facts.sides(theory)))
             control.add("visits", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
             street = ("path", number_symbols(*chart.facing[labels.index(dstate)], 0))
             control.ground(
@@ -462,8 +469,8 @@ def test_framed_search_at_the_time_limit_gives_map_and_bound() -> None:
     """Stop the search for paths, and the search for the fewest dstates."""
     walk = maze(3, 3, steps=200, seed=1, stars=True)
     with (
-        patch.object(FramedEngine, "_all_with_paths", side_effect=KeyboardInterrupt),
-        patch.object(engine, "FIRST_PREFIXES", 300),
+        patch.object(LabelsFirst, "_all_that_fit", side_effect=KeyboardInterrupt),
+        patch.object(labels_first, "FIRST_PREFIXES", 300),
     ):
         search = Search(walk.trace, Theory.topological())
         search._parts.prefixes.start = 201
@@ -497,7 +504,7 @@ def test_framed_engine_continues_after_a_limit() -> None:
     stopped = 0
     for stop in range(4, 25, 5):
         engine = Search(trace, Theory.topological())._parts.prefixes.engine
-        assert isinstance(engine, FramedEngine)
+        assert isinstance(engine, LabelsFirst)
         engine.grow(len(trace))
         checks = iter(range(1, 10**6))
 
@@ -509,10 +516,10 @@ def test_framed_engine_continues_after_a_limit() -> None:
 
         with patch.object(engine.asker.watch, "check", check_once):
             try:
-                labels = engine._visits.fewest()
+                labels = engine._labels.fewest()
             except LimitError:
                 stopped += 1
-                labels = engine._visits.fewest()
+                labels = engine._labels.fewest()
         assert labels is not None
         assert len(set(labels)) == engine.bound
         fewest.add(len(set(labels)))
@@ -583,14 +590,14 @@ def test_search_with_a_known_cost_lists_maps_of_the_whole_trace() -> None:
     assert again.prefix == len(trace)
 
 
-def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:
+def framed_engine(trace: Trace, theory: Theory) -> LabelsFirst:
     resolved = settle(trace, theory).theory
     watch = Watch()
     watch.start()
-    found = FramedEngine(engine.Task.of(Problem.of(trace, resolved), watch))
+    found = LabelsFirst(engine.Task.of(Problem.of(trace, resolved), watch))
     chart = Chart.framed(trace, found._task.log)
     if chart is not None:
-        found._visits._program = VisitProgram(found._task, found.asker, chart, found._sides)
+        found._labels._program = VisitProgram(found._task, found.asker, chart, found._labels._sides)
     return found
 
 
@@ -599,9 +606,9 @@ def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:
 def test_merging_any_guess_gives_a_map(trace: Trace, theory: Theory, guess: list[int]) -> None:
     """Only the causal axioms count. A guess that is a map stays as it is."""
     asked = framed_engine(trace, theory)
-    if asked._visits._program is None:
+    if asked._labels._program is None:
         return  # the trace fits no frame
-    chart = asked._chart
+    chart = asked._labels.chart
     apart = chart.apart()
     labels = merged(chart, guess=guess[: len(chart.seen)])
     assert chart.is_map(labels)

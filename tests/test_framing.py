@@ -14,7 +14,7 @@ from ssh_abduction import Theory, check, solve
 from ssh_abduction.solver import Status, Watch
 from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.sources.exact import choosing
-from ssh_abduction.solver.sources.exact.framed import maps_with_frames
+from ssh_abduction.solver.sources.exact.labels_first import maps_with_frames
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import settle

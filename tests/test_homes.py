@@ -10,10 +10,6 @@ import pytest
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.sources.exact import choosing
-from ssh_abduction.solver.sources.exact import frameless_paths as frameless
-from ssh_abduction.solver.sources.exact.frameless_paths import PlacesAndPaths
-from ssh_abduction.solver.sources.exact.homes import fewest_paths, homes_of
-from ssh_abduction.solver.sources.exact.path_facts import Segments
 from ssh_abduction.solver.steps.apart import pairwise_distinct
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
@@ -78,7 +74,7 @@ CASES = {
         *((case, ("dstates", "places")) for case in [*CASES][::4]),
     ],
 )
-def test_maps_with_homes_equal_those_of_the_plain_encoding(
+def test_maps_with_pinned_places_equal_those_of_the_plain_encoding(
     case: str, prefer: tuple[str, ...]
 ) -> None:
     trace, theory = CASES[case], Theory.topological().replace(prefer=prefer)
@@ -89,43 +85,9 @@ def test_maps_with_homes_equal_those_of_the_plain_encoding(
     assert (found.cost, set(found.maps)) == (expected.cost, set(expected.maps))
 
 
-def test_places_on_the_way_back_have_one_home() -> None:
-    there = [(9, i, i + 1) for i in range(3)]
-    back = [(9, 6, 5), (9, 5, 4), (9, 4, 3)]
-    elsewhere = [
-        (i, j) for some in ((0, 1, 2, 3), (6, 5, 4, 3)) for i in some for j in some if i != j
-    ]
-    homes = homes_of(Segments([0, 1, 2, 3, 4, 5, 6], elsewhere, there + back, [9], []))
-    assert homes is not None
-    assert all(len(found) == 1 for found in homes.values())
-    pairs = {frozenset((place, *found)) for place, found in homes.items()}
-    assert {frozenset(pair) for pair in ((6, 0), (5, 1), (4, 2), (3,))} <= pairs
-
-
-@pytest.mark.parametrize(
-    "elsewhere", [[(0, 0)], [(0, 1), (1, 2), (0, 2), (3, 0), (3, 1), (3, 2), (0, 3), (3, 3)]]
-)
-def test_impossible_places_have_no_homes(elsewhere: list[tuple[int, int]]) -> None:
-    assert homes_of(Segments([0, 1, 2, 3], elsewhere, [], [], [])) is None
-
-
-def test_pairwise_distinct_segments_bound_the_number_of_paths() -> None:
-    assert (
-        fewest_paths(
-            Segments([], [], [], [0, 1, 2, 3], [(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)])
-        )
-        == 3
-    )
-
-
 def test_long_corridor_needs_no_search_for_places() -> None:
-    """Clingo is asked once for the places of forty landmarks, and has no choice."""
-    trace = corridor(40)
-    with (
-        patch.object(PlacesAndPaths, "_has_paths", side_effect=AssertionError),
-        patch.object(frameless, "BETTERING", 0),
-    ):
-        found = solve(trace)
+    """The places of forty landmarks on the way there bound the number of places."""
+    found = solve(corridor(40), time_limit=60)
     assert (found.status, found.complete, found.count) == (Status.OPTIMAL, True, 1)
     assert found.cost is not None
     assert (found.cost.dstates, found.cost.places, found.cost.paths) == (80, 40, 1)

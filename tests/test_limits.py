@@ -425,7 +425,7 @@ def test_noise_is_reported_if_listing_is_stopped() -> None:
     list(search)
     assert search.status is Status.OPTIMAL
     # as if the limit ended the listing while clingo gets more steps
-    search._parts.prefixes.engine._named.size = 0
+    search._parts.prefixes.engine._labels.size = 0
     search._parts.known.complete, search._parts.known.stopped = False, "time limit"
     noise = search.solution().noise
     assert noise

@@ -13,7 +13,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.sources.exact import visits as same
-from ssh_abduction.solver.sources.exact.framed import FramedEngine
+from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.localising import Located, State, faced, located
 from ssh_abduction.solver.steps.log import Log
@@ -93,8 +93,8 @@ def test_long_trace_is_solved_from_some_of_its_visits() -> None:
     with patch.object(same, "FIRST_PAIRS", 500):
         maps = tuple(search)
     engine = search._parts.prefixes.engine
-    assert isinstance(engine, FramedEngine)
-    assert len(engine._visits.program.known.visits) < 0.8 * len(engine._visits.chart.stars)
+    assert isinstance(engine, LabelsFirst)
+    assert len(engine._labels.program.known.visits) < 0.8 * len(engine._labels.chart.stars)
     expected = solve(trace, max_maps=None, speedups=Speedups.without("lazy"))
     assert search.complete
     assert set(maps) == set(expected.maps)

@@ -18,8 +18,8 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data.action import Action
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.sources.exact import choosing, engine, name_program, names
-from ssh_abduction.solver.sources.exact.causal import CausalEngine
+from ssh_abduction.solver.sources.exact import choosing, engine, labels_first, name_program, names
+from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import Speedups
@@ -51,7 +51,7 @@ def test_search_near_a_guess_changes_no_answer(
     most = data.draw(st.sampled_from([0, 1, 3]), label="most")
     with (
         patch.object(choosing, "FEW_STEPS", 0),
-        patch.object(engine, "FIRST_PREFIXES", len(trace)),
+        patch.object(labels_first, "FIRST_PREFIXES", len(trace)),
         patch.multiple(names, PATIENCE=0, CORES=cores),
         patch.object(names, "machine_labels", lambda *_: iter([guess])),
     ):
@@ -162,12 +162,12 @@ def test_clingo_gets_links_of_a_long_trace_in_parts() -> None:
 def test_next_prefix_grows_until_the_clique_grows() -> None:
     trace = maze(3, 3, steps=3000, seed=0).trace
     log = Log(trace, CAUSAL)
-    long = CausalEngine(engine.Task.of(Problem.of(trace, CAUSAL), Watch(100.0)))
-    long._named.size = 32
-    with patch.object(engine, "AT_ONCE", 50), patch.object(names, "AT_ONCE", 50):
+    long = LabelsFirst(engine.Task.of(Problem.of(trace, CAUSAL), Watch(100.0)))
+    long._labels.size = 32
+    with patch.object(labels_first, "AT_ONCE", 50), patch.object(names, "AT_ONCE", 50):
         size = long.next_size(32)
         assert long.next_size(10) == size
-        long._named.size = size
+        long._labels.size = size
         assert long.next_size(size) == min(2 * size, 3001)
     sizes = [
         len(Chart.of_steps(log, steps).continuations.clique()) for steps in (size // 2, size, 3001)

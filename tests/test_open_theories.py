@@ -29,10 +29,8 @@ from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.judging import InternalError
 from ssh_abduction.solver.sources.exact import choosing, prefixes
-from ssh_abduction.solver.sources.exact.causal import CausalEngine
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.exact.framed import FramedEngine
-from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
+from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory import settle as problems
@@ -275,18 +273,18 @@ def test_maps_refused_by_evidence_are_forbidden(name: str, data: st.DataObject) 
 
 
 FAST = {
-    "causal": (THEORIES["causal"], CausalEngine),
+    "causal": (THEORIES["causal"], LabelsFirst),
     "framed": (
         Theory(star="frame", path_order="total", boundary="none", weigh="count"),
-        FramedEngine,
+        LabelsFirst,
     ),
-    "frameless": (Theory(star="none", weigh="count"), FramelessEngine),
+    "frameless": (Theory(star="none", weigh="count"), LabelsFirst),
 }
 
 
 def test_frameless_engine_without_a_map_left_yields_none() -> None:
     trace = Trace.from_steps("aba", ["around", "around"])
-    engine = FramelessEngine(Task.of(settle(trace, Theory(star="none", same=((0, 2),)))))
+    engine = LabelsFirst(Task.of(settle(trace, Theory(star="none", same=((0, 2),)))))
     engine.grow(len(trace))
     assert [*engine.improving_maps()]
     assert engine.forbid([Equality(0, 2)])
@@ -577,14 +575,14 @@ def test_assertions_enlarge_the_pinned_clique() -> None:
     """Then more steps differ, so the pinned clique is larger, and clingo need not find that out."""
     trace = Trace.from_steps("ab" * 20, ["travel"] * 39)
     cliques = []
-    grow = CausalEngine.grow
+    grow = LabelsFirst.grow
 
-    def noted(self: CausalEngine, size: int) -> None:
+    def noted(self: LabelsFirst, size: int) -> None:
         grow(self, size)
-        cliques.append(len(self._named.clique))
+        cliques.append(len(self._labels.clique))
 
     theory = Theory.causal().replace(different=[(0, 2), (0, 4), (2, 4)])
-    with patch.object(CausalEngine, "grow", noted):
+    with patch.object(LabelsFirst, "grow", noted):
         solution = solve(trace, theory, speedups=Speedups.without("prefixes"))
     assert (
         cliques[-1] == 5

@@ -35,11 +35,9 @@ from ssh_abduction.explain.no_map import explain
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.solver import Progress, Search, Status, fallback, map_list
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.sources.exact import engine as engine_module
-from ssh_abduction.solver.sources.exact import prefixes, readable
-from ssh_abduction.solver.sources.exact.causal import CausalEngine
+from ssh_abduction.solver.sources.exact import labels_first, prefixes, readable
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.exact.framed import FramedEngine
+from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.solver.steps.faults import links_of
 from ssh_abduction.solver.steps.log import Log, Outcome
@@ -673,18 +671,18 @@ def test_renaming_and_mirroring_do_not_change_maps(case: tuple[Trace, Theory]) -
 def test_map_of_a_prefix_is_extended_at_the_time_limit() -> None:
     """Unknown steps get new dstates. There are far fewer than if only a short prefix was mapped."""
     trace = maze(4, 4, steps=500, seed=0, loops=0.5, stars=True).trace
-    grow = FramedEngine.grow
+    grow = LabelsFirst.grow
     found = {}
     for most in (8, 250):
 
-        def interrupted(self: FramedEngine, size: int, most: int = most) -> None:
+        def interrupted(self: LabelsFirst, size: int, most: int = most) -> None:
             if size > most:
                 raise KeyboardInterrupt
             grow(self, size)
 
         with (
-            patch.object(engine_module, "AT_ONCE", 250),
-            patch.object(FramedEngine, "grow", interrupted),
+            patch.object(labels_first, "AT_ONCE", 250),
+            patch.object(LabelsFirst, "grow", interrupted),
             patch.object(fallback, "INTERRUPTED", 100.0),
         ):
             found[most] = solve(trace)
@@ -698,15 +696,15 @@ def test_search_ends_after_the_last_requested_map() -> None:
     trace = maze(2, 2, steps=200, seed=0).trace
     every = solve(trace, Theory.causal(), max_maps=None)
     assert (every.complete, every.stopped) == (True, None)
-    listed = CausalEngine.maps_of_cost
+    listed = LabelsFirst.maps_of_cost
 
-    def slow(self: CausalEngine, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
+    def slow(self: LabelsFirst, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         yield from listed(self, cost, enough)
         while True:
             self.asker.watch.check()
 
     with (
-        patch.object(CausalEngine, "maps_of_cost", slow),
+        patch.object(LabelsFirst, "maps_of_cost", slow),
         patch.object(map_list, "ONE_MORE", 0.01),
     ):
         search = Search(trace, Theory.causal(), max_maps=every.count, time_limit=100.0)

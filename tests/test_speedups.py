@@ -26,7 +26,7 @@ from ssh_abduction.data import SolverError
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError
-from ssh_abduction.solver.sources.exact import choosing, engine, name_program, names
+from ssh_abduction.solver.sources.exact import choosing, labels_first, name_program, names
 from ssh_abduction.solver.sources.exact import names as named
 from ssh_abduction.solver.sources.symbolic import machines as robust
 from ssh_abduction.solver.sources.symbolic.machines import machine_labels
@@ -79,7 +79,7 @@ def test_any_speedups_give_the_maps_of_the_plain_encoding(
     cores = data.draw(st.sampled_from([0, 1, 10_000]), label="cores")
     spares = data.draw(st.sampled_from([0, 1, 2]), label="spare names")
     with (
-        patch.multiple(engine, FIRST_PREFIXES=first, AT_ONCE=at_once),
+        patch.multiple(labels_first, FIRST_PREFIXES=first, AT_ONCE=at_once),
         patch.multiple(named, AT_ONCE=at_once, WHOLE=whole, HELD_BACK=held, SPARES=spares),
         patch.multiple(names, PATIENCE=patience, CORES=cores),
         patch.object(name_program, "MORE_LINKS", 2),

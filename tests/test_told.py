@@ -87,7 +87,7 @@ def test_log_names_the_engines(caplog: pytest.LogCaptureFixture) -> None:
         for theory in (Theory.causal(), Theory.causal().replace(misread=1.5), Theory.topological()):
             solve(circuits, theory)
     engines = re.findall(r", with (\w+)", caplog.text)
-    assert engines == ["CausalEngine", "FaultyEngine", "StepEngine"]
+    assert engines == ["LabelsFirst", "FaultyEngine", "StepEngine"]
 
 
 def test_verbose_twice_logs_more_than_once(tee: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,10 +21,10 @@ from ssh_abduction.solver import Search, Start, Status
 from ssh_abduction.solver.asp.facts import most_paths
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.sources.exact import choosing, names
-from ssh_abduction.solver.sources.exact import frameless_paths as ways
+from ssh_abduction.solver.sources.exact import choosing, name_program, names
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
+from ssh_abduction.solver.sources.exact.fitting import Fitting
+from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.evidence import Equality
@@ -64,7 +64,7 @@ def test_frameless_maps_equal_those_of_the_plain_encoding(data: st.DataObject) -
     trace = data.draw(traces(max_steps=6), label="trace").without_stars().without_displacements()
     said = {kind: data.draw(step_pairs(len(trace)), label=kind) for kind in ("same", "same_place")}
     theory = data.draw(bare_theories(), label="theory").replace(**said)
-    contrary = data.draw(st.sampled_from([0, 1, ways.CONTRARY]), label="contrary")
+    contrary = data.draw(st.sampled_from([0, 1, name_program.CONTRARY]), label="contrary")
     spares = data.draw(st.sampled_from([0, 2]), label="spare names")
     patience = data.draw(st.sampled_from([0, names.PATIENCE]), label="patience")
     cores = data.draw(st.sampled_from([0, names.CORES]), label="cores")
@@ -74,10 +74,10 @@ def test_frameless_maps_equal_those_of_the_plain_encoding(data: st.DataObject) -
     with (
         patch.object(names, "SPARES", spares),
         patch.multiple(names, PATIENCE=patience, CORES=cores),
-        patch.object(ways, "CONTRARY", contrary),
+        patch.object(name_program, "CONTRARY", contrary),
     ):
         known = data.draw(st.sampled_from([None, expected.maps[0].labels]), label="known")
-        engine = FramelessEngine(Task.of(Problem.of(trace, theory)), known or ())
+        engine = LabelsFirst(Task.of(Problem.of(trace, theory)), known or ())
         engine.grow(len(trace))
         *_, best = engine.improving_maps()
         found = [found.map for found in engine.maps_of_cost(best.cost, 0)]
@@ -109,7 +109,7 @@ def test_forbidden_pairs_of_returns_equal_rules_of_the_plain_encoding(data: st.D
     task = Task.of(settle(trace, data.draw(bare_theories(), label="theory")))
     plain, engine = (
         StepEngine(task, most_paths(trace, task.theory, len(trace))),
-        FramelessEngine(task),
+        LabelsFirst(task),
     )
     plain.grow(len(trace))
     engine.grow(len(trace))
@@ -149,7 +149,7 @@ def test_limit_during_listing_of_labels_stops_the_search() -> None:
     theory = settle(trace).theory
     known = solve(trace, theory).maps[0].labels
     with patch.object(names, "SPARES", 0):
-        engine = FramelessEngine(Task.of(Problem.of(trace, theory)), known)
+        engine = LabelsFirst(Task.of(Problem.of(trace, theory)), known)
         engine.grow(len(trace))
         maps = engine.improving_maps()
         next(maps)
@@ -174,7 +174,7 @@ def test_maze_without_stars_has_the_known_maps(off: str) -> None:
     with patch.object(choosing, "STEPWISE", -1.0):
         search = Search(trace, max_maps=None, speedups=Speedups.without(off))
         found = search.solution(tuple(search))
-    assert isinstance(search._parts.prefixes.engine, FramelessEngine)
+    assert isinstance(search._parts.prefixes.engine, LabelsFirst)
     assert set(found.maps) == maps_of_a_maze()
     assert found.complete
     assert found.certificate
@@ -190,7 +190,7 @@ def test_aces3_route_without_stars_has_the_known_maps() -> None:
     with patch.multiple(choosing, STEPWISE=-1.0, FEW_STEPS=0):
         search = Search(trace, Theory(star="none"), max_maps=None)
         found = search.solution(tuple(search))
-    assert isinstance(search._parts.prefixes.engine, FramelessEngine)
+    assert isinstance(search._parts.prefixes.engine, LabelsFirst)
     assert found.cost
     assert found.cost.to_dict() == {"dstates": 19, "places": 9, "paths": 4}
     assert len(set(found.maps)) == found.count == 38
@@ -253,13 +253,13 @@ def test_max_maps_cuts_the_list_of_a_frameless_search() -> None:
     assert all(check(trace, ssh_map, every.theory) == () for ssh_map in every.maps)
 
 
-@pytest.mark.parametrize("name", ["forget", "fits", "_control_for"])
+@pytest.mark.parametrize("name", ["take", "some", "_control"])
 def test_interrupt_keeps_the_known_map(name: str) -> None:
     """At any time, the map that was known before is the answer."""
     trace = maze(2, 2, steps=120, seed=1).trace
     with (
         patch.object(choosing, "STEPWISE", -1.0),
-        patch.object(ways.PlacesAndPaths, name, side_effect=KeyboardInterrupt),
+        patch.object(Fitting, name, side_effect=KeyboardInterrupt),
     ):
         found = solve(trace)
     assert (found.status, found.stopped, found.count) == (Status.FEASIBLE, "interrupted", 1)
@@ -273,7 +273,7 @@ def test_later_search_continues_from_a_frameless_engine() -> None:
     with patch.object(choosing, "STEPWISE", -1.0):
         search = Search(first, max_maps=None)
         before = search.solution(tuple(search))
-        assert isinstance(search._parts.prefixes.engine, FramelessEngine)
+        assert isinstance(search._parts.prefixes.engine, LabelsFirst)
         after = Search(trace, max_maps=None, _start=Start(after=search._parts))
         found = after.solution(tuple(after))
     assert before.complete
@@ -289,7 +289,7 @@ def test_known_map_with_refused_places_is_not_returned(
     actions = [*["travel", "travel", "around"] * 2, "travel", "travel"]
     trace = Trace.from_steps(["end", "hall", "end"] * 3, actions)
     task = Task.of(settle(trace, Theory.topological()))
-    named, plain = FramelessEngine(task, (0, 1, 2, 3, 4, 5, 0, 1, 2)), StepEngine(task, 9)
+    named, plain = LabelsFirst(task, (0, 1, 2, 3, 4, 5, 0, 1, 2)), StepEngine(task, 9)
     named.grow(len(trace))
     assert [*named.improving_maps()][-1].cost[0] == 6
     searched, calls = names.NameSearch._cheapest, [0]

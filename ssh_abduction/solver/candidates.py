@@ -293,7 +293,7 @@ class Candidates:
 
     def frame(self, speedups: Speedups) -> None:
         """Offer maps in which places have frames, although the theory does not demand frames."""
-        from ssh_abduction.solver.sources.exact.framed import maps_with_frames  # loads numpy
+        from ssh_abduction.solver.sources.exact.labels_first import maps_with_frames  # loads numpy
 
         watch = self._task.watch
         seconds = min(FRAMING, choosing.STEPWISE_SHARE * watch.left())

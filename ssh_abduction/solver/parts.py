@@ -80,7 +80,12 @@ class Parts:
         is_outgrown = isinstance(before, StepEngine) and may_name(self.task)
         # A search that was interrupted may have stopped while clingo grounded a step.
         is_partial = after.known.stopped == "interrupted" or not before.asker.intact
-        if isinstance(before, GrowingEngine) and not is_outgrown and not is_partial:
+        if (
+            isinstance(before, GrowingEngine)
+            and before.grows
+            and not is_outgrown
+            and not is_partial
+        ):
             return before.over(self.task)
         return new_engine(self.task)
 

@@ -65,7 +65,7 @@ class Stages:
             if not engine.size:
                 engine.grow(
                     steps
-                    if isinstance(engine, LabellingEngine)
+                    if isinstance(engine, LabellingEngine) and engine.lists_labels
                     else min(steps, prefixes.FIRST_PREFIX)
                 )
             return
@@ -141,11 +141,11 @@ class Stages:
         labels = best.dstate_at if best else ()
         parts.candidates.sketch()
         if parts.known.best is not None:
-            from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
+            from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 
             _log.info(
                 "finding dstates before places and paths, from a map of %d dstates",
                 len(parts.known.best.dstates),
             )
-            parts.prefixes.engine = FramelessEngine(parts.task, labels)
+            parts.prefixes.engine = LabelsFirst(parts.task, labels)
             parts.prefixes.start = len(parts.task.trace)

@@ -308,7 +308,7 @@ TABLE = (
         _kept_by(
             "visits",
             "sides_framed",
-            "paths_framed",
+            "paths",
             and_also=(*PAIRS_OF_STEPS, *OF_TRACES, "asserted same", "the field same_place"),
         ),
     ),
@@ -326,7 +326,7 @@ TABLE = (
         _kept_by(
             "names",
             "sides_frameless",
-            "paths_frameless",
+            "paths",
             and_also=(*PAIRS_OF_STEPS, *OF_TRACES, "asserted same", "the field same_place"),
         ),
     ),

@@ -58,6 +58,12 @@ def preferred(theory: Theory) -> list[str]:
     ]
 
 
+def sides(theory: Theory) -> list[str]:
+    """Return the facts that say which axioms about the sides of paths a theory has."""
+    found = ["sided."] if theory.boundary != "none" else []
+    return found + (["symmetric."] if theory.symmetric_sides else [])
+
+
 def own_rules(theory: Theory) -> str:
     """Return the text of all rules that the user added to the theory, in clingo's language."""
     return "\n".join(rules.text for rules in theory.rules)

@@ -127,7 +127,7 @@ class _Reasoning:
     def settle_labels(self, engine: Engine) -> bool:
         """Resolve the doubts of each labelling (dstates of steps). Return whether none is left."""
         forbidden = set[frozenset[Equality]]()
-        while isinstance(engine, LabellingEngine):
+        while isinstance(engine, LabellingEngine) and engine.lists_labels:
             failed, refused = 0, None
             for settled in engine.labellings(self._cost):
                 found = settled.any_map()

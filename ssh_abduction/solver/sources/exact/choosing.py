@@ -45,31 +45,25 @@ def new_engine(task: Task) -> Engine:
 
         return FaultyEngine(task)
     if may_name(task) and not task.theory.has_faults:
-        if task.theory.level == "causal":
-            from ssh_abduction.solver.sources.exact.causal import CausalEngine
+        from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 
-            return CausalEngine(task)
-        from ssh_abduction.solver.sources.exact.framed import FramedEngine
-
-        return FramedEngine(task)
+        return LabelsFirst(task)
     return step_engine(task)
 
 
 def preload_engine(theory: Theory) -> None:
     """Import the engine that long traces need, so that no step of a robot waits for the import."""
-    if theory.level == "causal":
-        import ssh_abduction.solver.sources.exact.causal
-    elif row("visits").holds_for(theory):
-        import ssh_abduction.solver.sources.exact.framed  # noqa: F401
+    if theory.level == "causal" or row("visits").holds_for(theory):
+        import ssh_abduction.solver.sources.exact.labels_first  # noqa: F401
 
 
 def labelling_engine(task: Task, labels: Sequence[int]) -> Engine:
     """Make the engine that finds dstates first, if it can begin with these dstates of steps."""
     engine = new_engine(task)
     if labels and isinstance(engine, StepEngine) and takes_all(task) and task.speedups.ways:
-        from ssh_abduction.solver.sources.exact.frameless import FramelessEngine
+        from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 
-        return FramelessEngine(task, labels)
+        return LabelsFirst(task, labels)
     return engine
 
 

@@ -8,7 +8,7 @@ holds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Hashable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
@@ -29,13 +29,8 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-# An engine with a chart first tries a prefix of this many steps, then a prefix of AT_ONCE steps.
-# For most traces the first prefix is enough.
-FIRST_PREFIXES = 32
 # Compare at most this many steps in pairs: n steps need a matrix of n x n bytes.
 AT_ONCE = 8000
-# After this many conflicts, stop improving paths one by one; raise the bound from below instead.
-BETTERING = 20_000
 
 
 @dataclass(frozen=True)
@@ -120,7 +115,13 @@ class Engine(Protocol):
 
 @runtime_checkable
 class GrowingEngine(Protocol):
-    """The protocol of an engine that can take more steps when the trace has grown."""
+    """The protocol of an engine that can take more steps when the trace has grown.
+
+    Attributes:
+        grows: Whether it can in its theory.
+    """
+
+    grows: bool
 
     def over(self, task: Task) -> Engine:
         """Go on with a longer trace, with new limits, and return this engine itself."""
@@ -129,7 +130,13 @@ class GrowingEngine(Protocol):
 
 @runtime_checkable
 class LabellingEngine(Protocol):
-    """The protocol of an engine that finds dstates first. It lists maps with the fewest dstates."""
+    """The protocol of an engine that finds dstates first. It lists maps with the fewest dstates.
+
+    Attributes:
+        lists_labels: Whether `labellings` lists maps in its theory.
+    """
+
+    lists_labels: bool
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
         """Yield the maps of this cost, grouped by their labelling.
@@ -157,21 +164,6 @@ def maps_of_labels(
         ahead=True,
     )
     return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), theory), answers))
-
-
-def listing(cost: tuple[int, ...]) -> str:
-    """Return clingo's opt-mode for listing the maps of this cost, with given dstates."""
-    return f"enum,{','.join(map(str, (0, *cost[1:])))}"
-
-
-def next_charted_size(size: int, failed: int, steps: int) -> int:
-    """Return the next prefix size, for an engine that compares all pairs of steps beforehand.
-
-    `size` is the size so far, and `steps` the length of the trace. No map explains step `failed`.
-    """
-    if size < FIRST_PREFIXES:
-        return min(steps, max(failed + 1, FIRST_PREFIXES))
-    return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * size, AT_ONCE))
 
 
 Answer = TypeVar("Answer")
@@ -243,31 +235,3 @@ class Settled:
         """Find a map in which at least one of these doubts about dstates holds; else None."""
         answer = self._doubts.answer(doubts, self._reader.read, self._mode)
         return None if answer is None else self._reader.map_of(answer)
-
-
-def all_accepted(
-    ask: Callable[[], Generator[Answer, None, object]],
-    fits: Callable[[Answer], bool],
-    forbid: Callable[[Answer], None],
-    key: Callable[[Answer], Hashable],
-    known: set[Hashable],
-) -> Generator[Answer, None, None]:
-    """Yield all answers that fit, each once. If one does not fit, forbid it, and ask again.
-
-    `key` is equal for answers that are the same. Answers with `known` keys are left out, and the
-    keys of accepted answers are added to them.
-    """
-    while True:
-        refused: Answer | None = None
-        with closing(ask()) as answers:
-            for answer in answers:
-                if key(answer) in known:
-                    continue
-                if not fits(answer):
-                    refused = answer
-                    break
-                known.add(key(answer))
-                yield answer
-        if refused is None:
-            return
-        forbid(refused)

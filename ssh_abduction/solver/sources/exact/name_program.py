@@ -8,23 +8,27 @@ map.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import clingo
 import numpy as np
 from clingo import Function, Model, Symbol
 from numpy.typing import NDArray
 
+from ssh_abduction.data.action import Action
+from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import number_symbols
 from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Task
 from ssh_abduction.solver.steps.chart import Chart, Link
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory import encodings
 from ssh_abduction.theory.pairs import pairs_in
+from ssh_abduction.theory.theory import Theory
 
 # Clingo cannot be stopped while it prepares to solve. That takes about this share of the time that
 # grounding took.
@@ -38,25 +42,13 @@ SECONDS_A_CHARACTER = 1e-6
 # that are left.
 MORE_LINKS = 1000
 
+# Give clingo the axioms of this many paths at once. With fewer, clingo would be asked more often.
+# With more, most would not be needed.
+CONTRARY = 8
+
 # A linked list of the links that were followed since the last node that clingo named. The latest
 # link comes first.
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
-
-
-class Fitting(Protocol):
-    """Axioms beyond the causal theory that dstates have to satisfy (`frameless.py`)."""
-
-    def fits(self, labels: Sequence[int]) -> bool:
-        """Whether some map with these labels (dstates of steps) satisfies these axioms."""
-        ...
-
-    def forbid(self, labels: Sequence[int]) -> None:
-        """Give clingo rules that exclude these labels (dstates of steps), as they have no map."""
-        ...
-
-    def give_again(self) -> None:
-        """Give a new control the rules that the previous control had."""
-        ...
 
 
 @dataclass
@@ -97,18 +89,17 @@ class NameProgram:
         pinned: Pinned,
         spares: dict[int, int],
         forbidden: list[list[tuple[int, int]]],
-        *,
-        fitting: Fitting | None,
     ) -> None:
         """Make a control that has the names, but no node yet.
 
-        `spares` has the number of spare names of each view, not counting the rest. `fitting` has
-        further axioms for labels; None in the causal theory.
+        `spares` has the number of spare names of each view, not counting the rest.
         """
         self.pinned, self.forbidden = pinned, forbidden
-        self._task, self._asker, self._fitting = task, asker, fitting
+        self._task, self._asker = task, asker
         self._spares = spares
         self._one = pairs_in(task.log.pairs.one)
+        # Dstates for whose paths clingo has the axioms of order and sides, as keys of `names`.
+        self._sides: dict[tuple[int, int], None] = {}
         self._known = self._new_control()
 
     @property
@@ -126,8 +117,9 @@ class NameProgram:
         self.add(links)
         for number in range(len(self.forbidden)):
             self.give_forbidden(number)
-        if self._fitting:
-            self._fitting.give_again()
+        sides, self._sides = self._sides, {}
+        if sides:
+            self._ground_sides([key for key in self.names() if key in sides])
 
     def name_more(self, views: Collection[int]) -> None:
         """Add a name for dstates to each of these views, in a new control with the same links."""
@@ -221,6 +213,32 @@ class NameProgram:
         pairs = self.forbidden[number]
         self.add_links_at({step for pair in pairs for step in pair})
         self._asker.control.tell(not_together(number, pairs))
+
+    def give_sides(self, contrary: Sequence[int]) -> bool:
+        """Give clingo the axioms of order and sides for the paths of some of these dstates.
+
+        Returns whether any of them are new. The dstates are given by their names.
+        """
+        key_of = {name: key for key, name in self.names().items()}
+        keys = [key_of[name] for name in contrary if name in key_of]
+        new = [key for key in keys if key not in self._sides][:CONTRARY]
+        if new:
+            self._ground_sides(new)
+        return bool(new)
+
+    def _ground_sides(self, keys: Sequence[tuple[int, int]]) -> None:
+        """Ground the axioms of order and sides for dstates, given as keys of `names`."""
+        control, names, task = self._asker.control, self.names(), self._task
+        with self._asker.grounding_timed():
+            parts: list[tuple[str, list[clingo.Symbol]]] = []
+            if not self._sides:
+                control.load(encodings.path("sides_frameless"))
+                actions = dict(zip(task.log.actions, task.trace.actions, strict=True))
+                control.add("sides", [], sides_facts(task.theory, actions))
+                parts.append(("sides", []))
+            # One call for all parts halves the time to ground and to search.
+            control.ground(parts + [("path", number_symbols(names[key])) for key in keys])
+        self._sides.update(dict.fromkeys(keys))
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
         """Whether the dstates of a map agree with what is known about pairs of steps."""
@@ -439,3 +457,13 @@ def forbidden_links(
     """Return the rule that some links do not all hold while some steps have certain names."""
     body = [f"goes({s},{a},{x})" for s, a, x in links] + [f"is({t},{s})" for t, s in placed]
     return f":- {', '.join(body)}."
+
+
+def sides_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
+    """Return the facts for sides_frameless.lp: kinds of actions, and the axioms about sides."""
+    kinds = [
+        f"turns({a},{action.turn})." if action.turn else f"travels({a})."
+        for a, action in actions.items()
+        if action.kind in ("travel", "turn")
+    ]
+    return "\n".join([*kinds, *facts.sides(theory)])

@@ -41,11 +41,18 @@ from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Task
-from ssh_abduction.solver.sources.exact.name_program import Fitting, NameProgram, Pinned, read_names
+from ssh_abduction.solver.sources.exact.fitting import Member
+from ssh_abduction.solver.sources.exact.name_program import (
+    NameProgram,
+    Pinned,
+    forbidden_links,
+    read_names,
+)
 from ssh_abduction.solver.sources.symbolic.machines import machine_labels
 from ssh_abduction.solver.sources.symbolic.merging import dstates_merged, merged
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.chart import Chart, Link
+from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.pairs import pairs_in
 
 # Before clingo has all links, any answer may show that a link is missing. So hold back the maps of
@@ -67,15 +74,13 @@ class NamedLabels:
         task: Task,
         asker: Asker,
         given_map: Sequence[int] = (),
-        fitting: Fitting | None = None,
     ) -> None:
         """Begin without any steps.
 
         `given_map` has the dstate of each step in a map with few dstates; empty if none is known.
-        `fitting` has further axioms for labels; None in the causal theory.
         """
         self.size = 0
-        self._task, self._asker, self._given_map, self._fitting = task, asker, given_map, fitting
+        self.task, self._asker, self._given_map = task, asker, given_map
         self._incumbent = Incumbent()
         # Sets of pairs of steps. A map must not have the steps of each pair of a set at one dstate.
         self._forbidden: list[list[tuple[int, int]]] = []
@@ -109,8 +114,8 @@ class NamedLabels:
 
         In a long trace this is enough for a clique as large as the clique of the whole trace.
         """
-        most = min(len(self._task.trace), WHOLE)
-        if AT_ONCE <= size < most and self._task.speedups.clique:
+        most = min(len(self.task.trace), WHOLE)
+        if AT_ONCE <= size < most and self.task.speedups.clique:
             largest = self._clique_size(most)
             while size < most and self._clique_size(size) < largest:
                 size = min(2 * size, most)
@@ -118,44 +123,42 @@ class NamedLabels:
 
     def _clique_size(self, steps: int) -> int:
         """Return the size of a largest clique of the first steps."""
-        log = self._task.log
+        log = self.task.log
         return len(Continuations(log.seen[:steps], log.actions[: steps - 1]).clique())
 
-    def grow(self, size: int) -> None:
-        """Make the first `size` steps the prefix."""
-        if size == self.size:
-            return
+    def grow(self, size: int) -> bool:
+        """Make the first `size` steps the prefix. Return True, as there are always labels."""
         try:
             self._take(size)
         except BaseException:
             self.size = 0  # an error may have left this prefix incomplete
             raise
+        return True
 
     def _take(self, size: int) -> None:
         """Chart the first steps, pin a clique of them, and make a new control."""
         self.size = size
-        speedups, known = self._task.speedups, self._incumbent
+        speedups, known = self.task.speedups, self._incumbent
         with self._asker.grounding_timed():
-            pinned = Pinned.of_steps(self._task.log, size, largest=speedups.clique)
+            pinned = Pinned.of_steps(self.task.log, size, largest=speedups.clique)
         self._pinned = pinned
         known.labels = numbered(self._given_map[:size]) or None
         known.raise_bound(len(pinned.clique))
         self._asker.watch.check()
         self._program = NameProgram(
-            self._task,
+            self.task,
             self._asker,
             pinned,
             self._first_spares(pinned),
             self._forbidden,
-            fitting=self._fitting,
         )
-        self._search = NameSearch(self._task, self._asker, self._program, known, self._fitting)
+        self._search = NameSearch(self.task, self._asker, self._program, known)
         links: Iterable[Link] = pinned.chart.links
         if speedups.lazy:
             # Only links that begin at the first step or at a pinned one, and those at steps that
             # the user says are one dstate.
             first = {0, *pinned.clique}
-            said = {t for pair in pairs_in(self._task.log.pairs.one) for t in pair}
+            said = {t for pair in pairs_in(self.task.log.pairs.one) for t in pair}
             links = [link for link in links if link[0] in first or not said.isdisjoint(link[::2])]
         self._program.give_links(links)
 
@@ -172,15 +175,41 @@ class NamedLabels:
     def improving(self) -> Iterator[list[int]]:
         """Yield labels of the first steps, with ever fewer dstates. The last have the fewest."""
         assert self._search is not None  # `grow` comes first
-        known = self._incumbent
-        # Evidence about places may have refused the places of a known map since it was found.
-        if known.labels and self._fitting and not self._fitting.fits(known.labels):
-            known.labels = None
         return self._search.improving()
 
-    def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
-        """Exclude labels in which both steps of each of these pairs are at one dstate."""
-        self._forbidden.append(list(pairs))
+    def take_back(self, labels: Sequence[int]) -> bool:
+        """Forget labels that turned out to have no map. Return whether they came from clingo.
+
+        Evidence about places may refuse the places of a given map.
+        """
+        known = self._incumbent
+        given, self._given_map = numbered(self._given_map[: self.size]), ()
+        if known.labels == list(labels):
+            known.labels = None
+        return list(labels) != given
+
+    def give_sides(
+        self, labels: Sequence[int], contrary: Sequence[int], twice: Sequence[int]
+    ) -> bool:
+        """Give clingo the axioms of paths that labels contradict. Return whether any are new."""
+        return self.program.give_sides(contrary)
+
+    def forbid(self, labels: Sequence[int], clashes: Iterable[Sequence[Member]]) -> None:
+        """Exclude all labels with the links of some clash, and with these labels of its steps."""
+        for clash in clashes:
+            placed = {step for member in clash if not member.link for step in member.steps}
+            links = [member.link for member in clash if member.link]
+            self.program.add_links_at(placed)
+            self._asker.control.tell(
+                forbidden_links(links, [(step, labels[step]) for step in sorted(placed)])
+            )
+
+    def forbid_together(self, equalities: Collection[Equality]) -> None:
+        """Exclude labels in which both steps of each of these equalities are at one dstate.
+
+        Steps at one dstate are also at one place.
+        """
+        self._forbidden.append([(one.first, one.second) for one in equalities])
         known = self._incumbent
         if known.labels and not self.program.is_allowed(known.labels):
             known.labels = None
@@ -298,11 +327,10 @@ class NameSearch:
         asker: Asker,
         program: NameProgram,
         incumbent: Incumbent,
-        fitting: Fitting | None,
     ) -> None:
-        """Prepare a search that improves the incumbent. `fitting` is None in the causal theory."""
+        """Prepare a search that improves the incumbent."""
         self._task, self._asker, self._program = task, asker, program
-        self._incumbent, self._fitting = incumbent, fitting
+        self._incumbent = incumbent
         self._small = SmallMaps(task, program.pinned)
         self._hard = False  # whether clingo once did not end after few conflicts
         self._had_all_help = False  # whether maps near a guess were sought already
@@ -376,11 +404,8 @@ class NameSearch:
         labels, failed = program.follow(names)
         if failed:
             program.add(failed)
-        elif self._fitting is None or self._fitting.fits(labels):
-            return labels
-        else:
-            self._fitting.forbid(labels)
-        return None
+            return None
+        return labels
 
     @property
     def _patience(self) -> int:
@@ -392,7 +417,8 @@ class NameSearch:
     @property
     def _may_help(self) -> bool:
         """Whether to look for small maps in other ways. These obey the causal axioms only."""
-        return self._fitting is None and (self._task.speedups.greedy or self._task.speedups.guessed)
+        speedups = self._task.speedups
+        return self._task.theory.level == "causal" and (speedups.greedy or speedups.guessed)
 
     def _helped(self) -> Iterator[list[int]]:
         """Look for small maps in other ways, as clingo takes long. Yield the dstates of steps."""

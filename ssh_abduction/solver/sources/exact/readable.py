@@ -36,6 +36,8 @@ FEW_PATHS = 8
 class StepEngine:
     """The engine that grounds the readable encodings. A dstate is named by its first step."""
 
+    grows = True
+
     def __init__(self, task: Task, paths: int) -> None:
         self.asker = Asker(task.watch)
         self.bound: int | None = None

@@ -17,10 +17,9 @@ from clingo import Function, Symbol
 
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver.asp.control import Asker, new_control
-from ssh_abduction.solver.asp.facts import number_symbols
+from ssh_abduction.solver.asp.facts import number_symbols, sides
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.exact.path_facts import sides_framed_facts, turn_facts
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.solver.steps.localising import Located, State, faced, located
 from ssh_abduction.theory import encodings
@@ -360,7 +359,7 @@ class FramedSides:
         with self._asker.grounding_timed():
             if not self._said:
                 control.load(encodings.path("sides_framed"))
-                control.add("sides", [], sides_framed_facts(self._theory))
+                control.add("sides", [], "\n".join(sides(self._theory)))
                 control.ground(
                     [("sides", []), *(("paths", number_symbols(batch)) for batch in batches)]
                 )
@@ -453,3 +452,14 @@ def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> st
     Each equality has pairs of visits (I, J, R), and holds if one of them is at one place.
     """
     return "\n".join(forbidden_pairs(pairs) for pairs in product(*equalities))
+
+
+def turn_facts(
+    batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]
+) -> str:
+    """Return the facts about a batch: its new visits, and its turns (node, direction, node)."""
+    facts = [f"visit({batch},{visit})." for visit in visits]
+    for s, turn, x in turns:
+        (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]
+        facts.append(f"{'about' if turn == 'around' else 'turns'}({batch},{visit},{slot},{faced}).")
+    return "\n".join(facts)

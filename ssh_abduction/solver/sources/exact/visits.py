@@ -1,16 +1,15 @@
 """Finds labels with the fewest dstates, for theories with frames, without names for dstates.
 
 A label is the number of the dstate of a node; a node is the steps of a visit that face one
-direction. The framed engine uses this module. Clingo is asked which visits are at one place
-(visits.lp). The module finds labels of all nodes with the fewest dstates, proves that none have
-fewer, and lists all labels with that number of dstates. `framed.py` checks them by the
-axioms of order and sides.
+direction. Clingo is asked which visits are at one place (visits.lp). The module finds labels of all
+nodes with the fewest dstates, proves that none have fewer, and lists all labels with that number of
+dstates. `labels_first.py` checks them by the axioms of order and sides.
 
-Names, as in `names.py`, help little if there are many dstates with few visits. What
-clingo learns about one spare name, it has to learn again about the next one. And each node of a
-view may have each of its names. An equality of two visits, in contrast, is only about these two. A
-node is *first* if no node before it, in an order of choice, is at its dstate. So the number of
-dstates is the number of first nodes.
+Names, as in `names.py`, help little if there are many dstates with few visits. What clingo learns
+about one spare name, it has to learn again about the next one. And each node of a view may have
+each of its names. An equality of two visits, in contrast, is only about these two. A node is
+*first* if no node before it, in an order of choice, is at its dstate. So the number of dstates is
+the number of first nodes.
 
 *Order of choice.* A clique of nodes comes first, then the nodes that can share a dstate with few
 others. When the trace grows, new nodes are put last. So the rules that clingo has, and the clauses
@@ -18,7 +17,7 @@ that it learned, still hold. When the number of nodes has grown by a tenth, a ne
 with a new clique.
 
 *Transitivity.* Clingo gets the rules of transitivity only for visits at which an answer violates
-them (`visits.py`). Without them clingo solves a relaxation, so its bounds hold.
+them (`intransitive`). Without them clingo solves a relaxation, so its bounds hold.
 
 *Few visits.* Of a long trace, clingo first gets the visits of the clique, and some of the first
 visits, such that few pairs of them may be at one place. Mostly an answer also determines the places
@@ -28,11 +27,12 @@ relaxation, and an answer that locates all visits is an answer for all of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from itertools import combinations
 
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.sources.exact.engine import Task
+from ssh_abduction.solver.sources.exact.fitting import Member
 from ssh_abduction.solver.sources.exact.visit_program import (
     FramedSides,
     Pair,
@@ -44,10 +44,14 @@ from ssh_abduction.solver.sources.exact.visit_program import (
 )
 from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
+from ssh_abduction.theory.evidence import Equality
 
 # At first, give clingo only the first visits: those with at most this many pairs that may be at one
 # place. It gets other visits if answers need them.
 FIRST_PAIRS = 10_000
+# If more pairs of visits than this may be at one place, add no axioms of single paths. They take
+# about forty rules for each pair.
+MANY_PAIRS = 20_000
 # If the number of nodes has grown by this factor, make a new control, as the order of choice only
 # suits the nodes that it was made for.
 GROWN = 1.1
@@ -62,12 +66,13 @@ class VisitLabels:
         clique: Nodes that are pairwise distinct.
     """
 
-    def __init__(self, task: Task, asker: Asker, sides: FramedSides) -> None:
-        """Begin without any steps. `sides` adds axioms to each new control and batch of visits."""
+    def __init__(self, task: Task, asker: Asker) -> None:
+        """Begin without any steps."""
         self.bound: int | None = None
         self.clique: list[int] = []
         self.size = 0
-        self.task, self._asker, self._sides = task, asker, sides
+        self.task, self._asker = task, asker
+        self._sides = FramedSides(task.theory, asker)
         self._program: VisitProgram | None = None
         self._nodes_at_start = 0  # the number of nodes when the control was made
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
@@ -151,6 +156,15 @@ class VisitLabels:
         """Take over a lower bound if it is higher."""
         self.bound = max(self.bound or 0, bound)
 
+    def large_enough(self, size: int) -> int:
+        """Return how many steps of the trace to take: `size`."""
+        return size
+
+    def improving(self) -> Iterator[list[int]]:
+        """Yield the dstates of all nodes, as few as possible; nothing if the rules allow none."""
+        if (labels := self.fewest()) is not None:
+            yield labels
+
     def fewest(self) -> list[int] | None:
         """Find the dstates of all nodes, as few as possible; None if the rules allow none."""
         if not self._found:
@@ -193,7 +207,7 @@ class VisitLabels:
         self._raise_bound(fewest)
         return pairs
 
-    def all_of(self, dstates: int) -> Generator[list[int], None, None]:
+    def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
         """Yield all labels with the fewest possible number of dstates, each once.
 
         Clingo gets a rule against each labelling that was found, and the same question as for the
@@ -219,18 +233,33 @@ class VisitLabels:
             self._found.append(labels)
             yield list(labels)
 
-    def take_back(self, labels: Sequence[int]) -> None:
-        """Forget labels that were found, but turned out to have no map."""
+    def take_back(self, labels: Sequence[int]) -> bool:
+        """Forget labels that turned out to have no map. Return True, as they came from clingo."""
         if (refused := tuple(labels)) in self._found:
             self._excluded -= self._found.index(refused) < self._excluded
             self._found.remove(refused)
+        return True
 
-    def forbid(self, labels: Sequence[int], clashes: Collection[Collection[int]]) -> None:
-        """Exclude all labels that agree with the given ones on the nodes of some clash.
+    def give_sides(
+        self, labels: Sequence[int], contrary: Sequence[int], twice: Sequence[int]
+    ) -> bool:
+        """Give clingo the axioms of a path that labels contradict. Return whether they are new."""
+        return (
+            self.task.speedups.sides
+            and len(self.program.known.fits) <= MANY_PAIRS
+            and self._sides.say_of_path(contrary, twice, self.program.standing(labels))
+        )
+
+    def forbid(self, labels: Sequence[int], found: Iterable[Iterable[Member]]) -> None:
+        """Exclude all labels that agree with the given ones on the steps of some clash.
 
         To agree means that two nodes of the clash share a dstate exactly if they have one label.
         """
-        program = self.program
+        program, node_of = self.program, self.chart.node_of
+        clashes = [
+            list(dict.fromkeys(node_of[step] for member in clash for step in member.steps))
+            for clash in found
+        ]
         clashing = {self.chart.facing[node][0] for clash in clashes for node in clash}
         if unknown := clashing - program.known.visits:
             self._give_more(unknown)
@@ -248,16 +277,16 @@ class VisitLabels:
                 rules.append(forbidden_pairs(together, different))
         program.add_rules("\n".join(rules))
 
-    def forbid_together(
-        self, pairs: Collection[tuple[int, int]], places: Collection[tuple[int, int]] = ()
-    ) -> None:
-        """Exclude labels with each of `pairs` at one dstate, and each of `places` at one place.
+    def forbid_together(self, equalities: Collection[Equality]) -> None:
+        """Exclude labels in which all of these equalities of steps hold.
 
-        Both have pairs of nodes. If `places` is not empty, labels found before are not removed, as
-        labels do not show which nodes are at one place. The search for their paths rejects them
-        later.
+        If one is about places, labels found before are not removed, as labels do not show which
+        nodes are at one place. The search for their paths rejects them later.
         """
-        program, facing = self.program, self.chart.facing
+        program, facing, node_of = self.program, self.chart.facing, self.chart.node_of
+        nodes = [(node_of[one.first], node_of[one.second], one.of) for one in equalities]
+        pairs = [(a, b) for a, b, of in nodes if of == "dstate"]
+        places = [(a, b) for a, b, of in nodes if of == "place"]
         apart = [(a, b) for a, b in pairs if a != b]
         away = [(a, b) for a, b in places if facing[a][0] != facing[b][0]]
         visits = {facing[node][0] for pair in (*apart, *away) for node in pair}
