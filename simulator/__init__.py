@@ -1,8 +1,8 @@
 """Worlds and robots whose true map is known, to make traces and logs.
 
-- `world`, `world_files`: worlds with walls, clutter, places and a route, and their files.
-- `plans`, `plan_files`, `occupancy`: worlds from floor plans and from occupancy maps of ROS.
-- `tours`, `drive`, `plan_tours`, `rounds`: drive through a world, and log what the robot sees.
+- `world`: worlds with walls, clutter, places and a route, and their files.
+- `plans`, `occupancy`: worlds from floor plans and from occupancy maps of ROS.
+- `tours`, `plan_tours`, `rounds`: drive through a world, and log what the robot sees.
 - `driver`, `junctions`: the control laws of the robot. They see laser images, and no true pose.
 
 Import from the modules. The package itself exports nothing, so that no command loads what it does
