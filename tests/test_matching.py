@@ -13,7 +13,7 @@ from test_distinctive import log_of
 from perception.places import closures, matching
 from perception.places.closures import VisitMatch, find_closures, uncertainty
 from perception.places.distinctive import WINDOW, find_visits
-from perception.places.following import Surfaces, _matched
+from perception.places.following import ScanMotion, Surfaces
 from perception.places.local_map import CELL, PackedPatch, Patch
 from perception.places.matching import Match, Scene, Turned, match
 from perception.places.tracing import closure_of, to_trace
@@ -188,11 +188,11 @@ def test_match_against_the_odometer_gets_a_large_covariance(share: float, is_wid
     seen = walls.copy()
     astray = np.arange(len(walls)) % 100 >= 100 * share
     seen[astray] *= 0.4  # people in the room
-    still = (0.0, 0.0, 0.0)
+    still, turned = (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)
+    scan = Scan(np.zeros(1), LaserScanner(0.0, 0.1, 1, 8.0), turned)
     recent = [Surfaces(walls, normals)]
-    pose, covariance, found = _matched(
-        Surfaces(seen, normals), recent, still, (0.0, 0.0, 0.5), odometer_covariance(still)
-    )
+    motion = ScanMotion(scan, Surfaces(seen, normals), recent, still, turned, still)
+    pose, covariance, found = motion.matched(turned, odometer_covariance(still))
     assert abs(pose[2]) < 0.05
     assert found == pytest.approx(share, abs=0.1)
     assert bool(covariance[2, 2] > 0.4**2) is is_wide

@@ -130,7 +130,7 @@ def _stands(log: RobotLog, track: Track, first: int, last: int) -> bool:
     for scan in log.scans[last : last + IN_A_ROW]:
         if len(seen := surfaces_in(scan)):
             onward = displacement_between(begin, scan.odometry)
-            motion = _ScanMotion(scan, seen, known, track.pose(first - 1), onward, onward)
+            motion = ScanMotion(scan, seen, known, track.pose(first - 1), onward, onward)
             pose, _, share = motion.matched(onward, wide)
             turns.append(abs(wrapped(pose[2] - track.poses[first - 1, 2] - onward[2])))
             shares.append(share)
@@ -205,7 +205,7 @@ def poses_of_scans(
             one = Followed(scan, (0.0, 0.0, 0.0))
         else:
             onward = displacement_between(last.scan.odometry, scan.odometry)
-            step = _ScanMotion(scan, seen, recent, last.pose, onward, before)
+            step = ScanMotion(scan, seen, recent, last.pose, onward, before)
             one = step.judged(doubt_of(i, onward))
             one = one if in_sight(scan).any() else replace(one, share=math.nan)
             before = displacement_between(last.pose, one.pose)
@@ -219,7 +219,7 @@ def poses_of_scans(
 
 
 @dataclass(frozen=True, eq=False)
-class _ScanMotion:
+class ScanMotion:
     """A motion from one scan to the next."""
 
     scan: Scan  # the next scan
