@@ -447,8 +447,8 @@ class _Drawing:
     def labels(self) -> Iterator[Mark]:
         """Draw each label at the first point where it overlaps nothing, if there is one.
 
-        Names of places are always drawn, and so are all labels of a map without poses. A font is
-        smaller if there is little room, but at least 9.
+        Names of places and of the start are always drawn, and so are all labels of a map without
+        poses. A font is smaller if there is little room, but at least 9.
         """
         for text, spots, gap, colour, size, is_bold in self._wanted():
             w, h = self.half(text, size)
@@ -462,7 +462,7 @@ class _Drawing:
                 yield Label(at, text, colour, max(size * self.unit, 9.0), is_bold)
 
     def _wanted(self) -> Iterator[tuple[str, list[Point], float, str, float, bool]]:
-        """Yield all labels the important ones first.
+        """Yield all labels, the important ones first.
 
         Each has its text, the points around which it may be, the distance from these points (0 to
         be at a point), its colour, its size, and whether it is bold.
