@@ -140,11 +140,12 @@ class Solution(MapSequence):
             return f"{self.status.value}: no map of {steps} satisfies the axioms"
         if self.cost is None:
             return f"{self.status.value}{why}: no map of {steps} yet; {bound}"
-        # A causal map has no places and paths to count.
+        # Count only what maps by the theory have.
+        has = {"places": self.theory.level != "causal", "paths": self.theory.has_paths}
         counts = ", ".join(
             counted(v, k) if k != "faults" else f"faults that cost {v:g}"
             for k, v in self.cost.to_dict().items()
-            if self.theory.level != "causal" or k in ("dstates", "faults")
+            if has.get(k, True)
         )
         if self.weighed is not None:
             counts += f"; {self.weighed.nats:.1f} nats"
