@@ -19,8 +19,8 @@ from ssh_abduction.solver import Status, candidates, fallback
 from ssh_abduction.solver.geometry import ranking
 from ssh_abduction.solver.geometry.fit import fit
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.sources.symbolic.merging import Merging
 from ssh_abduction.solver.sources.symbolic.sketch import Sketch
-from ssh_abduction.solver.sources.symbolic.voting import Merging
 from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.theory.evidence import Planar
 from ssh_abduction.theory.settle import Problem, settle

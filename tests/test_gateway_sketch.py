@@ -19,7 +19,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Status, fallback
 from ssh_abduction.solver.asp.own_rules import can_be_asked, keeps_own_rules
 from ssh_abduction.solver.sources.metric.beam import Beam
-from ssh_abduction.solver.sources.symbolic.gateway_sketch import sketch_beyond, sketches_of
+from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond, sketches_of
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.settle import Problem, settle

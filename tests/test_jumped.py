@@ -24,9 +24,11 @@ from ssh_abduction.data.odometry import in_words
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.solver import Misfit, Search
 from ssh_abduction.solver.costs import weighing
-from ssh_abduction.solver.costs.wrong_displacements import search_jumps
 from ssh_abduction.solver.front import fault_front
-from ssh_abduction.solver.sources.symbolic.voting import wrong_displacements
+from ssh_abduction.solver.sources.metric.wrong_displacements import (
+    search_jumps,
+    wrong_displacements,
+)
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.settle import settle
@@ -191,7 +193,7 @@ def test_annealing_with_a_jump_costs_at_most_the_true_cost() -> None:
 
     believing = parts.candidates.map_without(())
     assert believing
-    search_jumps(search.trace, parts.candidates, believing, add)
+    search_jumps(search.trace, parts.candidates.map_without, believing, add)
     dstates, places = walk.truth, [state[:2] for state in walk.truth]
     number = [[*dict.fromkeys(names)].index for names in (dstates, places)]
     course = [*map(number[0], dstates)], [*map(number[1], places)]

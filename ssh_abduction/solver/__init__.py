@@ -61,9 +61,9 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.solution.weighed import Weighed as Weighed
     from ssh_abduction.solver.solution.weighed import probability_in_words as probability_in_words
     from ssh_abduction.solver.sources.exact.choosing import preload_engine as preload_engine
-    from ssh_abduction.solver.sources.symbolic.gateway_sketch import sketch_beyond as sketch_beyond
-    from ssh_abduction.solver.sources.symbolic.gateway_sketch import sketches_of as sketches_of
     from ssh_abduction.solver.sources.symbolic.sketch import Sketch as Sketch
+    from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond as sketch_beyond
+    from ssh_abduction.solver.sources.symbolic.sketch import sketches_of as sketches_of
     from ssh_abduction.solver.start import Limits as Limits
     from ssh_abduction.solver.start import Start as Start
     from ssh_abduction.solver.steps.certificate import RESTS_ON as RESTS_ON

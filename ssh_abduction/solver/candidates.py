@@ -26,8 +26,7 @@ from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.projecting import projected
 from ssh_abduction.solver.sources.exact import choosing
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.symbolic.gateway_sketch import sketch_beyond, sketches_of
-from ssh_abduction.solver.sources.symbolic.sketch import Sketch
+from ssh_abduction.solver.sources.symbolic.sketch import Sketch, sketch_beyond, sketches_of
 from ssh_abduction.solver.sources.symbolic.sketched import (
     first_contradiction,
     has_no_frames,

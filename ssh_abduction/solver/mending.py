@@ -6,12 +6,13 @@ unknown action, and leave out a wrong displacement. So a map with faults is a ma
 a mended trace. All fast engines can solve a mended trace.
 
 Two methods guess which steps have faults. If places have frames, visits are merged robustly
-(`sources/symbolic/voting.py`). In any case, the causal theory with faults is solved
+(`sources/symbolic/merging.py`). In any case, the causal theory with faults is solved
 (`exact/faulty.py`). A map with places becomes a map of that theory when its places are dropped.
 
 *Displacements.* Labels that were found without displacements show which displacements may be wrong
-(`sources/symbolic/voting.py`). The labels of each better map may show further ones. A displacement
-that was guessed to be wrong may agree with the map after all. Then it is no fault of the map.
+(`sources/metric/wrong_displacements.py`). The labels of each better map may show further ones. A
+displacement that was guessed to be wrong may agree with the map after all. Then it is no fault of
+the map.
 
 *Bound.* A map of the theory, without its places, is a causal map with the same dstates and with no
 more faults. So a lower bound for the causal theory holds here. If a mended trace has a map that
@@ -32,8 +33,9 @@ from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.faulty import FaultyEngine
+from ssh_abduction.solver.sources.metric.wrong_displacements import wrong_displacements
+from ssh_abduction.solver.sources.symbolic.merging import Merging
 from ssh_abduction.solver.sources.symbolic.sketched import mended_sketch
-from ssh_abduction.solver.sources.symbolic.voting import Merging, wrong_displacements
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.settle import Problem
@@ -122,7 +124,7 @@ class Mending:
             yield better
 
     def _by_merging(self, trace: Trace) -> Iterator[Found]:
-        """Yield a better map, found by merging visits robustly (`sources/symbolic/voting.py`).
+        """Yield a better map, found by merging visits robustly (`sources/symbolic/merging.py`).
 
         Merging groups the visits, and the votes of the groups mend the trace. The trace is that of
         the task, perhaps without some displacements.

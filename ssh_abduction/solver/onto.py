@@ -42,7 +42,7 @@ from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE
-from ssh_abduction.solver.sources.symbolic.gateway_sketch import sketch_beyond
+from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond
 from ssh_abduction.solver.sources.symbolic.sketched import first_contradiction
 from ssh_abduction.solver.values import Cost, Level, Status
 from ssh_abduction.theory.settle import Problem, settle

@@ -57,7 +57,6 @@ from ssh_abduction.solver.costs.estimating import (
 )
 from ssh_abduction.solver.costs.forced import Forcing
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.costs.wrong_displacements import search_jumps
 from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
@@ -68,6 +67,7 @@ from ssh_abduction.solver.solution.weighed import CHANCE, EQUAL, IMPROBABLE, Riv
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
+from ssh_abduction.solver.sources.metric.wrong_displacements import search_jumps
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Found, Status
 from ssh_abduction.theory.evidence import Equality
@@ -177,7 +177,9 @@ class Weighing:
             self._raise_by_scatter()
         if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
             if self.candidates and parts.task.theory.jumped and parts.candidates.beam(1):
-                search_jumps(parts.task.trace, parts.candidates, self.candidates[0].map, self.add)
+                search_jumps(
+                    parts.task.trace, parts.candidates.map_without, self.candidates[0].map, self.add
+                )
             raise LimitError("no proof")
         best = parts.known.best
         engine = labelling_engine(task, best.dstate_at if best else ())

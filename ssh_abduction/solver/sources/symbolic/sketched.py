@@ -52,8 +52,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.runtime.clock import each_looking, look_at_clock
 from ssh_abduction.solver.sources.metric.completing import completed
-from ssh_abduction.solver.sources.symbolic.gateway_sketch import sketches_of
-from ssh_abduction.solver.sources.symbolic.sketch import Sketch
+from ssh_abduction.solver.sources.symbolic.sketch import Sketch, sketches_of
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory
