@@ -28,7 +28,7 @@ from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
 from ssh_abduction.data.action import QUARTERS
-from ssh_abduction.data.groups import NodeClasses, gathered
+from ssh_abduction.data.groups import NodeClasses, gathered, minimal_part
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace
@@ -95,7 +95,8 @@ class Planar(Evidence):
         if len(at) < len(places) or not self._cross(trace, moves, labels, at, self.distinct):
             return None
         distinct = self.distinct and not self._cross(trace, moves, labels, at, False)
-        moves = fewest(moves, lambda fewer: self._cross(trace, fewer, labels, at, distinct))
+        moves = minimal_part(lambda fewer: self._cross(trace, fewer, labels, at, distinct), moves)
+        moves.sort()
         steps = sorted({step for t in moves for step in (t, t + 1)})
         if not distinct:
             labels = split(labels, steps, lambda finer: self._cross(trace, moves, finer, at, False))
@@ -368,23 +369,6 @@ def _join(same: NodeClasses[Arm], first: Arm, second: Arm) -> None:
     """Record that two arms (of dstates) are one gateway, and that their opposite arms are one."""
     for turned in (1, -1):
         same.merge((second[0], second[1] * turned), (first[0], first[1] * turned))
-
-
-def fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
-    """Return a minimal subset of travels and turns, by their first steps, whose edges cross."""
-    size = max(1, len(moves) // 2)
-    while True:
-        begin = 0
-        while begin < len(moves):
-            look_at_clock()
-            fewer = moves[:begin] + moves[begin + size :]
-            if cross(fewer):
-                moves = fewer
-            else:
-                begin += size
-        if size == 1:
-            return moves
-        size //= 2
 
 
 def split(
