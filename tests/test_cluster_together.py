@@ -19,14 +19,20 @@ from ssh_abduction.data.trace import images_file
 NAMES = ("monday.jsonl", "tuesday.jsonl")
 
 
-@pytest.fixture
-def drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Trace]:
+@pytest.fixture(scope="module")
+def simulated() -> tuple[Trace, Trace]:
     """Two drives through one room. The second starts at the fourth dstate of the first."""
-    monkeypatch.chdir(tmp_path)
     world = World.named("notched-rectangle")
-    monday = simulate(world, tours=2, seed=1)[:10]
-    tuesday = simulate(world, tours=2, seed=2)[3:14]
-    for trace, name in zip((monday, tuesday), NAMES, strict=True):
+    return simulate(world, tours=2, seed=1)[:10], simulate(world, tours=2, seed=2)[3:14]
+
+
+@pytest.fixture
+def drives(
+    simulated: tuple[Trace, Trace], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> list[Trace]:
+    """The two drives in files of their own."""
+    monkeypatch.chdir(tmp_path)
+    for trace, name in zip(simulated, NAMES, strict=True):
         replace(trace, name=Path(name).stem).save(name)
     return [Trace.load(name) for name in NAMES]
 

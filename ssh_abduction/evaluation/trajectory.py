@@ -139,12 +139,8 @@ class Trajectory:
             return None
         if first == last or self.times[last] - self.times[first] > 2 * NEAREST:
             return self.poses[nearest]
-        # Interpolate; turn the shorter way.
         share = (time - self.times[first]) / (self.times[last] - self.times[first])
-        (x, y, heading), (u, v, other) = self.poses[first], self.poses[last]
-        turned = share * math.remainder(other - heading, math.tau)
-        heading = math.remainder(heading + turned, math.tau)
-        return x + share * (u - x), y + share * (v - y), heading
+        return _interpolated(self.poses[first], self.poses[last], share)
 
     def told_to(self, trace: Trace) -> Trace:
         """Copy a trace, with the poses of this trajectory as the truth of its steps.
@@ -219,6 +215,14 @@ def indices_around(times: Sequence[float], time: float) -> list[int]:
     after = bisect.bisect_left(times, time)
     around = [i for i in (after - 1, after) if 0 <= i < len(times)]
     return sorted(around, key=lambda i: abs(times[i] - time))
+
+
+def _interpolated(first: Pose, second: Pose, share: float) -> Pose:
+    """Return the pose at a share of the way from one pose to another. Turn the shorter way."""
+    (x, y, heading), (u, v, other) = first, second
+    turned = share * math.remainder(other - heading, math.tau)
+    heading = math.remainder(heading + turned, math.tau)
+    return x + share * (u - x), y + share * (v - y), heading
 
 
 def is_trajectory(lines: Iterable[Sequence[str]]) -> bool:
@@ -452,8 +456,7 @@ class Relations:
         other = others[0] if others else node
         if (whole := self._to.get((node, other))) is not None:
             share = (time - self.times[node]) / (self.times[other] - self.times[node])
-            dx, dy, turned = whole
-            return node, (share * dx, share * dy, share * math.remainder(turned, math.tau))
+            return node, _interpolated((0.0, 0.0, 0.0), whole, share)
         return (node, (0.0, 0.0, 0.0)) if abs(self.times[node] - time) <= NEAREST else None
 
 

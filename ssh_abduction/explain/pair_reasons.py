@@ -155,18 +155,14 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         a drive starts, or after a lift.
         """
         evidence = displacement_of(self.problem)
-        if evidence is None:
-            return None
-        said = []
         way = self.trace.steps[self.first + 1 : self.second + 1]
-        if all(step.displacement is not None for step in way):
-            closing = evidence.returns_of(self.trace).closing(self.first, self.second)
-            if closing.way >= 0.5:
-                said.append(f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off")
-            else:  # the robot only turned
-                off = abs(math.degrees(closing.turned))
-                said.append(f"by the odometry their headings are {off:.1f} degrees apart")
-        return ", and ".join(said) or None
+        if evidence is None or any(step.displacement is None for step in way):
+            return None
+        closing = evidence.returns_of(self.trace).closing(self.first, self.second)
+        if closing.way >= 0.5:
+            return f"the loop of {closing.way:.0f} m closes {closing.size:.1f} m off"
+        off = abs(math.degrees(closing.turned))  # the robot only turned
+        return f"by the odometry their headings are {off:.1f} degrees apart"
 
     def _matches(self) -> tuple[str, ...]:
         """Put the closures between the visits of the two steps into words."""
