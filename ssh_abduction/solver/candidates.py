@@ -24,7 +24,7 @@ from ssh_abduction.solver.asp.limits import STARVED, LimitError, Watch, processo
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.projecting import projected
-from ssh_abduction.solver.sources.exact import choosing
+from ssh_abduction.solver.schedule import turn
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.symbolic.sketch import Sketch, sketch_beyond, sketches_of
 from ssh_abduction.solver.sources.symbolic.sketched import (
@@ -44,12 +44,8 @@ if TYPE_CHECKING:
 
 _log = log_of(__name__)
 
-# Look for maps with frames for at most FRAMING seconds; if no map is found by then, for UNMAPPED
-# times as long.
-FRAMING, UNMAPPED = 30.0, 2.0
-# A sketch (a map made without a search) and its check may take this share of the time left for all
-# sketches.
-SKETCH_SHARE = 0.4
+# Look for maps with frames for UNMAPPED times as long if no map is known.
+UNMAPPED = 2.0
 # The sketch that succeeds most often may take this many seconds of processor time even if less time
 # is left. Otherwise a slow or busy machine would find no map.
 SUREST = 1.0
@@ -192,7 +188,7 @@ class Candidates:
                 if self._known.best is not None and whole.left() < whole.elapsed():
                     return
                 before = self._known.best
-                share = 1.0 if attempt in (surest, *smaller[-1:]) else SKETCH_SHARE
+                share = 1.0 if attempt in (surest, *smaller[-1:]) else turn("sketch").share
                 part = (
                     Watch().part(max(seconds, SUREST), processor_clock(waiting=STARVED))
                     if attempt is surest
@@ -295,7 +291,7 @@ class Candidates:
         from ssh_abduction.solver.sources.exact.labels_first import maps_with_frames  # loads numpy
 
         watch = self._task.watch
-        seconds = min(FRAMING, choosing.STEPWISE_SHARE * watch.left())
+        seconds = turn("maps with frames").work(watch)
         part = watch.part(UNMAPPED * seconds)
         try:
             with heeding(part.check):

@@ -24,10 +24,11 @@ from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of
-from ssh_abduction.solver.costs.estimating import ESTIMATING, may_join_more, rival_of, rivals_of
+from ssh_abduction.solver.costs.estimating import may_join_more, rival_of, rivals_of
 from ssh_abduction.solver.derived_regions import Deriving
 from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning
 from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.schedule import turn
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.weighed import IMPROBABLE, Weighed
@@ -74,7 +75,7 @@ def laid(
     assert kept is not None
     assert best.fit is not None
     known = [rival_of(m, nats) for nats, m in found]
-    moved = rivals_of(problem, misfit, best, ESTIMATING, len(old))
+    moved = rivals_of(problem, misfit, best, turn("estimated rivals").most, len(old))
     weighed = Weighed(
         bound=max(nats_of(cost, theory) for cost in _costs(ssh_map)) + kept.chi2 / 2,
         within=0.0,

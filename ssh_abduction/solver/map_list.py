@@ -12,6 +12,7 @@ from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.projecting import projected
+from ssh_abduction.solver.schedule import turn
 from ssh_abduction.solver.sources.exact.near import NearMinimal, counted_first
 from ssh_abduction.solver.values import Status
 from ssh_abduction.theory.theory import Theory
@@ -20,8 +21,6 @@ from ssh_abduction.theory.theory import Theory
 # time so far if that is more. If clingo proves that there is none, the list is complete.
 ONE_MORE = 1.0
 ONE_MORE_SHARE = 0.1
-# This share of the time limit is kept for proving what all minimal maps share.
-PROVING = 0.2
 _log = log_of(__name__)
 
 Priced: TypeAlias = tuple[SSHMap, tuple[int, ...]]
@@ -37,7 +36,8 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
     known, watch, most = parts.known, parts.watch, parts.limits.most
     if known.status is Status.OPTIMAL:
         _log.info("minimal maps cost %s; they are listed", _cost_in_words(parts))
-        ends = (1 - PROVING) * (watch.elapsed() + watch.left()) if keeps_time else math.inf
+        kept = turn("backbone").share if keeps_time else 0.0
+        ends = (1 - kept) * (watch.elapsed() + watch.left()) if kept else math.inf
         ends = ends if ends > watch.elapsed() else math.inf
         watch.stage_ends = ends
         for ssh_map, cost in _without_repeats(found, parts.task.theory):

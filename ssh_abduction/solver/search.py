@@ -9,7 +9,7 @@ steps.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
@@ -40,6 +40,7 @@ from ssh_abduction.solver.fallback import (
 from ssh_abduction.solver.geometry.ranking import Ranking
 from ssh_abduction.solver.map_list import Priced, by_count, listed
 from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.sharing import Backbone
 from ssh_abduction.solver.stages import Stages
@@ -63,10 +64,6 @@ COUNTED = (
     "weigh: maps are counted instead of weighed, as no displacements are used whose misfit could "
     "be weighed"
 )
-# Before maps are weighed, a map with the fewest dstates is sought for at most the share
-# COUNTING_SHARE of the time. If a map is guessed and has no faults, the share SOON is enough: it
-# only finds the least number of dstates, if that is easy.
-COUNTING_SHARE, SOON = 0.4, 0.05
 _log = log_of(__name__)
 
 
@@ -356,15 +353,36 @@ class Search:
 
         # The matrices are small: threads of BLAS would mostly wait for each other.
         with one_thread("blas"):
-            if not weighing.guess(clashes):
-                self._parts.known.status = Status.UNSATISFIABLE
-                return
+            # 1. Some map, so that there always is one.
+            if watch.left() > 0:
+                self._parts.candidates.sketch(turn("sketch").work(watch))
+                weighing.keep_best()
+            # 2. Maps of little cost, by guesses.
+            self._run(weighing.guesses(clashes), weighing)
+            # 3. The least number of dstates.
             is_enough = weighing.best is not None and not self.theory.has_faults
-            self._stages.find_minimum_within(SOON if is_enough else COUNTING_SHARE)
-            if self._parts.known.status is not Status.UNSATISFIABLE:
-                # One more map shows that not all are listed.
-                most = self.limits.most and self.limits.most + 1
-                weighing.search(lambda trace, theory, s: self._solve_mended(trace, theory, most, s))
+            fewest = turn("fewest dstates, map known" if is_enough else "fewest dstates")
+            self._run([Source(fewest, lambda: True, self._stages.find_fewest)], weighing)
+            if self._parts.known.status is Status.UNSATISFIABLE:
+                return
+            # 4. The proof. One map more than wanted shows that not all are listed.
+            most = self.limits.most and self.limits.most + 1
+            weighing.of_labels = lambda trace, theory, s: self._solve_mended(trace, theory, most, s)
+            weighing.begin_proof()
+            self._run(weighing.proofs(), weighing)
+
+    def _run(self, sources: Iterable[Source], weighing: Weighing) -> None:
+        """Run sources one after the other, each within its turn, while a map may be found."""
+        parts, watch = self._parts, self._parts.watch
+        for source in sources:
+            if parts.known.status is Status.UNSATISFIABLE or not source.suits():
+                continue
+            _log.debug("%s", source.turn.name)
+            with suppress(StageTimeError), watch.stage(source.turn.ends(watch)):
+                source.run()
+            if parts.known.status is not Status.UNSATISFIABLE:
+                weighing.keep_best()
+            parts.report()
 
     def _solve_mended(
         self, mended: Trace, theory: Theory, most: int, seconds: float

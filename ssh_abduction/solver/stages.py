@@ -8,6 +8,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.schedule import turn
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.solver.sources.exact.choosing import may_name, takes_all
 from ssh_abduction.solver.sources.exact.engine import LabellingEngine
@@ -74,14 +75,14 @@ class Stages:
         may_settle = may_change and task.speedups.ways and parts.speedups.names
         if (
             may_settle
-            and not self._find_minimum_soon(min(choosing.SETTLE_AFTER, choosing.STEPWISE))
+            and not self._find_minimum_soon("prefixes, first try")
             and parts.candidates.sketch_least()
         ):
             self._settle_dstates_first()
         elif (
             (may_frame or may_settle)
             and parts.known.status is Status.UNKNOWN
-            and not self._find_minimum_soon(choosing.STEPWISE)
+            and not self._find_minimum_soon("prefixes, second try")
         ):
             _log.info("no minimal map after %.1f s step by step", parts.watch.elapsed())
             if may_frame:
@@ -92,12 +93,10 @@ class Stages:
         if parts.known.status is Status.UNKNOWN:
             parts.prefixes.find_minimum()
 
-    def find_minimum_within(self, share: float) -> None:
-        """Find the minimal cost as `find_minimum` does, in a share of the time left."""
-        watch = self._parts.watch
+    def find_fewest(self) -> None:
+        """Find the minimal counts as `find_minimum` does, if a proof is possible."""
         try:
-            with suppress(StageTimeError), watch.stage(watch.elapsed() + share * watch.left()):
-                self.find_minimum()
+            self.find_minimum()
         except LimitError as limit:
             if limit.reason != "no proof":
                 raise
@@ -125,11 +124,10 @@ class Stages:
             parts.rivals.reasons = False  # engines do not know mended traces
         return bool(self.mended_maps)
 
-    def _find_minimum_soon(self, seconds: float) -> bool:
-        """Find the minimal cost by growing prefixes. Return False if that takes too long."""
+    def _find_minimum_soon(self, name: str) -> bool:
+        """Find the minimal cost by growing prefixes in a turn. Return False if it takes longer."""
         parts, watch = self._parts, self._parts.watch
-        ends = watch.elapsed() + min(seconds, choosing.STEPWISE_SHARE * watch.left())
-        with suppress(StageTimeError), watch.stage(ends):
+        with suppress(StageTimeError), watch.stage(turn(name).ends(watch)):
             parts.prefixes.find_minimum()
             return True
         parts.prefixes.start = max(parts.prefixes.start, parts.engine.size)

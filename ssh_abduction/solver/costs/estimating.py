@@ -38,8 +38,6 @@ CostOf: TypeAlias = Callable[[Sequence[int], Sequence[int]], float]
 # Leave out rivals that cost CERTAIN nats more than the best map. Even a million of them together
 # have a probability of only 0.005.
 CERTAIN = 19.0
-# Estimating rivals takes at most this many seconds.
-ESTIMATING = 0.5
 
 
 def rivals_of(

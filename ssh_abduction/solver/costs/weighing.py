@@ -28,7 +28,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Generator, Hashable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeAlias
@@ -39,15 +38,14 @@ from ssh_abduction.data.drives import drives_of, starts_of
 from ssh_abduction.data.groups import first_index_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.clock import heeding, look_at_clock
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.loggers import log_of
-from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.costs import scatter
 from ssh_abduction.solver.costs.beams import Beams
 from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of, misfit_of
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
-    ESTIMATING,
     Course,
     dstates_and_places,
     least_places,
@@ -63,6 +61,7 @@ from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.projecting import projected
+from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.solution.weighed import CHANCE, EQUAL, IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.sources.exact.engine import Task
@@ -88,10 +87,6 @@ RIVALS = 50
 EXCESS = 2.25
 # Without a time limit, give up after PATIENCE seconds plus MORE times the time of the best map.
 PATIENCE, MORE = 10.0, 5.0
-# Finding joins that all cheap maps have takes at most this share of the time, and PATIENCE seconds.
-FORCING = 0.4
-# The bound by the scatter of visits takes at most this share of the time that is left then.
-SCATTER = 0.5
 # Estimating rivals may end OVERTIME seconds late. It gets at least LEAST_ESTIMATING seconds.
 OVERTIME, LEAST_ESTIMATING = 0.5, 0.1
 
@@ -114,12 +109,13 @@ class Weighing:
     Attributes:
         candidates: The maps found that cost little more than the best one, the best one first.
         bound: A proven lower bound on the cost of every map, in nats.
+        of_labels: Lists the minimal maps of a theory within some time; None before the proof.
         proven: Whether it is proven that no map costs less than the best one, and that all its
             rivals are found.
     """
 
     def __init__(self, parts: Parts) -> None:
-        """Prepare the search. `guess` and `search` run it."""
+        """Prepare the search, whose sources are `guesses` and `proofs`."""
         self._parts = parts
         self._misfit = Misfit(parts.task.problem)
         # The price in nats of one unit of each count, that of the count minimised first in front.
@@ -134,8 +130,10 @@ class Weighing:
         self.candidates: list[Candidate] = []
         self.bound = 0.0
         self.proven = False
-        self._of_labels: OfLabels | None = None
-        self._beams = Beams(parts, self.add, self.keep_best)
+        self.of_labels: OfLabels | None = None
+        self._beams = Beams(parts, self.add, lambda: bool(self.candidates or parts.known.best))
+        self._task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
+        self._forced: list[tuple[int, int]] = []  # pairs of steps at one dstate in all cheap maps
         # For each way to lay drives, or parts between gaps, on each other: the cheapest map.
         self._of_laying: dict[Hashable, Candidate] = {}
         problem = parts.task.problem
@@ -152,35 +150,87 @@ class Weighing:
         least = self.candidates[0].nats + EQUAL if self.candidates else 0.0
         return [candidate for candidate in self.candidates if candidate.nats <= least]
 
-    def guess(self, clashes: Callable[[], bool]) -> bool:
-        """Guess maps of little cost (`beams.py`). Return whether the trace may have a map."""
-        return self._beams.search(clashes)
+    def guesses(self, clashes: Callable[[], bool]) -> list[Source]:
+        """List the sources that guess maps of little cost, in the order of the schedule.
 
-    def search(self, of_labels: OfLabels) -> None:
-        """Find the maps of least cost and their rivals, and prove that there are no others.
-
-        `of_labels` lists the minimal maps of a theory, within some seconds. Raises LimitError if a
-        limit is reached. What was found so far is kept.
+        `clashes` returns whether a short proof shows that the trace has no map.
         """
-        parts, self._of_labels = self._parts, of_labels
-        parts.known.status = Status.UNKNOWN  # what was proven is about counts
+        return self._beams.sources(clashes)
+
+    def proofs(self) -> list[Source]:
+        """List the sources that bound the cost of all maps, in the order of the schedule.
+
+        `begin_proof` comes before the first one.
+        """
+        problem, has_faults = self._parts.task.problem, self._parts.task.theory.has_faults
+        is_long = has_faults and len(problem.trace) > READABLE
+
+        def has_map() -> bool:
+            return bool(self.candidates)
+
+        return [
+            Source(
+                turn("forced joins"), lambda: has_map() and Forcing.holds_for(problem), self._force
+            ),
+            Source(turn("scatter"), lambda: has_map() and scatter.is_for(problem), self._scatter),
+            Source(
+                turn("wrong displacements"),
+                lambda: is_long and has_map() and bool(self._parts.task.theory.jumped),
+                self._search_jumps,
+            ),
+            Source(turn("Benders cuts"), lambda: True, self._refuse if is_long else self._cut),
+        ]
+
+    def begin_proof(self) -> None:
+        """Bound the cost of all maps by what each map pays. Forget what was proven about counts."""
+        parts = self._parts
+        parts.known.status = Status.UNKNOWN
         self._improved = parts.watch.elapsed()
         if parts.known.best is not None:
             self.add(parts.known.best)
         self._least = {"places": least_places(parts.task.problem)}
         may_be_wrong = range(1, len(parts.task.trace)) if parts.task.theory.jumped else ()
         self._base = self._misfit.of_returns([], may_be_wrong) / 2  # of every map
-        task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
-        if self.candidates and Forcing.holds_for(task.problem):
-            task = self._with_forced_joins(task)
-        if self.candidates and scatter.is_for(parts.task.problem):
-            self._raise_by_scatter()
-        if parts.task.theory.has_faults and len(parts.task.trace) > READABLE:
-            if self.candidates and parts.task.theory.jumped and parts.candidates.beam(1):
-                search_jumps(
-                    parts.task.trace, parts.candidates.map_without, self.candidates[0].map, self.add
-                )
-            raise LimitError("no proof")
+
+    def _force(self) -> None:
+        """Find joins that all cheap maps have. Raise the bound, and let clingo assert the joins."""
+        task, best = self._task, self.candidates[0]
+        least = self._parts.known.bound.dstates or 0
+        forcing = Forcing(task.problem, task.log, self._misfit, best.map, least)
+        try:
+            forcing.force(self._most)
+            if forcing.low < best.nats - EQUAL:
+                for bound in forcing.bounds(best.nats, self.bound):
+                    self.bound = max(self.bound, min(bound, best.nats))
+        finally:
+            self.bound = max(self.bound, min(forcing.low, best.nats))
+            returns = forcing.returns
+            self._forced = [(one.first, one.second) for one in returns if one.of == "dstate"]
+            self._base = max(self._base, self._misfit.of_returns(returns) / 2)
+
+    def _scatter(self) -> None:
+        """Raise the bound by the scatter of visits about their places."""
+        problem, most = self._parts.task.problem, self.candidates[0].nats
+        self.bound = max(self.bound, scatter.least_cost(problem, self._misfit.visit, most))
+
+    def _search_jumps(self) -> None:
+        """Look for cheaper maps with other wrong displacements."""
+        parts = self._parts
+        if parts.candidates.beam(1):
+            best, map_without = self.candidates[0].map, parts.candidates.map_without
+            search_jumps(parts.task.trace, map_without, best, self.add)
+
+    def _refuse(self) -> None:
+        """Give up the proof: the readable encodings would take too much memory."""
+        raise LimitError("no proof")
+
+    def _cut(self) -> None:
+        """List maps by their counts, and exclude those whose misfit is too expensive."""
+        parts, task = self._parts, self._task
+        if self._forced and row("visits").holds_for(task.theory):
+            theory = task.theory.replace(same=(*task.theory.same, *self._forced))
+            asserted = Task.of(task.problem.changed(theory=theory), task.watch)
+            task = replace(asserted, speedups=task.speedups)
         best = parts.known.best
         engine = labelling_engine(task, best.dstate_at if best else ())
         judging = _CostJudging(task.problem, self)
@@ -200,41 +250,6 @@ class Weighing:
         self.bound = self.candidates[0].nats
         self.proven = True
         parts.known.status = Status.OPTIMAL
-        self.keep_best()
-
-    def _with_forced_joins(self, task: Task) -> Task:
-        """Find joins that all cheap maps have. Raise the bound, and assert the joins for clingo."""
-        least = self._parts.known.bound.dstates or 0
-        best = self.candidates[0]
-        forcing = Forcing(task.problem, task.log, self._misfit, best.map, least)
-        seconds = min(FORCING * self._parts.watch.left(), PATIENCE)
-        with suppress(LimitError), heeding(Watch().part(seconds).check):
-            for bound in self._bounds(forcing, best):
-                self.bound = max(self.bound, min(bound, best.nats))
-        self.bound = max(self.bound, min(forcing.low, best.nats))
-        returns = forcing.returns
-        self._base = max(self._base, self._misfit.of_returns(returns) / 2)
-        same = [(one.first, one.second) for one in returns if one.of == "dstate"]
-        if not same or not row("visits").holds_for(task.theory):
-            return task
-        theory = task.theory.replace(same=(*task.theory.same, *same))
-        return replace(
-            Task.of(task.problem.changed(theory=theory), task.watch), speedups=task.speedups
-        )
-
-    def _raise_by_scatter(self) -> None:
-        """Raise the bound by the scatter of visits about their places."""
-        most = self.candidates[0].nats
-        seconds = SCATTER * self._parts.watch.left()
-        with suppress(LimitError), heeding(self._parts.watch.part(seconds).check):
-            bound = scatter.least_cost(self._parts.task.problem, self._misfit.visit, most)
-            self.bound = max(self.bound, bound)
-
-    def _bounds(self, forcing: Forcing, best: Candidate) -> Iterator[float]:
-        """Yield lower bounds on the cost of all maps. Find joins that all cheap maps have."""
-        forcing.force(self._most)
-        if forcing.low < best.nats - EQUAL:
-            yield from forcing.bounds(best.nats, self.bound)
 
     def keep_best(self) -> None:
         """Compute the cost of the search's best map. Make the cheapest known map the best one.
@@ -284,13 +299,13 @@ class Weighing:
         """
         task, wrong = self._parts.task, jumped(ssh_map)
         theory = task.theory
-        if (theory.level == "causal" and not theory.has_faults) or self._of_labels is None:
+        if (theory.level == "causal" and not theory.has_faults) or self.of_labels is None:
             return (ssh_map,), True
         trace = task.trace.without_displacements_at(wrong)
         pinned = _pinned(theory, ssh_map).replace(
             jumped=0.0, displacement="use" if trace.has_displacements else "none"
         )
-        found, proven = self._of_labels(trace, pinned, self._parts.watch.left())
+        found, proven = self.of_labels(trace, pinned, self._parts.watch.left())
         jumps = tuple(fault for fault in ssh_map.faults if fault.kind == "jumped")
         alike = [
             with_more_faults(other, jumps)
@@ -433,7 +448,8 @@ class Weighing:
         If it found all maps below a cost, estimated rivals below it break axioms: leave them out.
         """
         least = best.nats + self._within if self.proven else -math.inf
-        seconds = min(max(self._parts.watch.left() + OVERTIME, LEAST_ESTIMATING), ESTIMATING)
+        left = max(self._parts.watch.left() + OVERTIME, LEAST_ESTIMATING)
+        seconds = min(left, turn("estimated rivals").most)
         of_best = self._parts.task.problem, self._misfit, self.candidates[0].map
         for rival in rivals_of(*of_best, seconds):
             if rival.nats >= least and (rival.dstates, rival.places) not in known:

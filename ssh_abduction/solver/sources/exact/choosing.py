@@ -17,13 +17,6 @@ FEW_STEPS = 24
 # With faults and places, use the readable encodings only for traces of at most this many steps.
 # Longer traces would take too much memory.
 READABLE = 60
-# After this many seconds with the step engine, check whether the dstates can be found without a
-# search. The check comes late because it loads numpy.
-SETTLE_AFTER = 0.15
-# After STEPWISE seconds with the step engine, or after STEPWISE_SHARE of the time left if that is
-# less, go on with an engine that finds dstates first. Most traces are solved by then.
-STEPWISE = 1.0
-STEPWISE_SHARE = 0.4
 
 
 def may_name(task: Task) -> bool:

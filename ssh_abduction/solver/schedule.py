@@ -1,0 +1,233 @@
+"""The schedule of a search: its sources in order, each with its share of the work and the reason.
+
+A source puts maps or proven lower bounds on the board. `search.py` runs the sources in the order of
+this table, until a map costs no more than the bound, or no work is left. No other module says how
+much of the work a source gets. A unit of work is about a second of a quiet core; without a work
+limit, seconds count instead.
+
+The page docs/reference/schedule.md shows this table (`python website/schedule.py` writes it).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from ssh_abduction.solver.asp.limits import RESERVE, Watch
+
+COUNT, COST, LATE = "maps are counted", "maps are weighed by cost", "after the search"
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """The turn of a source.
+
+    Attributes:
+        name: The name of the source.
+        when: The part of a search: COUNT, COST or LATE.
+        problems: For which problems the source runs.
+        why: Why it gets this share.
+        share: The source ends when this share of the work left at its begin is done.
+        until: The source ends when this share of the whole limit is used up.
+        most: The source ends after this many units of work in any case.
+    """
+
+    name: str
+    when: str
+    problems: str
+    why: str
+    share: float = 1.0
+    until: float = 1.0
+    most: float = math.inf
+
+    def work(self, watch: Watch) -> float:
+        """Return how much work the source may do if it begins now."""
+        left, until = watch.left(), math.inf
+        if self.until < 1 and left < math.inf:
+            until = max(self.until * (watch.elapsed() + left) - watch.elapsed(), 0.0)
+        return min(self.share * left, self.most, until)
+
+    def ends(self, watch: Watch) -> float:
+        """Return what the clock shows when the source has to end."""
+        return watch.elapsed() + self.work(watch)
+
+
+TABLE = (
+    Turn(
+        "greedy merging",
+        COUNT,
+        "causal theories, more than 24 steps",
+        "It takes milliseconds, and clingo then only has to find a better map.",
+    ),
+    Turn(
+        "mending",
+        COUNT,
+        "theories with faults, more than 24 steps",
+        "It finds the fewest faults by solving traces without them.",
+    ),
+    Turn(
+        "prefixes, first try",
+        COUNT,
+        "theories without frames, more than 24 steps",
+        "Most traces are solved by then. Later sources load numpy, which takes longer.",
+        share=0.4,
+        most=0.15,
+    ),
+    Turn(
+        "prefixes, second try",
+        COUNT,
+        "theories without frames, more than 24 steps",
+        "A trace that is not solved by then is seldom solved step by step.",
+        share=0.4,
+        most=1.0,
+    ),
+    Turn(
+        "maps with frames",
+        COUNT,
+        "the same, with the speed-up `framing`",
+        "They are only candidates. Without any map they may take twice as long.",
+        share=0.4,
+        most=30.0,
+    ),
+    Turn(
+        "exact search",
+        COUNT,
+        "all",
+        "It proves the minimum and lists all maps: prefixes, dstates first, or names.",
+    ),
+    Turn(
+        "sketch",
+        COST,
+        "all",
+        "There must be a map before any long source begins.",
+        share=0.4,
+    ),
+    Turn(
+        "smoothing",
+        COST,
+        "displacements, no lifts or faults within a drive",
+        "After a long way, poses that fit all closures are better than a beam.",
+        until=0.3,
+    ),
+    Turn(
+        "joint drives",
+        COST,
+        "several drives",
+        "Joining the maps of single drives is cheaper than a beam over all drives.",
+        until=0.5,
+    ),
+    Turn("beam of 1", COST, "up to 2,000 steps", "It finds most true maps.", until=0.7),
+    Turn(
+        "beam of 4",
+        COST,
+        "up to 2,000 steps",
+        "A map that a broad beam ends with is nearly always the best one.",
+        until=0.6,
+    ),
+    Turn(
+        "beam of 16",
+        COST,
+        "one drive on one floor",
+        "With several drives or floors, a beam of 4 keeps as many hypotheses.",
+        until=0.7,
+    ),
+    Turn(
+        "beams of logs",
+        COST,
+        "logs of robots: all beams",
+        "Smoothing has mostly found the best map there, and bounds need the work.",
+        until=0.5,
+    ),
+    Turn(
+        "beams with wrong displacements",
+        COST,
+        "theories with `jumped`: all beams",
+        "They often drop the best map. The search for wrong displacements finds it.",
+        until=0.4,
+    ),
+    Turn(
+        "beam without axioms",
+        COST,
+        "a broad beam ended",
+        "It says how much cheaper a map that breaks axioms would be.",
+        until=0.8,
+    ),
+    Turn(
+        "fewest dstates, map known",
+        COST,
+        "a map is known, and no faults are allowed",
+        "It only finds the least number of dstates, if that is easy.",
+        share=0.05,
+    ),
+    Turn(
+        "fewest dstates",
+        COST,
+        "no map is known, or faults are allowed",
+        "A map with the fewest dstates is the only one then.",
+        share=0.4,
+    ),
+    Turn(
+        "forced joins",
+        COST,
+        "no faults, up to 2,500 steps",
+        "They raise the bound most. Without a limit, more than 10 units seldom help.",
+        share=0.4,
+        most=10.0,
+    ),
+    Turn(
+        "scatter",
+        COST,
+        "logs of robots, no wrong displacements",
+        "It adds 5 to 22 % of the cost to the bound of logs, and cannot prove a map.",
+        share=0.5,
+    ),
+    Turn(
+        "wrong displacements",
+        COST,
+        "theories with `jumped`, more than 60 steps",
+        "A local search over which displacements are wrong. No source proves such maps.",
+    ),
+    Turn(
+        "Benders cuts",
+        COST,
+        "all but long traces with faults",
+        "Clingo lists maps by counts, and each misfit excludes many. This is the proof.",
+    ),
+    Turn(
+        "estimated rivals",
+        LATE,
+        "maps are weighed by cost",
+        "The confidence counts rivals that no source found.",
+        most=0.5,
+    ),
+    Turn(
+        "backbone",
+        LATE,
+        "not all minimal maps are listed",
+        "What all minimal maps share needs a search of its own.",
+        share=0.2,
+    ),
+    Turn(
+        "reserve",
+        LATE,
+        "no map is known",
+        "The last part of the limit is for a sketch, so that there always is a map.",
+        share=RESERVE,
+    ),
+)
+_TURNS = {turn.name: turn for turn in TABLE}
+
+
+def turn(name: str) -> Turn:
+    """Return the turn of a source, by its name."""
+    return _TURNS[name]
+
+
+class Source(NamedTuple):
+    """A source as a search runs it: its turn, whether it suits the problem now, and its work."""
+
+    turn: Turn
+    suits: Callable[[], bool]
+    run: Callable[[], None]
