@@ -18,6 +18,7 @@ from brute_force import Key, minimal_maps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
+from turns import STEPWISE, stepwise, turn_with
 from worlds import HEADINGS, QUARTERS, TWO_BLOCKS, Streets, drive, rectangle, written
 
 from benchmarks.instances import maze
@@ -107,10 +108,11 @@ def test_backbone_equals_the_brute_force(data: st.DataObject) -> None:
     # By default engines that settle dstates first are used for longer traces, and those for places
     # without frames only if clingo is slow.
     few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
-    frame_after = data.draw(st.sampled_from([0.0, choosing.STEPWISE]), label="frame after")
+    frame_after = data.draw(st.sampled_from([0.0, STEPWISE]), label="frame after")
     with (
         patch.object(prefixes, "FIRST_PREFIX", first_prefix),
-        patch.multiple(choosing, FEW_STEPS=few_steps, STEPWISE=frame_after),
+        patch.object(choosing, "FEW_STEPS", few_steps),
+        stepwise(frame_after),
         patch.multiple(map_list, ONE_MORE=0.0, ONE_MORE_SHARE=0.0),
     ):
         every = solve(trace, theory, max_maps=None, time_limit=LIMIT)
@@ -167,7 +169,7 @@ def test_each_engine_can_prove_the_backbone_from_one_map(frame_after: float, eng
     """32 maps that also differ in dstates. A prefix of the readable encodings finds them, or labels
     that are settled before places and paths."""
     trace, theory = walk(TWO_BLOCKS, "a1", 50, 1), Theory(boundary="none", prefer=("dstates",))
-    with patch.object(choosing, "STEPWISE", frame_after):
+    with stepwise(frame_after):
         every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
         search = Search(trace, theory, max_maps=1, _start=Start(reasons=True))
         reasoned = search.solution(tuple(search))
@@ -218,7 +220,7 @@ def test_endless_list_leaves_time_to_prove_the_backbone() -> None:
     search = Search(
         rectangle(14), theory, max_maps=None, time_limit=1000, _start=Start(reasons=True)
     )
-    with patch.object(map_list, "PROVING", 0.9995):
+    with turn_with("backbone", share=0.9995):
         count = sum(1 for _ in search)
     solution = search.solution()
     assert solution.stopped == "time limit"

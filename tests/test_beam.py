@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import theories, traces
 from test_plans import plan_of, xml
+from turns import guessed
 
 from simulator.plan_tours import tour
 from ssh_abduction import Theory, Trace, solve
@@ -182,10 +183,7 @@ def test_stopped_search_returns_the_true_map_of_the_beam() -> None:
 
 def test_broad_beam_and_small_misfit_raise_confidence() -> None:
     (known,) = truth.mazes(3, 30, [701], DRIFTING)
-    weighing = Search(known.trace)._weighing
-    assert weighing is not None
-    weighing.guess(lambda: False)
-    weighed = weighing.weighed()
+    weighed = guessed(Search(known.trace)).weighed()
     assert weighed is not None
     assert weighed.searched
     assert not weighed.proven

@@ -9,6 +9,7 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import pytest
+from turns import turn_with
 
 from benchmarks.instances import maze, rectangle
 from ssh_abduction import Theory, Trace, solve
@@ -145,7 +146,7 @@ def test_solve_tries_another_sketch_if_the_checker_refuses_one() -> None:
     trace = driven(maze(3, 3, steps=60, seed=1).trace, 4)
     theory = settle(trace).theory
     assert check(trace, sketched(trace, theory), theory)
-    with patch.multiple(fallback, OVERTIME=100.0), patch.object(candidates, "SKETCH_SHARE", 1.0):
+    with patch.multiple(fallback, OVERTIME=100.0), turn_with("sketch", share=1.0):
         assert solve(trace, time_limit=1e-6).maps
 
 

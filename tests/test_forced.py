@@ -71,7 +71,7 @@ def case_of(kind: str, seed: int, noises: Sequence[dict[str, float]] = (ROUGH, F
 
 
 def solved(trace: Trace, theory: Theory) -> Case:
-    with patch.object(beams, "WIDTHS", {1: 0.8}):  # the proof needs no better guess
+    with patch.object(beams, "WIDTHS", (1,)):  # the proof needs no better guess
         solution = solve(trace, theory)
     assert solution.status.value == "optimal"
     assert solution.weighed is not None

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import maze
 from strategies import theories, traces
+from turns import stepwise
 
 from ssh_abduction import Theory, check, solve
 from ssh_abduction.solver import Status, Watch
@@ -47,7 +48,7 @@ def test_framed_maps_satisfy_the_theory(data: st.DataObject) -> None:
 def test_framing_changes_no_answer(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6).filter(lambda t: t.has_stars), label="trace")
     expected = solve(trace, PATTERN, max_maps=None, speedups=Speedups.without(SPEEDUPS))
-    with patch.multiple(choosing, STEPWISE=-1.0, FEW_STEPS=0):
+    with patch.object(choosing, "FEW_STEPS", 0), stepwise(-1.0):
         found = solve(trace, PATTERN, max_maps=None)
     assert (found.status, set(found.maps)) == (expected.status, set(expected.maps))
 

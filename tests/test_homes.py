@@ -6,6 +6,7 @@ import random
 from unittest.mock import patch
 
 import pytest
+from turns import stepwise
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.solver import Status
@@ -79,7 +80,7 @@ def test_maps_with_pinned_places_equal_those_of_the_plain_encoding(
 ) -> None:
     trace, theory = CASES[case], Theory.topological().replace(prefer=prefer)
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
-    with patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0):
+    with patch.object(choosing, "FEW_STEPS", 0), stepwise(-1.0):
         found = solve(trace, theory, max_maps=None)
     assert (found.status, found.complete) == (Status.OPTIMAL, True)
     assert (found.cost, set(found.maps)) == (expected.cost, set(expected.maps))

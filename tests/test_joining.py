@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import truth
 from together import of_mazes
+from turns import guessed
 
 from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
 from ssh_abduction.checker.checker import violations
@@ -24,7 +25,6 @@ from ssh_abduction.solver.costs import beams
 from ssh_abduction.solver.costs.distrust import doubt_of
 from ssh_abduction.solver.costs.estimating import may_join_more, rival_of
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.costs.weighing import Weighing
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.weighed import groups_of_drives
 from ssh_abduction.solver.sources.metric.drives import Joining
@@ -320,10 +320,8 @@ def test_closures_say_how_drives_lie_on_each_other() -> None:
 @pytest.mark.parametrize("seed", [312, pytest.param(313, marks=pytest.mark.slow)])
 def test_joined_map_has_a_probability_without_a_broad_beam(seed: int) -> None:
     (known,) = of_mazes(3, 20, [seed], NOISE, drives=2)
-    weighing = Weighing(Search(known.trace)._parts)
-    with patch.object(beams, "WIDTHS", {1: 0.7}):
-        weighing.guess(lambda: False)
-    weighed = weighing.weighed()
+    with patch.object(beams, "WIDTHS", (1,)):
+        weighed = guessed(Search(known.trace)).weighed()
     assert weighed is not None
     assert weighed.searched
     assert weighed.broken == 0

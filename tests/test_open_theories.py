@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import maze
 from strategies import TOYS, Toy, traces
+from turns import stepwise
 from worlds import ACTIONS
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
@@ -307,7 +308,8 @@ def test_every_engine_forbids_maps_refused_by_evidence(name: str, data: st.DataO
         patch.object(
             prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 8]), label="first prefix")
         ),
-        patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0),
+        patch.object(choosing, "FEW_STEPS", 0),
+        stepwise(-1.0),
     ):
         asked = Search(trace, theory, max_maps=None, speedups=Speedups())
         found = tuple(asked)

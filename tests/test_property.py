@@ -9,6 +9,7 @@ from brute_force import consistent_maps, key, minimal_maps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import FOREIGN, TOYS, theories, traces
+from turns import STEPWISE, stepwise
 
 from ssh_abduction import solve
 from ssh_abduction.checker.checker import check
@@ -56,10 +57,11 @@ def solver_agrees(data: st.DataObject, trace: Trace) -> None:
     first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
     first_paths = data.draw(st.sampled_from([1, 2, prefixes.FIRST_PATHS]), label="first paths")
     few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
-    stepwise = data.draw(st.sampled_from([-1.0, choosing.STEPWISE]), label="seconds step by step")
+    seconds = data.draw(st.sampled_from([-1.0, STEPWISE]), label="seconds step by step")
     with (
         patch.multiple(prefixes, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths),
-        patch.multiple(choosing, FEW_STEPS=few_steps, STEPWISE=stepwise),
+        patch.object(choosing, "FEW_STEPS", few_steps),
+        stepwise(seconds),
     ):
         agree(trace, theory)
 

@@ -10,6 +10,7 @@ from itertools import combinations, pairwise
 from unittest.mock import patch
 
 import pytest
+from turns import guessed
 
 from ssh_abduction import SSHMap, Theory, Trace
 from ssh_abduction.data import Closure, Odometry
@@ -164,10 +165,8 @@ def test_smoothing_needs_displacements_that_connect_all_steps() -> None:
 
 def test_search_takes_the_smoothed_map() -> None:
     trace, places = rounds(6, 4, 0)
-    weighing = Search(trace, BARE)._weighing
-    assert weighing is not None
-    with patch.object(beams, "WIDTHS", {}):
-        assert weighing.guess(lambda: False)
+    with patch.object(beams, "WIDTHS", ()):
+        weighing = guessed(Search(trace, BARE))
     assert weighing.best is not None
     assert is_true(weighing.best.map, places)
 
@@ -184,7 +183,7 @@ def test_places_of_the_best_map_of_a_broad_beam_are_merged() -> None:
     weighing, beam = Weighing(parts), parts.candidates.beam(4)
     assert beam
     with patch.object(Candidates, "maps_of", return_value=[split]):
-        assert weighing._beams._ends(beam, 4, math.inf)
+        weighing._beams._finish(beam, 4)
     assert weighing.best
     assert [weighing.best.map.place_of(t) for t in range(7)] == [0, 1, 1, 0, 0, 2, 1]
     assert weighing._beams.found(weighing.best.nats)

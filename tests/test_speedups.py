@@ -19,6 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import maze, moore
 from strategies import traces
+from turns import stepwise
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
@@ -129,7 +130,8 @@ CASES = {
 def hurried() -> Iterator[None]:
     """Steps that need a slow search are done at once."""
     with (
-        patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0),
+        patch.object(choosing, "FEW_STEPS", 0),
+        stepwise(-1.0),
         patch.multiple(names, PATIENCE=0, CORES=0),
     ):
         yield

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import maze
 from strategies import theories, traces
+from turns import STEPWISE, stepwise
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, solve
 from ssh_abduction.checker.checker import check
@@ -49,7 +50,8 @@ def test_change_of_engine_changes_no_answer(data: st.DataObject) -> None:
     first = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
     expected = solve(trace, theory, max_maps=None, speedups=Speedups.without(SPEEDUPS))
     with (
-        patch.multiple(choosing, STEPWISE=-1.0, FEW_STEPS=0),
+        patch.object(choosing, "FEW_STEPS", 0),
+        stepwise(-1.0),
         patch.object(prefixes, "FIRST_PREFIX", first),
     ):
         found = solve(trace, theory, max_maps=None, speedups=Speedups.without("names"))
@@ -70,7 +72,7 @@ def test_listing_has_no_stage_limit() -> None:
     listed = Prefixes.minimal_maps
 
     def slowly(self: Prefixes) -> Iterator[SSHMap]:
-        self._task.watch._spent += 2 * choosing.STEPWISE
+        self._task.watch._spent += 2 * STEPWISE
         yield from listed(self)
 
     with patch.object(Prefixes, "minimal_maps", slowly):
@@ -102,7 +104,7 @@ def test_online_mapper_without_time_has_a_small_map() -> None:
     """The sketch is small enough. The robot was in 27 dstates."""
     trace = maze(3, 3, steps=120, seed=0).trace
     mapper = OnlineMapper(trace.steps[0].view or "", time_limit=0.01)
-    with patch.object(choosing, "STEPWISE", -1.0), patch.object(fallback, "OVERTIME", 100.0):
+    with stepwise(-1.0), patch.object(fallback, "OVERTIME", 100.0):
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):
             answer = mapper.observe(action, step.view or "")
     assert answer.cost

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import maze
 from strategies import step_pairs, traces
+from turns import stepwise
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
@@ -171,7 +172,7 @@ def maps_of_a_maze() -> frozenset[SSHMap]:
 def test_maze_without_stars_has_the_known_maps(off: str) -> None:
     """All minimal maps of 32 steps, with all speed-ups. The bound has a certificate."""
     trace = maze(2, 2, steps=32, seed=1).trace
-    with patch.object(choosing, "STEPWISE", -1.0):
+    with stepwise(-1.0):
         search = Search(trace, max_maps=None, speedups=Speedups.without(off))
         found = search.solution(tuple(search))
     assert isinstance(search._parts.prefixes.engine, LabelsFirst)
@@ -187,7 +188,7 @@ def test_maze_without_stars_has_the_known_maps(off: str) -> None:
 def test_aces3_route_without_stars_has_the_known_maps() -> None:
     """As the table of docs/explanation/theory.md has it: (19, 9, 4), 38 maps."""
     trace = Trace.load(EXAMPLES / "aces3-route.jsonl")
-    with patch.multiple(choosing, STEPWISE=-1.0, FEW_STEPS=0):
+    with patch.object(choosing, "FEW_STEPS", 0), stepwise(-1.0):
         search = Search(trace, Theory(star="none"), max_maps=None)
         found = search.solution(tuple(search))
     assert isinstance(search._parts.prefixes.engine, LabelsFirst)
@@ -227,9 +228,8 @@ def test_refused_maps_do_not_count_as_listed(settled: bool) -> None:
 
     with (
         patch.multiple(Judging, refusal=refusal, may_refuse=True),
-        patch.multiple(
-            choosing, STEPWISE=-1.0 if settled else 60.0, FEW_STEPS=0 if settled else 24
-        ),
+        patch.object(choosing, "FEW_STEPS", 0 if settled else 24),
+        stepwise(-1.0 if settled else 60.0),
     ):
         few, left = solve(trace, theory, max_maps=1), solve(trace, theory, max_maps=None)
     assert set(left.maps) == {m for m in every if m.place_of(first) != m.place_of(second)}
@@ -240,7 +240,7 @@ def test_refused_maps_do_not_count_as_listed(settled: bool) -> None:
 @pytest.mark.slow
 def test_max_maps_cuts_the_list_of_a_frameless_search() -> None:
     trace = maze(2, 2, steps=120, seed=2).trace
-    with patch.object(choosing, "STEPWISE", -1.0):
+    with stepwise(-1.0):
         few, every = solve(trace, max_maps=3), solve(trace, max_maps=None)
     assert (few.status, few.count, few.complete, few.stopped) == (
         Status.OPTIMAL,
@@ -258,7 +258,7 @@ def test_interrupt_keeps_the_known_map(name: str) -> None:
     """At any time, the map that was known before is the answer."""
     trace = maze(2, 2, steps=120, seed=1).trace
     with (
-        patch.object(choosing, "STEPWISE", -1.0),
+        stepwise(-1.0),
         patch.object(Fitting, name, side_effect=KeyboardInterrupt),
     ):
         found = solve(trace)
@@ -270,7 +270,7 @@ def test_later_search_continues_from_a_frameless_engine() -> None:
     """The first search of a mapper may have many steps. What it proved holds for later steps."""
     trace = maze(2, 2, steps=30, seed=1).trace
     first = trace.prefix(26)
-    with patch.object(choosing, "STEPWISE", -1.0):
+    with stepwise(-1.0):
         search = Search(first, max_maps=None)
         before = search.solution(tuple(search))
         assert isinstance(search._parts.prefixes.engine, LabelsFirst)

@@ -387,7 +387,7 @@ def test_check_computes_the_costs_of_all_rivals_or_counts_the_others(
 
 
 def test_stopped_search_is_not_sure(route: truth.Known) -> None:
-    with patch.object(beams, "WIDTHS", {1: 0.8, beams.BROAD: 0.0}):  # no broad beam
+    with patch.object(beams, "WIDTHS", (1,)):  # no broad beam
         solution = solve(route.trace, work_limit=0.5)
     assert solution.status is Status.FEASIBLE
     assert solution.weighed is not None

@@ -5,7 +5,7 @@ this table, until a map costs no more than the bound, or no work is left. No oth
 much of the work a source gets. A unit of work is about a second of a quiet core; without a work
 limit, seconds count instead.
 
-The page docs/reference/schedule.md shows this table (`python website/schedule.py` writes it).
+The page docs/reference/schedule.md shows this table (`python website/schedule_table.py` writes it).
 """
 
 from __future__ import annotations
@@ -217,12 +217,12 @@ TABLE = (
         share=RESERVE,
     ),
 )
-_TURNS = {turn.name: turn for turn in TABLE}
+TURNS = {turn.name: turn for turn in TABLE}
 
 
 def turn(name: str) -> Turn:
     """Return the turn of a source, by its name."""
-    return _TURNS[name]
+    return TURNS[name]
 
 
 class Source(NamedTuple):

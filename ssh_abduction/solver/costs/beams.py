@@ -1,8 +1,8 @@
 """Guess maps of little cost: by poses that fit all closures, by joining drives, and by beams.
 
-Places are first merged at poses that fit all closures (`sources/metric/overlay.py`). After a long way this is
-better than a beam of hypotheses, which goes through the trace once. Then come beams, narrow ones
-first. The places of the best map of a broad beam are merged in the same way.
+Places are first merged at poses that fit all closures (`sources/metric/overlay.py`). After a long
+way this is better than a beam of hypotheses, which goes through the trace once. Then come beams,
+narrow ones first. The places of the best map of a broad beam are merged in the same way.
 """
 
 from __future__ import annotations
