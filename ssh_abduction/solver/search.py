@@ -375,7 +375,7 @@ class Search:
         """Run sources one after the other, each within its turn, while a map may be found."""
         parts, watch = self._parts, self._parts.watch
         for source in sources:
-            if parts.known.status is Status.UNSATISFIABLE or not source.suits():
+            if self.status is Status.UNSATISFIABLE or not source.suits():
                 continue
             _log.debug("%s", source.turn.name)
             with suppress(StageTimeError), watch.stage(source.turn.ends(watch)):
