@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +15,7 @@ from ssh_abduction.cli.options import (
     add_trace,
     check_number,
     check_picture,
+    draw_plot,
     output,
     picture_file,
     seed,
@@ -115,11 +115,7 @@ def run_cluster(options: argparse.Namespace) -> int:
     _write(clustered, files, options, f"{_choice_of_k(clusterer, uncertainty)}\n{said}")
     warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
     warn(runner_up_doubts(clustered))
-    if options.plot:
-        sys.stdout.flush()  # print first, in case drawing fails
-        from ssh_abduction.evaluation.figures import draw_quality
-
-        draw_quality(options.plot, clusterer.quality_, uncertainty, clusterer.k_)
+    draw_plot(options, "draw_quality", clusterer.quality_, uncertainty, clusterer.k_)
     return 0
 
 
@@ -330,11 +326,7 @@ def run_learning_curve(options: argparse.Namespace) -> int:
             for s, m, a, b in zip(curve.sizes, curve.mean, curve.lowest, curve.highest, strict=True)
         ]
         print(table(["images", "recognised", "worst fold", "best fold"], rows))
-    if options.plot:
-        sys.stdout.flush()  # print first, in case drawing fails
-        from ssh_abduction.evaluation.figures import draw_learning
-
-        draw_learning(options.plot, {"map": curve})
+    draw_plot(options, "draw_learning", {"map": curve})
     return 0
 
 
@@ -394,9 +386,5 @@ def run_tell_apart(options: argparse.Namespace) -> int:
         ]
         beams = [f"beams by {method}" for method in next(iter(found.values())).methods]
         print(table(["dstates", "recognised", *beams], rows))
-    if options.plot:
-        sys.stdout.flush()  # print first, in case drawing fails
-        from ssh_abduction.evaluation.figures import draw_telling
-
-        draw_telling(options.plot, ranges, labels, found)
+    draw_plot(options, "draw_telling", ranges, labels, found)
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -14,6 +13,7 @@ from ssh_abduction.cli.options import (
     add_maps,
     check_number,
     check_picture,
+    draw_plot,
     picture_file,
     read_maps,
     some_maps,
@@ -111,11 +111,7 @@ def run_localise(options: argparse.Namespace) -> int:
         ]
         place = ("place",) if localiser.ssh_map.places else ()
         print(table((*HEAD, *place, *NUMBERS), rows))
-    if options.plot:
-        sys.stdout.flush()  # print first, in case drawing fails
-        from ssh_abduction.evaluation.figures import draw_beliefs
-
-        draw_beliefs(options.plot, beliefs)
+    draw_plot(options, "draw_beliefs", beliefs)
     return 0
 
 

@@ -314,6 +314,15 @@ def check_picture(file: str | None) -> None:
         require_matplotlib()
 
 
+def draw_plot(options: argparse.Namespace, name: str, *data: object) -> None:
+    """Draw a figure into the file of --plot, if one is named, by a function of `figures`."""
+    if options.plot:
+        sys.stdout.flush()  # print first, in case drawing fails
+        from ssh_abduction.evaluation import figures
+
+        getattr(figures, name)(options.plot, *data)
+
+
 def check_number(number: int | None, maps: Sequence[object], where: str) -> None:
     """Raise MapError, which names the file `where`, if there is no map with this number, from 1."""
     if number is not None and not 1 <= number <= len(maps):

@@ -31,11 +31,6 @@ class Setting:
         """The setting as the help shows it, such as `star={auto,none}`."""
         return f"{self.name}={'{' + ','.join(self.choices) + '}' if self.choices else self.metavar}"
 
-    @property
-    def is_flag(self) -> bool:
-        """Whether the value is true or false."""
-        return self.type is true_or_false
-
     def read(self, text: str) -> Any:
         """Convert text to a value. Raise argparse.ArgumentTypeError if it is wrong."""
         if self.choices and text not in self.choices:
