@@ -477,6 +477,7 @@ class Search:
         Args:
             stopped: The reason to name in the answer, if the search ends now.
         """
+        one_of("stopped", stopped, get_args(Stop), SolverError)
         known = self._parts.known
         best, status = known.best, known.status
         if best is not None and status is Status.UNKNOWN:
