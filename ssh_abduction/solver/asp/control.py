@@ -125,6 +125,8 @@ class Control(clingo.Control):
     @contextmanager
     def _alone(self) -> Iterator[None]:
         """Let only this control read or ground in this context. First wait for other controls."""
+        if counts_work():
+            self._check()  # a limit that is reached must not depend on whether this waits
         while not _grounding.acquire(timeout=POLL):
             self._check()
         try:
@@ -193,8 +195,9 @@ class _GroundingCheck:
         count_work(ASKED)
         self._calls += 1
         try:
-            if counts_work() and self._calls % CALLS == 0:
-                self._check()
+            if counts_work():
+                if self._calls % CALLS == 0:
+                    self._check()
             elif time.perf_counter() > self._next:
                 self._check()
                 self._next = time.perf_counter() + POLL
@@ -326,6 +329,8 @@ class Asker:
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
         """Wait for an answer or the end; False if `until` ended the wait. May raise LimitError."""
         began = time.perf_counter()
+        if counts_work():
+            self.watch.check()  # a limit that is reached must not depend on whether this waits
         try:
             while not handle.wait(POLL):
                 self.watch.check()
