@@ -20,6 +20,7 @@ from clingo import Function, Model, Symbol
 from numpy.typing import NDArray
 
 from ssh_abduction.data.action import Action
+from ssh_abduction.runtime.clock import now
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import number_symbols
@@ -154,12 +155,12 @@ class NameProgram:
 
     def add(self, links: Iterable[Link]) -> None:
         """Give clingo more links and the nodes at their ends, in batches. Check limits between."""
-        added, before = list(links), self._asker.ground_seconds
+        added, began = list(links), now()
         for start in range(0, len(added), AT_A_TIME):
             self._asker.watch.check()
             with self._asker.grounding_timed():
                 self._give(added[start : start + AT_A_TIME])
-        self._asker.watch.check(PREPARING * (self._asker.ground_seconds - before))
+        self._asker.watch.check(PREPARING * (now() - began))
 
     def add_links_at(self, nodes: Collection[int]) -> None:
         """Give clingo all links to and from these steps that it lacks."""
