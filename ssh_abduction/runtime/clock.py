@@ -29,8 +29,8 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 # The work of a turn of a loop that looks at the clock, in microunits, if it names no other number;
-# and of a turn of a short loop over steps.
-TURN, SHORT_TURN = 800, 80
+# of a turn of a short loop over steps; and of a turn that compares all pairs of many steps.
+TURN, SHORT_TURN, LONG_TURN = 800, 80, 8000
 MICRO = 1_000_000  # microunits in a unit; whole numbers add up to the same sum in each order
 
 

@@ -7,9 +7,9 @@ solving mazes, offices and logs of robots (`benchmarks/work.py` measures them ag
 from __future__ import annotations
 
 # A conflict of clasp, and an answer of it, in units.
-CONFLICT, ANSWER = 2e-4, 2e-4
+CONFLICT, ANSWER = 1.2e-4, 2e-3
 # An iteration of a least-squares fit of poses, and what each displacement adds, in microunits.
-FIT, FIT_OF_ONE = 900, 6
+FIT, FIT_OF_ONE = 900, 8
 # An atom that clingo grounds, and a call of `@go_on` by which it asks whether to go on, in
 # microunits.
-ATOM, ASKED = 15, 2
+ATOM, ASKED = 18, 2

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.clock import LONG_TURN, look_at_clock
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ class Facilities:
         """Compute shares that hold for all facilities that a search from some starts finds."""
         best = np.zeros(len(self.points))
         for _ in range(ROUNDS):
-            look_at_clock()
+            look_at_clock(LONG_TURN)
             shares = program.solved()
             saved, members, paid, centres = self.climbed(shares, starts, kinds)
             scaled = shares * self.price / max(self.price, float(saved.max()))

@@ -31,7 +31,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ssh_abduction.data.groups import gathered, indices_of
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.clock import LONG_TURN, look_at_clock
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.steps.apart import apart_classes, apart_matrix, clique, grown_clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
@@ -417,7 +417,7 @@ class Forcing:
         without it, the highest first. `known` has such bounds by join. New bounds are added.
         """
         while True:
-            look_at_clock()
+            look_at_clock(LONG_TURN)
             classes = _Joined(visits, joins)
             if classes.fails:
                 return joins, math.inf, []

@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.clock import LONG_TURN, look_at_clock
 from ssh_abduction.theory.evidence.protocol import KEPT, Equality, Evidence
 from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
 
@@ -617,5 +617,5 @@ class Returns:
 def _parts(size: int, most: int = AT_A_TIME) -> Iterator[slice]:
     """Yield slices of at most `most` loops, so that each part fits into memory."""
     for start in range(0, size, most):
-        look_at_clock()
+        look_at_clock(LONG_TURN)
         yield slice(start, start + most)

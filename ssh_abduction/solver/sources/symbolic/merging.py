@@ -58,7 +58,7 @@ from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace, View
-from ssh_abduction.runtime.clock import each_looking, look_at_clock
+from ssh_abduction.runtime.clock import SHORT_TURN, each_looking, look_at_clock
 from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart, Link
 from ssh_abduction.theory.pairs import Pairs, pairs_in
@@ -243,7 +243,7 @@ class Classes:
         steps = np.flatnonzero(~self.known[self.root])
         fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
         for t in steps[np.argsort(fitting, kind="stable")].tolist():
-            look_at_clock()
+            look_at_clock(SHORT_TURN)
             root = int(self.root[t])
             if self.known[root]:
                 continue
