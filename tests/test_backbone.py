@@ -32,13 +32,12 @@ from ssh_abduction.solver import (
     Solution,
     Start,
     Status,
-    choosing,
     find_backbone,
     map_list,
-    prefixes,
 )
 from ssh_abduction.solver.solution.result import summary_of
 from ssh_abduction.solver.solution.sharing import Backbone, Shared
+from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 

@@ -8,7 +8,7 @@ holds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
@@ -145,6 +145,11 @@ class LabellingEngine(Protocol):
         with one labelling.
         """
         ...
+
+
+def in_order(equalities: Iterable[Equality]) -> list[Equality]:
+    """Sort equalities, as the order of a set depends on the hashes of texts."""
+    return sorted(equalities, key=lambda one: (one.first, one.second, one.of, one.holds))
 
 
 def maps_of_labels(

@@ -1,7 +1,7 @@
 """The control of clingo that assigns names of dstates to steps (names.lp).
 
-The engines without frames use it. Clingo gets only some links of the trace at first, and more if an
-answer needs them. Fewer links are a relaxation, so a proven bound also holds for the whole trace.
+`names.py` uses it. Clingo gets only some links of the trace at first, and more if an answer needs
+them. Fewer links are a relaxation, so a proven bound also holds for the whole trace.
 Each answer is followed along the trace (`NameProgram.follow`). If it explains every link, it is a
 map.
 """

@@ -1,8 +1,7 @@
 """Finds labels with the fewest dstates, for theories without frames.
 
 A label is the number of the dstate of a step. This module finds labels of the first steps with the
-fewest dstates, proves that none have fewer, and lists all labels with that number of dstates. The
-causal engine and the frameless one use it.
+fewest dstates, proves that none have fewer, and lists all labels with that number of dstates.
 
 The search works with names. Clingo assigns a name, which is a dstate, to each step. Pairwise
 distinct steps, a clique (`steps/apart.py`), are *pinned*: each gets a name of its own. Their number
@@ -22,11 +21,14 @@ If a minimal answer uses a rest, its view gets one more spare name, and clingo i
 
 Not every step is needed. Clingo starts with the links of the pinned steps. Each answer is followed
 along the trace, and the links that it does not explain are added, until it explains all links
-(`name_program.py`). If clingo does not answer soon, it gets all links, or some at a time if
-the trace is long. A very long trace is charted only up to a step at which the clique is as large as
-the clique of all steps.
+(`name_program.py`). If clingo does not answer soon, it gets all links, or some at a time if the
+trace is long. A very long trace is charted only up to a step at which the clique is as large as the
+clique of all steps.
 
-The search for the fewest dstates is in `names.py`.
+Clasp raises the lower bound by one for each core. A core is a set of spare names, and at least one
+of them is needed. Cores are small at first, as views share no names. If that takes long in the
+causal theory, small maps are also looked for in other ways: first steps are merged, later dstates
+are guessed. The search ends as soon as some map has as few dstates as the bound.
 
 While a map is made from one answer, clingo searches for the next.
 """
@@ -64,6 +66,9 @@ SPARES = 2
 # Of a long trace whose clique grows, take at most this many steps at once. The clique of more steps
 # would take minutes.
 WHOLE = 100_000
+# Stop after this many guesses, even if none of them is a map. Guesses are slow, and later ones are
+# rarely better.
+GUESSES = 10
 
 
 class NamedLabels:
@@ -331,7 +336,6 @@ class NameSearch:
         """Prepare a search that improves the incumbent."""
         self._task, self._asker, self._program = task, asker, program
         self._incumbent = incumbent
-        self._small = SmallMaps(task, program.pinned)
         self._hard = False  # whether clingo once did not end after few conflicts
         self._had_all_help = False  # whether maps near a guess were sought already
 
@@ -422,59 +426,35 @@ class NameSearch:
 
     def _helped(self) -> Iterator[list[int]]:
         """Look for small maps in other ways, as clingo takes long. Yield the dstates of steps."""
-        if self._may_help and not self._hard and not self._program.pinned.is_long:
-            yield from self._small.merged()
+        pinned, greedy = self._program.pinned, self._task.speedups.greedy
+        if self._may_help and greedy and not self._hard and not pinned.is_long:
+            yield merged(pinned.chart, pinned.clique)
         self._hard = True
         # It takes long until clingo has all links of a long trace, so guess before.
-        is_time = self._program.has_all_links or self._program.pinned.is_long
+        is_time = self._program.has_all_links or pinned.is_long
         if is_time and self._may_help and not self._had_all_help:
             self._had_all_help = True
             yield from self._near_a_guess()
 
     def _near_a_guess(self) -> Iterator[list[int]]:
-        """Guess maps. Yield the labels of each with fewer dstates than all maps before."""
-        known = self._incumbent.labels
-        for labels in self._small.guessed():
-            if known is None or len(set(labels)) < len(set(known)):
-                known = labels
-                yield labels
-            if self._incumbent.is_settled():
-                return
-
-
-# Stop after this many guesses, even if none of them is a map. Guesses are slow, and later ones are
-# rarely better.
-GUESSES = 10
-
-
-class SmallMaps:
-    """Finds small maps of first steps by merging and guessing, in case a search stops early."""
-
-    def __init__(self, task: Task, pinned: Pinned) -> None:
-        """Prepare for a chart in which each of the first steps is a node."""
-        self._task, self._pinned = task, pinned
-
-    def merged(self) -> Iterator[list[int]]:
-        """Merge nodes by evidence, and yield the labels of the map, if speed-up `greedy` is on."""
-        if self._task.speedups.greedy:
-            yield merged(self._pinned.chart, self._pinned.clique)
-
-    def guessed(self) -> Iterator[list[int]]:
-        """Yield the labels of a map near each guess at the dstates, if speed-up `guessed` is on.
+        """Guess dstates. Yield the labels of a map near each guess, with ever fewer dstates.
 
         The first guess that is itself a map is the last one. There is no guess if that takes too
         much memory, of a long trace, and where a robot travels and turns: there merging does as
         well in less time.
         """
-        steps, speedups = self._pinned.chart, self._task.speedups
+        steps, known = self._program.chart, self._incumbent.labels
         drives = all(action.kind for action in self._task.trace.actions)
-        if not speedups.guessed or drives or self._pinned.is_long:
+        if not self._task.speedups.guessed or drives or self._program.pinned.is_long:
             return
         actions = [action for _, action, _ in steps.links]
-        for labels in islice(machine_labels(steps.seen, actions), GUESSES):
-            guess = mended(labels, steps)
-            yield dstates_merged(steps, merged(steps, guess=guess))
-            if steps.is_map(guess):
+        for guessed in islice(machine_labels(steps.seen, actions), GUESSES):
+            guess = mended(guessed, steps)
+            labels = dstates_merged(steps, merged(steps, guess=guess))
+            if known is None or len(set(labels)) < len(set(known)):
+                known = labels
+                yield labels
+            if self._incumbent.is_settled() or steps.is_map(guess):
                 return
 
 

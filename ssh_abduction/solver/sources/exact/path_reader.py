@@ -1,6 +1,6 @@
-"""Read maps from answers of `fast/paths_framed.lp` and `fast/paths_frameless.lp`.
+"""Read maps from answers of `fast/paths.lp`.
 
-These encodings get dstates and links as input, and find places and paths for them. Travels and
+This encoding gets dstates and links as input, and finds places and paths for them. Travels and
 turns around join dstates to *segments*, which are parts of paths. Several segments may be one path.
 In the same way turns connect dstates to small places, and several of these may be one place of the
 map.
@@ -30,7 +30,7 @@ _Ahead: TypeAlias = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class PathAnswer:
-    """The places and paths in an answer of paths_framed.lp or paths_frameless.lp.
+    """The places and paths in an answer of paths.lp.
 
     Attributes:
         at: For each group of dstates connected by turns: its place in the map, and the rotation
@@ -45,7 +45,7 @@ class PathAnswer:
 
 
 class PathReader:
-    """Reads maps from answers of paths_framed.lp or paths_frameless.lp, for fixed labels.
+    """Reads maps from answers of paths.lp, for fixed labels.
 
     It asks clingo whether single atoms are in an answer, beginning with the atoms of the last
     answer. That takes a third of the time of reading all atoms. Values that follow from the labels

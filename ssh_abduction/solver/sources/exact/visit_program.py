@@ -1,6 +1,6 @@
 """The control of clingo that decides which visits are at one place (visits.lp).
 
-The engine with frames uses it. Clingo gets some visits at first, and others if an answer needs
+`visits.py` uses it. Clingo gets some visits at first, and others if an answer needs
 them. Fewer visits are a relaxation, so a bound proven for them holds for the trace.
 """
 
