@@ -24,7 +24,7 @@ from ssh_abduction.data.errors import MapError, SolverError, brief, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import SOLUTION_FORMAT, VERSION, check_format, read_json, write_map
 from ssh_abduction.data.maps import SSHMap, check_of_trace, maps_of
-from ssh_abduction.data.schema import FieldReader
+from ssh_abduction.data.schema import FieldReader, plain
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.output import cards
@@ -533,55 +533,46 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
 
     `count` maps were written. The solution need not hold them.
     """
+    recorded, effort = solution.support.recorded, solution.effort
+    drives = () if recorded is None else recorded.drives
+    if recorded is None and solution.trace is not None:
+        drives = with_fingerprints(solution.trace)
+    certificate: Any = solution.certificate and solution.certificate.to_dict(solution.trace)
+    if recorded is not None and recorded.written_certificate is not None:
+        certificate = recorded.written_certificate
+    listed = solution.minimal_listed
     end: dict[str, Any] = {
         "status": solution.status.value,
         "complete": solution.complete,
         "count": count,
-        "cost": solution.cost.to_dict() if solution.cost else None,
-        "bound": solution.bound.to_dict(),
-        "prefix": solution.effort.prefix,
-        "grounding": asdict(solution.effort.grounding),
-        "seconds": {
-            k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")
-        },
+        "cost": solution.cost,
+        "bound": solution.bound,
+        "prefix": effort.prefix,
+        "grounding": asdict(effort.grounding),
+        "seconds": {k: round(seconds, 6) for k, seconds in asdict(effort.seconds).items()},
+        **({} if effort.work is None else {"work": round(effort.work, 6)}),
+        "summary": summary_of(solution, count, backbone),
     }
-    if solution.effort.work is not None:
-        end["work"] = round(solution.effort.work, 6)
-    end["summary"] = summary_of(solution, count, backbone)
-    recorded = solution.support.recorded
-    drives = () if recorded is None else recorded.drives
-    if recorded is None and solution.trace is not None:
-        drives = with_fingerprints(solution.trace)
-    if onto := solution.support.onto or (() if recorded is None else recorded.onto):
-        end["onto"] = list(onto)
-    if drives:
-        end["drives"] = [drive.to_dict() for drive in drives]
-    # Leave out fields that would say nothing.
-    if backbone and not (solution.minimal_listed and count == 1):
-        end["backbone"] = backbone.to_dict()
-    if solution.within:
-        end["levels"] = [level.to_dict() for level in solution.levels]
-        if solution.minimal_listed and not solution.complete:
-            end["minimal_listed"] = True
-    if recorded is not None and recorded.written_certificate is not None:
-        end["certificate"] = dict(recorded.written_certificate)
-    elif solution.certificate:
-        end["certificate"] = solution.certificate.to_dict(solution.trace)
-    if solution.weighed is not None:
-        end["weighed"] = solution.weighed.to_dict()
-    if joins := solution.by_minimality:
-        end["by_minimality"] = [join.to_dict() for join in joins]
-    if solution.stopped:
-        end["stopped"] = solution.stopped
-    if solution.partial:
-        end["partial"] = solution.partial.to_dict()
-    if solution.effort.evidence:
-        end["evidence"] = {name: dict(said) for name, said in solution.effort.evidence.items()}
-    if solution.warnings:
-        end["warnings"] = list(solution.warnings)
-    if recorded is not None and recorded.explanation is not None:
-        end["explanation"] = dict(recorded.explanation)
-    return end
+    # These fields are left out if they would say nothing.
+    more: dict[str, Any] = {
+        "onto": solution.support.onto or (recorded and recorded.onto),
+        "drives": drives,
+        "backbone": None if listed and count == 1 else backbone,
+        "levels": solution.within and [*solution.levels],
+        "minimal_listed": bool(solution.within) and listed and not solution.complete,
+        "certificate": certificate,
+        "weighed": solution.weighed,
+        "by_minimality": solution.by_minimality,
+        "stopped": solution.stopped,
+        "partial": solution.partial,
+        "evidence": effort.evidence,
+        "warnings": solution.warnings,
+        "explanation": recorded and recorded.explanation,
+    }
+    # The levels of an answer without maps are an empty list.
+    said = {name: value for name, value in more.items() if value or value == []}
+    written: dict[str, Any] = plain(end | said)
+    return written
 
 
 def table_of_maps(solution: Solution) -> str:

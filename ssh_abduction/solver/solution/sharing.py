@@ -19,15 +19,16 @@ are *one*.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any, Literal, TypeAlias
 
 from ssh_abduction.data.checks import a_text, a_whole_number
 from ssh_abduction.data.drives import Drive, DriveStep, named_steps
-from ssh_abduction.data.errors import MapError, brief, is_whole
+from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.groups import first_index_of, indices_of, numbered
 from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.data.words import counted
 
 Pair: TypeAlias = tuple[int, int]
@@ -188,10 +189,10 @@ class Backbone:
                 f"{where}: expected an object with proven and dstates, got {brief(data)}; write "
                 "it with solve --json"
             )
-        dstates = _read_shared(data["dstates"], None, steps, f"{where}: dstates")
-        of_step = dstates.always
+        read = FieldReader(where)
+        dstates = _read_shared(read, data, "dstates", steps)
         rest = {
-            sort: _read_shared(data[sort], of_step, steps, f"{where}: {sort}")
+            sort: _read_shared(read, data, sort, steps, dstates.always)
             for sort in SORTS[1:]
             if sort in data
         }
@@ -320,43 +321,31 @@ class Kept:
             self.together.update(combinations(some, 2))
 
 
-def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: str) -> Shared:
+def _read_shared(
+    read: FieldReader, data: Mapping[str, Any], sort: Sort, steps: int, of_step: Sequence[int] = ()
+) -> Shared:
     """Read what all maps share of their dstates, places, paths or courses. Raises MapError.
 
-    `data` is the part of a file about one of these. It has one number for each step or, if
-    `of_step` is given, for each dstate. `of_step` has the number of the dstate of each step.
+    The file has one number for each step or, if `of_step` is given, for each dstate. `of_step` has
+    the number of the dstate of each step.
     """
-    expected = steps if of_step is None else len(set(of_step))
-    always = data.get("always") if isinstance(data, Mapping) else None
-    if (
-        not isinstance(always, list)
-        or len(always) != expected
-        or not all(is_whole(n) and n >= 0 for n in always)
-    ):
-        raise MapError(
-            f"{where}.always: expected {expected} numbers, got {brief(always)}; write the file "
-            "with solve --json"
-        )
-    pairs, differing = data.get("sometimes"), data.get("differing", [])
-    if not isinstance(pairs, list) or not all(
-        isinstance(pair, list) and len(pair) == 2 and _are_steps(pair, steps) for pair in pairs
-    ):
-        raise MapError(
-            f"{where}.sometimes: expected pairs of steps from 0 to {steps - 1}, got "
-            f"{brief(pairs)}; write the file with solve --json"
-        )
-    if not isinstance(differing, list) or not _are_steps(differing, steps):
-        raise MapError(
-            f"{where}.differing: expected a list of steps from 0 to {steps - 1}, got "
-            f"{brief(differing)}; write the file with solve --json"
-        )
-    by_step = tuple(always if of_step is None else (always[number] for number in of_step))
-    return Shared(by_step, tuple((i, j) for i, j in pairs), tuple(differing))
-
-
-def _are_steps(values: Sequence[Any], steps: int) -> bool:
-    """Whether all values are steps of a trace with this many steps."""
-    return all(is_whole(t) and 0 <= t < steps for t in values)
+    step = read.within(0, steps - 1, f"a step from 0 to {steps - 1}")
+    pairs = f"pairs of steps from 0 to {steps - 1}"
+    count = len(set(of_step)) or steps
+    record = read.mapping(data[sort], sort)
+    shared = read.record(
+        Shared,
+        record,
+        sort,
+        always=read.exactly(count, read.whole, f"{count} numbers"),
+        sometimes=read.several(read.exactly(2, step, pairs), pairs),
+    )
+    differing = read.several(step, f"a list of steps from 0 to {steps - 1}")
+    return replace(
+        shared,
+        always=tuple(shared.always[number] for number in of_step) or shared.always,
+        untold=differing(record.get("differing", []), f"{sort}.differing"),
+    )
 
 
 def _split(together: Iterable[Pair], parts: Mapping[int, Sequence[int]]) -> Iterator[Pair]:
