@@ -47,7 +47,7 @@ from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.data.star import Gateway as Sighted
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.sources.metric.beam import Beam
-from ssh_abduction.solver.sources.metric.drives import Joining
+from ssh_abduction.solver.sources.metric.joint_drives import Joining
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

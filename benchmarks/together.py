@@ -41,7 +41,7 @@ from simulator.plans import Plan
 from ssh_abduction import SSHMap, Theory
 from ssh_abduction.data import Odometry, together
 from ssh_abduction.solver.sources.metric.beam import Beam
-from ssh_abduction.solver.sources.metric.drives import Joining
+from ssh_abduction.solver.sources.metric.joint_drives import Joining
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

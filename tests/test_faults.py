@@ -30,7 +30,7 @@ from ssh_abduction.solver.front import fault_front
 from ssh_abduction.solver.sources.exact import choosing, faulty, faulty_program
 from ssh_abduction.solver.sources.exact.blocks import Blocks
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.symbolic.machines import Explainer
+from ssh_abduction.solver.sources.symbolic.state_merging import Explainer
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import Problem
 

@@ -30,17 +30,17 @@ from ssh_abduction.solver.sources.exact import (
     labels_first,
     visit_program,
 )
-from ssh_abduction.solver.sources.exact import visits as same
+from ssh_abduction.solver.sources.exact import visit_labels as same
 from ssh_abduction.solver.sources.exact.fitting import Fitting
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
+from ssh_abduction.solver.sources.exact.visit_labels import VisitLabels
 from ssh_abduction.solver.sources.exact.visit_program import (
     FramedSides,
     VisitProgram,
     turn_facts,
     visit_facts,
 )
-from ssh_abduction.solver.sources.exact.visits import VisitLabels
 from ssh_abduction.solver.sources.symbolic.merging import merged
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log

@@ -27,8 +27,8 @@ from ssh_abduction.solver.costs.estimating import may_join_more, rival_of
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.weighed import groups_of_drives
-from ssh_abduction.solver.sources.metric.drives import Joining
 from ssh_abduction.solver.sources.metric.hypothesis import conditioned
+from ssh_abduction.solver.sources.metric.joint_drives import Joining
 from ssh_abduction.solver.sources.metric.overlay import KeptApart
 from ssh_abduction.solver.sources.metric.sights import Sights
 from ssh_abduction.solver.steps.log import Log

@@ -12,7 +12,7 @@ from ssh_abduction import Theory, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver import Search
-from ssh_abduction.solver.sources.exact import visits as same
+from ssh_abduction.solver.sources.exact import visit_labels as same
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.localising import Located, State, faced, located

@@ -22,7 +22,7 @@ from perception.places.closures import VisitMatch
 from perception.places.importing import Imported, import_log
 from perception.places.joining import join_logs
 from perception.places.local_map import CELL, Patch
-from perception.places.matching import Match, Scene
+from perception.places.matching import LocalScene, Match
 from perception.places.unrelated import DriveScenes, agreeing_matches, without_clashes
 from perception.readers.scans import RobotLog
 from perception.readers.writers import write_carmen
@@ -40,7 +40,7 @@ from ssh_abduction.robot_logs import log_maps, log_report
 from ssh_abduction.robot_logs.log_maps import BARE, map_log
 from ssh_abduction.robot_logs.log_picture import ASIDE, colour_of, laid_over
 from ssh_abduction.solver import Solution, solve
-from ssh_abduction.solver.sources.metric.drives import Joining
+from ssh_abduction.solver.sources.metric.joint_drives import Joining
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
@@ -198,7 +198,7 @@ def test_relation_that_puts_walls_into_free_space_does_not_count() -> None:
         rows, columns = np.indices((101, 101)) - 50
         far = np.maximum(abs(rows), abs(columns))
         corner = np.array([-50 * CELL, -50 * CELL])
-        rooms.append(Scene.of(Patch(far < half, far == half, far < 0, corner), np.zeros(2)))
+        rooms.append(LocalScene.of(Patch(far < half, far == half, far < 0, corner), np.zeros(2)))
 
     def matched(first: int, last: int) -> VisitMatch:
         return VisitMatch(first, last, Match(1.0, 0.0, np.zeros(2), 1.0, 0.1))

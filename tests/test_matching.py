@@ -15,7 +15,7 @@ from perception.places.closures import VisitMatch, find_closures, uncertainty
 from perception.places.distinctive import WINDOW, find_visits
 from perception.places.following import ScanMotion, Surfaces
 from perception.places.local_map import CELL, PackedPatch, Patch
-from perception.places.matching import Match, Scene, Turned, match
+from perception.places.matching import LocalScene, Match, Turned, match
 from perception.places.tracing import closure_of, to_trace
 from perception.places.track import Track, odometer_covariance, points_turned
 from perception.places.visits import Visit, Way
@@ -43,8 +43,8 @@ def patch_of(turn: float = 0.0, x: float = 0.0, y: float = 0.0, corners: object 
     return Patch(inside & ~walls, walls, np.zeros_like(inside), np.array([-8.0, -8.0]))
 
 
-def scene(patch: Patch) -> Scene:
-    return Scene.of(patch, np.zeros(2))
+def scene(patch: Patch) -> LocalScene:
+    return LocalScene.of(patch, np.zeros(2))
 
 
 @pytest.mark.parametrize(
@@ -224,9 +224,9 @@ def test_visit_is_matched_with_a_limited_number_of_earlier_ones(
     """If each visit is matched once, then with the nearest one: another pass of the same fork."""
     _, track, visits, patches = rounds()
     every = find_closures(track, visits, patches, 2 * WINDOW)
-    asked: list[Scene] = []
+    asked: list[LocalScene] = []
 
-    def counted(first: Scene, second: Turned) -> Match | None:
+    def counted(first: LocalScene, second: Turned) -> Match | None:
         asked.append(second.scene)
         return match(first, second)
 

@@ -347,7 +347,7 @@ def test_onto_counts_the_time_of_all_searches() -> None:
     """The time of all searches counts, not only that of the last one."""
     monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
     solution = solve(monday)
-    with patch.object(Watch, "elapsed", lambda watch: 7.0):
+    with patch.object(Watch, "seconds", lambda watch: 7.0):
         added = solve(Trace.from_steps("ab", ["travel"], name="tuesday"), onto=solution)
     assert added.seconds.total == 7.0
 

@@ -29,9 +29,9 @@ from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.sources.exact import choosing, labels_first, name_program, names
 from ssh_abduction.solver.sources.exact import names as named
-from ssh_abduction.solver.sources.symbolic import machines as robust
-from ssh_abduction.solver.sources.symbolic.machines import machine_labels
+from ssh_abduction.solver.sources.symbolic import state_merging as robust
 from ssh_abduction.solver.sources.symbolic.merging import dstates_merged, merged
+from ssh_abduction.solver.sources.symbolic.state_merging import machine_labels
 from ssh_abduction.solver.steps.apart import Continuations, clique
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log

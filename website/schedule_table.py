@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from ssh_abduction.solver.schedule import COST, COUNT, LATE, TABLE, Turn
+from ssh_abduction.solver.schedule import COST, COUNT, LATE, TABLE, SourceTurn
 
 PAGE = Path(__file__).parent.parent / "docs" / "reference" / "schedule.md"
 HEAD = (
@@ -26,7 +26,7 @@ COLUMNS = "| source | for which problems | share | why |"
 TITLES = {COUNT: "If maps are counted", COST: "If maps are weighed by cost", LATE: "In the end"}
 
 
-def share_of(turn: Turn) -> str:
+def share_of(turn: SourceTurn) -> str:
     """Return the share of a turn in words."""
     parts = [f"{turn.share:.0%}"] if turn.share < 1 else []
     parts += [f"by the share {turn.until:.0%}"] if turn.until < 1 else []

@@ -30,7 +30,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
 from perception.places.local_map import PackedPatch
-from perception.places.matching import MOST, Match, Scene, Turned, match
+from perception.places.matching import MOST, LocalScene, Match, Turned, match
 from perception.places.track import Array, Track, points_turned
 from perception.places.visits import Visit
 
@@ -105,8 +105,8 @@ def find_closures(
     """
 
     @lru_cache(SCENES)
-    def scene(visit: int) -> Scene:
-        return Scene.of(patches[visit], visits[visit].middle)
+    def scene(visit: int) -> LocalScene:
+        return LocalScene.of(patches[visit], visits[visit].middle)
 
     gates, corrected = _Gates(track, visits, apart), _Corrected(visits)
     found: list[VisitMatch] = []
@@ -123,7 +123,7 @@ def find_closures(
 
 
 def _closings(
-    scene: Callable[[int], Scene], asked: Sequence[tuple[int, _Gate]], last: int
+    scene: Callable[[int], LocalScene], asked: Sequence[tuple[int, _Gate]], last: int
 ) -> Iterator[VisitMatch]:
     """Match a visit with earlier ones, and yield the closures."""
     if not asked:

@@ -67,8 +67,8 @@ _MOVES = np.array(
 _Spectra = NDArray[np.complex64]
 _Floats = NDArray[np.float32]
 
-# Agreement of a wall point in a cell, for each code of a cell (`Scene`). Beyond FAR, in squared
-# cells, it no longer changes.
+# Agreement of a wall point in a cell, for each code of a cell (`LocalScene`). Beyond FAR, in
+# squared cells, it no longer changes.
 FAR = 4000
 _far = np.repeat(np.sqrt(np.arange(FAR + 1)) * CELL, 2)
 _observed = np.arange(len(_far)) % 2 > 0
@@ -94,7 +94,7 @@ class Match:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class LocalScene:
     """The local map around the middle of a place, prepared for matching."""
 
     walls: Array  # (m, 2) wall points in metres, relative to the middle
@@ -104,7 +104,7 @@ class Scene:
     shift: Array  # the middle in metres, relative to the middle of the cells
 
     @staticmethod
-    def of(patch: Patch | PackedPatch, middle: Array) -> Scene:
+    def of(patch: Patch | PackedPatch, middle: Array) -> LocalScene:
         """Prepare a patch that is centred on a middle (x, y), in metres."""
         occupied = patch.occupied
         size = len(occupied)
@@ -115,7 +115,7 @@ class Scene:
         squares = np.minimum(np.rint(np.square(far)), FAR).astype(np.uint16)
         shift = np.asarray(middle) - (patch.corner + size // 2 * CELL)
         points = (np.argwhere(walls) - size // 2) * CELL - shift
-        return Scene(points, 2 * squares + (free | walls), shift)
+        return LocalScene(points, 2 * squares + (free | walls), shift)
 
     @cached_property
     def spectra(self) -> _Spectra:
@@ -131,7 +131,7 @@ class Scene:
         codes = self.codes.ravel()[self.cells(points)]
         return _SHARP[codes].sum(axis=1), (codes & 1).sum(axis=1)
 
-    def clash(self, other: Scene, turn: float, shift: Array) -> float | None:
+    def clash(self, other: LocalScene, turn: float, shift: Array) -> float | None:
         """The share of the wall points of each scene that lie in free space of the other one.
 
         The other one is rotated by `turn` radians, and its middle is shifted by `shift` metres.
@@ -146,7 +146,7 @@ class Scene:
         seen = codes[codes & 1 > 0]
         return float((_far[seen] > CLEAR).mean()) if len(seen) >= FEW else None
 
-    def mutual(self, other: Scene, turn: float, shift: Array) -> float:
+    def mutual(self, other: LocalScene, turn: float, shift: Array) -> float:
         """The area that both scenes observed, as a share of the smaller one.
 
         The other one is rotated by `turn` radians, and its middle is shifted by `shift` metres.
@@ -183,14 +183,14 @@ class Scene:
 class Turned:
     """A scene in several rotations."""
 
-    scene: Scene  # without rotation
+    scene: LocalScene  # without rotation
     turns: Sequence[float]  # the rotations in radians, n
     # The transforms of the wall points, the blurred walls and the observed cells: (3, n, SIZE, SIZE
     # // 2 + 1).
     spectra: _Spectra
 
     @staticmethod
-    def of(scene: Scene, turns: Sequence[float]) -> Turned:
+    def of(scene: LocalScene, turns: Sequence[float]) -> Turned:
         """Rotate a scene."""
         grids = np.zeros((3, len(turns), SIDE, SIDE), np.float32)
         turned = _rotations(np.asarray(turns))
@@ -227,7 +227,7 @@ def _spread_out(at: Array) -> Array:
     return found.reshape(-1, SIDE, SIDE)
 
 
-def match(first: Scene, second: Turned) -> Match | None:
+def match(first: LocalScene, second: Turned) -> Match | None:
     """Find the rotation and shift with which the maps of two places agree best.
 
     Returns None if the maps agree nowhere, or agree equally well at very different shifts. The
@@ -273,7 +273,9 @@ def _spread(less: Array) -> float:
     return math.sqrt(float((weights * ((_X - x) ** 2 + (_Y - y) ** 2)).sum()))
 
 
-def _refined(first: Scene, second: Scene, turn: float, shift: Array) -> tuple[float, float, Array]:
+def _refined(
+    first: LocalScene, second: LocalScene, turn: float, shift: Array
+) -> tuple[float, float, Array]:
     """Improve a rotation and a shift step by step; return the score and both of them."""
     least = OVERLAP * (len(first.walls) + len(second.walls))
 

@@ -23,7 +23,7 @@ from statistics import median
 import numpy as np
 
 from perception.places.closures import KEPT, TURN, VisitMatch, is_reliable
-from perception.places.matching import Scene, Turned, match
+from perception.places.matching import LocalScene, Turned, match
 from perception.places.track import Array, Track, points_moved, points_turned
 from perception.places.visits import Visit, patches_of
 from ssh_abduction.data.groups import gathered
@@ -46,14 +46,14 @@ MATCHED = 200
 class DriveScenes:
     """The visits of a drive, prepared for matching."""
 
-    scenes: Sequence[Scene]  # the local map of each visit
+    scenes: Sequence[LocalScene]  # the local map of each visit
     poses: Array  # (n, 3) poses of the visits, as `fitted_poses` returns them
 
     @staticmethod
     def of(visits: Sequence[Visit], poses: Array) -> DriveScenes:
         """Prepare the local map of each visit."""
         pairs = zip(patches_of(visits), visits, strict=True)
-        return DriveScenes([Scene.of(patch, visit.middle) for patch, visit in pairs], poses)
+        return DriveScenes([LocalScene.of(patch, visit.middle) for patch, visit in pairs], poses)
 
 
 def closures_between(
@@ -74,7 +74,7 @@ def closures_between(
             yield replace(closing, first=closing.first + counts[a], last=closing.last + counts[b])
 
 
-def parts_of(track: Track, visits: Sequence[Visit]) -> list[int]:
+def piece_of_each(track: Track, visits: Sequence[Visit]) -> list[int]:
     """Return, for each visit, how many cuts of the track are before it."""
     scans = [visit.scan for visit in visits]
     return [int(count) for count in np.searchsorted(track.cuts, scans, "right")]
@@ -88,7 +88,7 @@ def closures_across_cuts(track: Track, visits: Sequence[Visit], poses: Array) ->
     if not track.cuts:
         return []
     some = range(0, len(visits), 1 + len(visits) // MATCHED)
-    parts = gathered(zip(parts_of(track, visits)[:: some.step], some, strict=True)).values()
+    parts = gathered(zip(piece_of_each(track, visits)[:: some.step], some, strict=True)).values()
     drives = [[visits[k] for k in part] for part in parts]
     return [
         replace(closing, first=some[closing.first], last=some[closing.last])

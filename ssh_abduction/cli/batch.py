@@ -53,7 +53,7 @@ GUARDED, OVERDUE = 1.2, 10.0
 HURRY = 0.5
 
 
-class Known(NamedTuple):
+class HandedOver(NamedTuple):
     """What is known of the answer for a trace: plain data, which another process can print."""
 
     solution: Solution
@@ -64,7 +64,7 @@ class Known(NamedTuple):
     @classmethod
     def of(
         cls, search: Search, solution: Solution, explanation: Explanation | None = None
-    ) -> Known:
+    ) -> HandedOver:
         """Collect what is known from a search and its solution."""
         found = max(search.count, len(solution.maps))
         return cls(solution, found, explanation, Warnings(search).of(solution))
@@ -145,7 +145,7 @@ class SolveQuestion(FileQuestion):
             for ssh_map in search:
                 kept += [ssh_map] if self.json else []
             explanation = why_no_map(search)
-            known = Known.of(search, search.solution(tuple(kept)), explanation)
+            known = HandedOver.of(search, search.solution(tuple(kept)), explanation)
             return self._answer(number, path, known, search.backbone)
 
     def _guarded(
@@ -162,7 +162,7 @@ class SolveQuestion(FileQuestion):
             try:
                 solution = search.snapshot(why)
                 solution = replace(solution, maps=tuple(kept) or solution.maps)
-                answer = self._answer(number, path, Known.of(search, solution))
+                answer = self._answer(number, path, HandedOver.of(search, solution))
             except Exception as error:  # without an answer, the process would seem to be killed
                 answer = self.failed(number, path, error)
             # Nobody reads the exit code of this process.
@@ -177,20 +177,20 @@ class SolveQuestion(FileQuestion):
             self.memory,
             given_up=given_up,
             known=lambda: (search.best, search.bound) if search.best else None,
-            hand_over=lambda: workers.hand_over(Known.of(search, search.so_far("time limit"))),
+            hand_over=lambda: workers.hand_over(HandedOver.of(search, search.so_far("time limit"))),
         )
 
     def rescued(self, lost: workers.Lost, path: str, *, stopped: bool) -> FileAnswer | None:
         """Implement `FileQuestion.rescued`: answer with the best map so far."""
         if lost.known is None:
             return None
-        known: Known = lost.known
+        known: HandedOver = lost.known
         why: Stop = "interrupted" if stopped else "time limit" if lost.late else "memory limit"
         known = known._replace(solution=replace(known.solution, stopped=why))
         answer = self._answer(lost.number, path, known)
         return answer if stopped else self.warned(answer, path, self.warning_of(lost))
 
-    def hurried(self, known: Known | None) -> SolveQuestion:
+    def hurried(self, known: HandedOver | None) -> SolveQuestion:
         """Implement `FileQuestion.hurried`: give the search little time."""
         return replace(self, limit=min(self.limit or HURRY, HURRY), work=None)
 
@@ -198,7 +198,7 @@ class SolveQuestion(FileQuestion):
         return replace(answer, warnings=(*answer.warnings, f"{named(path)}: {warning}"))
 
     def _answer(
-        self, number: int, path: str, known: Known, backbone: Backbone | None = None
+        self, number: int, path: str, known: HandedOver, backbone: Backbone | None = None
     ) -> FileAnswer:
         """Make the answer for a solution: its line, exit code and warnings."""
         solution, count, explanation, found = known

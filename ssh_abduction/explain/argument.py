@@ -85,7 +85,7 @@ _TURNED = (
 
 
 @dataclass(frozen=True)
-class _Line:
+class _Inferred:
     """A line of an argument: the conclusions that follow from its links and the lines before it.
 
     `group` has the links. A line without conclusions is the contradiction. A line that is
@@ -132,7 +132,7 @@ class Argument:
         clash = self._axioms.smallest_clash([self._supposed])
         self._links = sorted(clash, key=lambda link: (order.index(link[0]), link[1]))
         self._axioms.tell_of(self._named_steps())
-        self._lines: list[_Line] = []
+        self._lines: list[_Inferred] = []
         self._born: dict[clingo.Symbol, int] = {}  # the first line of each conclusion
         self._words = Words(piece, trace)
 
@@ -183,7 +183,7 @@ class Argument:
                 placed += group
                 left = [link for link in left if link not in group]
                 if supposed and not self._axioms.consistent(_active(placed), assumed):
-                    self._lines.append(_Line(group, frozenset(), supposed))
+                    self._lines.append(_Inferred(group, frozenset(), supposed))
                     return
                 known = self._axioms.consequences(_active(placed), assumed, known)
                 self._add(group, known, supposed)
@@ -217,7 +217,7 @@ class Argument:
         new = known - self._born.keys()
         if new:
             self._born.update(dict.fromkeys(new, len(self._lines)))
-            self._lines.append(_Line(group, new, supposed))
+            self._lines.append(_Inferred(group, new, supposed))
 
     # Which conclusions the argument needs
 
@@ -258,7 +258,7 @@ class Argument:
         inferences = tuple(self._inference(*line) for line in lines)
         return inferences, self._summary(goal, premises, links)
 
-    def _line_of(self, conclusion: clingo.Symbol | None) -> _Line:
+    def _line_of(self, conclusion: clingo.Symbol | None) -> _Inferred:
         """Return the line that draws a conclusion; None is the contradiction at the end."""
         return self._lines[-1 if conclusion is None else self._born[conclusion]]
 

@@ -58,7 +58,7 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
     degrees = degrees_of(turns)
     poses = drawable_poses(ssh_map)
     if poses is None:
-        return _floor_by_floor(ssh_map, _Drawing(ssh_map, degrees).layout())
+        return _floor_by_floor(ssh_map, _Tracing(ssh_map, degrees).layout())
     at = [(pose.x, pose.y, pose.heading) for pose in poses]
     first = {s.place: s.id for s in reversed(ssh_map.dstates)}  # the first dstate of each place
     spreads = tuple(pose.spread for pose in poses)
@@ -216,7 +216,7 @@ def untravelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
     ]
 
 
-class _Drawing:
+class _Tracing:
     """Computes the layout of a map without poses.
 
     Spots are those of `DState.site`. `degrees` has, for each action's name, the degrees clockwise

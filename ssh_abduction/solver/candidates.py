@@ -40,7 +40,7 @@ from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from ssh_abduction.solver.sources.metric.beam import Beam
-    from ssh_abduction.solver.sources.metric.drives import Joining
+    from ssh_abduction.solver.sources.metric.joint_drives import Joining
 
 _log = log_of(__name__)
 
@@ -132,7 +132,7 @@ class Candidates:
         trusts_drives = not (theory.lifts or theory.replace(changed=0.0).has_faults)
         if self.beam(1) is None or not theory.several_drives or not trusts_drives:
             return None
-        from ssh_abduction.solver.sources.metric.drives import Joining  # loads numpy
+        from ssh_abduction.solver.sources.metric.joint_drives import Joining  # loads numpy
 
         return Joining(self._given.problem, self._given.log)
 

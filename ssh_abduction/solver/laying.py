@@ -38,7 +38,7 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.solver.sources.metric.drives import ExistingMap
+    from ssh_abduction.solver.sources.metric.joint_drives import ExistingMap
 
 
 def can_lay(theory: Theory) -> bool:
@@ -58,7 +58,7 @@ def laid(
     to agree with the map.
     """
     from ssh_abduction.solver.costs.misfit import Misfit  # loads numpy
-    from ssh_abduction.solver.sources.metric.drives import ExistingMap
+    from ssh_abduction.solver.sources.metric.joint_drives import ExistingMap
 
     joint, theory = problem.trace, problem.theory
     judging, existing, misfit = Judging(problem), ExistingMap(old, ssh_map), Misfit(problem)

@@ -21,7 +21,7 @@ COUNT, COST, LATE = "maps are counted", "maps are weighed by cost", "after the s
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class SourceTurn:
     """The turn of a source.
 
     Attributes:
@@ -55,19 +55,19 @@ class Turn:
 
 
 TABLE = (
-    Turn(
+    SourceTurn(
         "greedy merging",
         COUNT,
         "causal theories, more than 24 steps",
         "It takes milliseconds, and clingo then only has to find a better map.",
     ),
-    Turn(
+    SourceTurn(
         "mending",
         COUNT,
         "theories with faults, more than 24 steps",
         "It finds the fewest faults by solving traces without them.",
     ),
-    Turn(
+    SourceTurn(
         "prefixes, first try",
         COUNT,
         "theories without frames, more than 24 steps",
@@ -75,7 +75,7 @@ TABLE = (
         share=0.4,
         most=0.15,
     ),
-    Turn(
+    SourceTurn(
         "prefixes, second try",
         COUNT,
         "theories without frames, more than 24 steps",
@@ -83,7 +83,7 @@ TABLE = (
         share=0.4,
         most=1.0,
     ),
-    Turn(
+    SourceTurn(
         "maps with frames",
         COUNT,
         "the same, with the speed-up `framing`",
@@ -91,84 +91,84 @@ TABLE = (
         share=0.4,
         most=30.0,
     ),
-    Turn(
+    SourceTurn(
         "exact search",
         COUNT,
         "all",
         "It proves the minimum and lists all maps: prefixes, dstates first, or names.",
     ),
-    Turn(
+    SourceTurn(
         "sketch",
         COST,
         "all",
         "There must be a map before any long source begins.",
         share=0.4,
     ),
-    Turn(
+    SourceTurn(
         "smoothing",
         COST,
         "displacements, no lifts or faults within a drive",
         "After a long way, poses that fit all closures are better than a beam.",
         until=0.3,
     ),
-    Turn(
+    SourceTurn(
         "joint drives",
         COST,
         "several drives",
         "Joining the maps of single drives is cheaper than a beam over all drives.",
         until=0.5,
     ),
-    Turn("beam of 1", COST, "up to 2,000 steps", "It finds most true maps.", until=0.7),
-    Turn(
+    SourceTurn("beam of 1", COST, "up to 2,000 steps", "It finds most true maps.", until=0.7),
+    SourceTurn(
         "beam of 4",
         COST,
         "up to 2,000 steps",
         "A map that a broad beam ends with is nearly always the best one.",
         until=0.6,
     ),
-    Turn(
+    SourceTurn(
         "beam of 16",
         COST,
         "one drive on one floor",
         "With several drives or floors, a beam of 4 keeps as many hypotheses.",
         until=0.7,
     ),
-    Turn(
+    SourceTurn(
         "beams of logs",
         COST,
         "logs of robots: all beams",
         "Smoothing has mostly found the best map there, and bounds need the work.",
         until=0.5,
     ),
-    Turn(
+    SourceTurn(
         "beams with wrong displacements",
         COST,
         "theories with `jumped`: all beams",
         "They often drop the best map. The search for wrong displacements finds it.",
         until=0.4,
     ),
-    Turn(
+    SourceTurn(
         "beam without axioms",
         COST,
         "a broad beam ended",
         "It says how much cheaper a map that breaks axioms would be.",
         until=0.8,
     ),
-    Turn(
+    SourceTurn(
         "fewest dstates, map known",
         COST,
         "a map is known, and no faults are allowed",
         "It only finds the least number of dstates, if that is easy.",
         share=0.05,
     ),
-    Turn(
+    SourceTurn(
         "fewest dstates",
         COST,
         "no map is known, or faults are allowed",
         "A map with the fewest dstates is the only one then.",
         share=0.4,
     ),
-    Turn(
+    SourceTurn(
         "forced joins",
         COST,
         "no faults, up to 2,500 steps",
@@ -176,40 +176,40 @@ TABLE = (
         share=0.4,
         most=10.0,
     ),
-    Turn(
+    SourceTurn(
         "scatter",
         COST,
         "logs of robots, no wrong displacements",
         "It adds 5 to 22 % of the cost to the bound of logs, and cannot prove a map.",
         share=0.5,
     ),
-    Turn(
+    SourceTurn(
         "wrong displacements",
         COST,
         "theories with `jumped`, more than 60 steps",
         "A local search over which displacements are wrong. No source proves such maps.",
     ),
-    Turn(
+    SourceTurn(
         "Benders cuts",
         COST,
         "all but long traces with faults",
         "Clingo lists maps by counts, and each misfit excludes many. This is the proof.",
     ),
-    Turn(
+    SourceTurn(
         "estimated rivals",
         LATE,
         "maps are weighed by cost",
         "The confidence counts rivals that no source found.",
         most=0.5,
     ),
-    Turn(
+    SourceTurn(
         "backbone",
         LATE,
         "not all minimal maps are listed",
         "What all minimal maps share needs a search of its own.",
         share=0.2,
     ),
-    Turn(
+    SourceTurn(
         "reserve",
         LATE,
         "no map is known",
@@ -220,7 +220,7 @@ TABLE = (
 TURNS = {turn.name: turn for turn in TABLE}
 
 
-def turn(name: str) -> Turn:
+def turn(name: str) -> SourceTurn:
     """Return the turn of a source, by its name."""
     return TURNS[name]
 
@@ -228,6 +228,6 @@ def turn(name: str) -> Turn:
 class Source(NamedTuple):
     """A source as a search runs it: its turn, whether it suits the problem now, and its work."""
 
-    turn: Turn
+    turn: SourceTurn
     suits: Callable[[], bool]
     run: Callable[[], None]

@@ -103,49 +103,38 @@ class Search:
         self.limits = Limits(time_limit, memory_limit, max_maps, within, work_limit)
         self._counts_work = work_limit is not None
         with counting(self._counts_work):
-            self._prepare(trace, theory, speedups, on_progress, _start)
-
-    def _prepare(
-        self,
-        trace: Trace,
-        theory: Theory | None,
-        speedups: Speedups,
-        on_progress: Callable[[Progress], None] | None,
-        _start: Start,
-    ) -> None:
-        """Settle the theory, and make the parts of the search."""
-        began, within = now(), self.limits.within
-        if on_progress is not None and not callable(on_progress):
-            raise SolverError(
-                f"on_progress: expected a function of one Progress, got {brief(on_progress)}"
-                "; give one, or None"
+            began = now()
+            if on_progress is not None and not callable(on_progress):
+                raise SolverError(
+                    f"on_progress: expected a function of one Progress, got {brief(on_progress)}"
+                    "; give one, or None"
+                )
+            before = _start.after.task.problem if _start.after else None
+            problem = settle(trace, theory, before)
+            self.theory = problem.theory
+            self._asked_weigh = theory.weigh if theory else "auto"
+            if within and self.theory.has_faults:
+                raise TheoryError(
+                    f"within: expected 0 where faults are allowed, got {within}; leave within "
+                    "out, or compare the numbers of faults (--front)"
+                )
+            check_rules(self.theory)
+            self.trace = trace
+            self.clash: range | None = None
+            self._begun = False
+            self._reasons, self._known_maps = _start.reasons, _start.known
+            self._parts = Parts(
+                problem, self.limits, checked_speedups(speedups), on_progress, _start, began
             )
-        before = _start.after.task.problem if _start.after else None
-        problem = settle(trace, theory, before)
-        self.theory = problem.theory
-        self._asked_weigh = theory.weigh if theory else "auto"
-        if within and self.theory.has_faults:
-            raise TheoryError(
-                f"within: expected 0 where faults are allowed, got {within}; leave within out, or "
-                "compare the numbers of faults (--front)"
-            )
-        check_rules(self.theory)
-        self.trace = trace
-        self.clash: range | None = None
-        self._begun = False
-        self._reasons, self._known_maps = _start.reasons, _start.known
-        self._parts = Parts(
-            problem, self.limits, checked_speedups(speedups), on_progress, _start, began
-        )
-        self._stages = Stages(self._parts, self._solve_mended, goes_on=_start.after is not None)
-        self._answer = Answer(self._parts)
-        self._weighing: Weighing | None = None
-        if self.theory.weigh == "cost":
-            from ssh_abduction.solver.costs.weighing import Weighing  # loads numpy
+            self._stages = Stages(self._parts, self._solve_mended, goes_on=_start.after is not None)
+            self._answer = Answer(self._parts)
+            self._weighing: Weighing | None = None
+            if self.theory.weigh == "cost":
+                from ssh_abduction.solver.costs.weighing import Weighing  # loads numpy
 
-            self._weighing = Weighing(self._parts)
-            self._reasons = False  # what clingo proves about minimal maps is about counts
-            self._parts.rivals.reasons = False
+                self._weighing = Weighing(self._parts)
+                self._reasons = False  # what clingo proves about minimal maps is about counts
+                self._parts.rivals.reasons = False
 
     @classmethod
     def continuing(
@@ -288,7 +277,7 @@ class Search:
         yield from self._searched()
         fall_back(parts, self._answer)
         self.clash = self.clash or late_clash(
-            parts, lambda trace, theory: self._solve_mended(trace, theory, 1, CLASHING)
+            parts, lambda trace, theory: self._solve_mended(trace, theory, 1, CLASHING, late=True)
         )
         if self._weighing is not None:
             # If this takes too long after a limit, the map has no cost in nats.
@@ -385,13 +374,13 @@ class Search:
             parts.report()
 
     def _solve_mended(
-        self, mended: Trace, theory: Theory, most: int, seconds: float
+        self, mended: Trace, theory: Theory, most: int, seconds: float, *, late: bool = False
     ) -> tuple[tuple[SSHMap, ...], bool]:
         """Solve a mended trace (its faults are corrected) within the limits of this search.
 
         The theory has no faults. At most `most` maps are listed; 0 for all. Returns the minimal
         maps (none if the trace has no map) and True; or the best map known after that time and
-        False.
+        False. If `late`, the limits of this search are over, and hold no more.
         """
         limit = max(seconds, SHORTEST)
         search = Search(
@@ -402,7 +391,7 @@ class Search:
             max_maps=most or None,
             memory_limit=self.limits.memory_limit,
             speedups=self._parts.speedups,
-            _start=Start(around=self._parts.watch),
+            _start=Start(around=None if late else self._parts.watch),
         )
         maps = tuple(search.unranked())
         if search.stopped == "interrupted":

@@ -55,6 +55,11 @@ def processor_clock(
     return clock
 
 
+def _seconds() -> float:
+    """Return the seconds on the wall clock."""
+    return time.perf_counter()
+
+
 def check_limit(name: str, unit: str, limit: object) -> None:
     """Raise SolverError if a limit is neither None nor a number above 0. Name it and its unit."""
     if (
@@ -109,7 +114,7 @@ class Watch:
         """
         self._on_tick, self._around = on_tick, around
         counts = work is not None or (clock is None and counts_work())
-        self._clock = work_done if counts else clock or time.perf_counter
+        self._clock = work_done if counts else clock or _seconds
         self._next_tick = time.perf_counter() + TICK
         self._limit = limit if work is None else work
         self._cap = limit if work is not None else None

@@ -10,7 +10,7 @@ A Viterbi pass chooses the further steps (Viterbi 1967). It explains the whole t
 that clingo found, with the cheapest faults. Clingo gets the steps at fault and those around them.
 The explanation is also a map of the whole trace, so it may be the new incumbent.
 
-The first maps of a long trace are guessed (`sources/symbolic/machines.py`), and clingo is only
+The first maps of a long trace are guessed (`sources/symbolic/state_merging.py`), and clingo is only
 asked for cheaper ones. The lower bound of a long trace comes from its blocks (`blocks.py`). For a
 short trace clingo is asked first, and maps are guessed if it does not end soon.
 """
@@ -34,7 +34,7 @@ from ssh_abduction.solver.sources.exact.faulty_program import (
     FaultyControl,
     faulty_names,
 )
-from ssh_abduction.solver.sources.symbolic.machines import (
+from ssh_abduction.solver.sources.symbolic.state_merging import (
     Explained,
     Explainer,
     PartialMachine,

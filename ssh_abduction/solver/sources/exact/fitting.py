@@ -79,6 +79,7 @@ class Fitting:
 
     def __init__(self, task: Task, asker: Asker) -> None:
         """Begin without a chart; `take` comes first."""
+        self._chart: Chart
         self.task, self._asker = task, asker
         self._framed = task.theory.star == "frame"
         # Sets of equalities of steps. In no map do all equalities of one set hold.

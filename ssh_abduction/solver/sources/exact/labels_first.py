@@ -47,7 +47,7 @@ from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Settled, Task, in_order
 from ssh_abduction.solver.sources.exact.fitting import PLACES, Fitting
 from ssh_abduction.solver.sources.exact.names import NamedLabels
-from ssh_abduction.solver.sources.exact.visits import VisitLabels
+from ssh_abduction.solver.sources.exact.visit_labels import VisitLabels
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem

@@ -50,8 +50,8 @@ from ssh_abduction.solver.sources.exact.name_program import (
     forbidden_links,
     read_names,
 )
-from ssh_abduction.solver.sources.symbolic.machines import machine_labels
 from ssh_abduction.solver.sources.symbolic.merging import dstates_merged, merged
+from ssh_abduction.solver.sources.symbolic.state_merging import machine_labels
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.chart import Chart, Link
 from ssh_abduction.theory.evidence import Equality

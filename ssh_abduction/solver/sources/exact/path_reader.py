@@ -75,7 +75,7 @@ class PathReader:
             for segment, members in self._runs.items()
             for i, _ in members
         }
-        self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
+        self._at, self._part = _Options(control, "at"), _Options(control, "course")
         self._total, self._framed = theory.path_order == "total", theory.star == "frame"
         # The literals of atoms of `before`; 0 if an atom is never true.
         self._before: dict[_Ahead, int] = {}
@@ -164,7 +164,7 @@ class PathReader:
         return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(arrived))), paths)
 
 
-class _Choices:
+class _Options:
     """Reads the atoms of a predicate that chooses, for each first argument, the other two.
 
     In each answer there is exactly one atom for each first argument.
