@@ -94,8 +94,13 @@ def _stretches(trace: Trace, ends: Sequence[int]) -> Iterator[range]:
     begins = [
         [i for i in range(t, -1, -1) if _begins_visit(trace, i)][1 : VISITS + 1] for t in ends
     ]
+    # The whole trace is no stretch: its search would look for the same clash again, without end.
     for starts in zip_longest(*begins):
-        yield from (range(i, t + 1) for i, t in zip(starts, ends, strict=True) if i is not None)
+        yield from (
+            range(i, t + 1)
+            for i, t in zip(starts, ends, strict=True)
+            if i is not None and t + 1 - i < len(trace)
+        )
 
 
 def late_clash(
