@@ -147,7 +147,7 @@ class LabellingEngine(Protocol):
         ...
 
 
-def in_order(equalities: Iterable[Equality]) -> list[Equality]:
+def in_fixed_order(equalities: Iterable[Equality]) -> list[Equality]:
     """Sort equalities, as the order of a set depends on the hashes of texts."""
     return sorted(equalities, key=lambda one: (one.first, one.second, one.of, one.holds))
 

@@ -27,7 +27,7 @@ from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.sources.exact.blocks import Blocks
-from ssh_abduction.solver.sources.exact.engine import Task, in_order
+from ssh_abduction.solver.sources.exact.engine import Task, in_fixed_order
 from ssh_abduction.solver.sources.exact.faulty_program import (
     LONG,
     FaultyAnswer,
@@ -199,7 +199,7 @@ class FaultyEngine:
                 self._control.give_around([failed])
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
-        self._control.forbidden.append(in_order(equalities))
+        self._control.forbidden.append(in_fixed_order(equalities))
         self._control.give_around(
             [step for equality in equalities for step in (equality.first, equality.second)]
         )

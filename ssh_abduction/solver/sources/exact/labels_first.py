@@ -44,7 +44,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Settled, Task, in_order
+from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Settled, Task, in_fixed_order
 from ssh_abduction.solver.sources.exact.fitting import PLACES, Fitting
 from ssh_abduction.solver.sources.exact.names import NamedLabels
 from ssh_abduction.solver.sources.exact.visit_labels import VisitLabels
@@ -223,7 +223,7 @@ class LabelsFirst:
             self._labels.forbid(labels, self._fitting.clashes(labels))
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
-        equalities = in_order(equalities)
+        equalities = in_fixed_order(equalities)
         if self._fitting:
             self._fitting.forbid(equalities)
         self._labels.forbid_together(equalities)

@@ -15,7 +15,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import number_symbols
-from ssh_abduction.solver.sources.exact.engine import Doubt, Doubts, Task, in_order
+from ssh_abduction.solver.sources.exact.engine import Doubt, Doubts, Task, in_fixed_order
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
@@ -138,7 +138,7 @@ class StepEngine:
         return None if found is None else found.map
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
-        equalities = in_order(equalities)
+        equalities = in_fixed_order(equalities)
         self._forbidden.append(equalities)
         self.asker.control.tell(facts.forbidden_equalities(equalities))
         return True
