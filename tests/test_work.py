@@ -6,12 +6,14 @@ import json
 import math
 import random
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
+from instances import maze
 
-from ssh_abduction import Theory, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.runtime.clock import counting, look_at_clock, now, work_done
@@ -43,6 +45,21 @@ def test_one_work_limit_gives_one_answer(work: float, theory: Theory) -> None:
     trace = Trace.load(ROUTE)
     first, *others = (answer_by_a_random_clock(trace, theory, work, seed) for seed in range(3))
     assert others == [first, first]
+
+
+@pytest.mark.parametrize(("seed", "work"), [(900, 0.3), (902, 0.6)])
+def test_threads_give_one_answer(seed: int, work: float) -> None:
+    """Threads wait for each other while clingo grounds, so limits are reached at other times."""
+    trace = maze(5, 5, steps=120, seed=seed).trace
+
+    def answer(_: int) -> tuple[tuple[SSHMap, ...], float | None]:
+        solution = solve(trace, work_limit=work)
+        return solution.maps, solution.effort.work
+
+    with ThreadPoolExecutor(4) as pool:
+        first, *others = pool.map(answer, range(4))
+    assert others == [first] * 3
+    assert first[1] == pytest.approx(work, abs=0.3)
 
 
 @pytest.mark.parametrize("work", [0, -1, math.nan, "much"])

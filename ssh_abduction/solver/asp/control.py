@@ -308,6 +308,7 @@ class Asker:
                     handle.resume()
                 yield answer
                 if not ahead or counts_work():
+                    self.watch.check()  # a limit of work must not stop clasp while it searches
                     handle.resume()
         if result.interrupted and most == allowed >= 0:
             self.watch.check()
@@ -329,8 +330,6 @@ class Asker:
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
         """Wait for an answer or the end; False if `until` ended the wait. May raise LimitError."""
         began = time.perf_counter()
-        if counts_work():
-            self.watch.check()  # a limit that is reached must not depend on whether this waits
         try:
             while not handle.wait(POLL):
                 self.watch.check()
