@@ -310,7 +310,7 @@ def test_lost_task_has_what_its_process_handed_over_last(
 def test_guard_lets_a_starving_search_find_its_first_map(
     known: tuple[object, ...] | None, used: float, is_late: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A second of the clock is over, of which the process had `used` seconds of the processor."""
+    """The clock shows one second. The process had the processor for `used` seconds of it."""
     monkeypatch.setattr(guard, "LATE", (1.0, 0.0))
     guarding = guard.Guard(lambda: None, limit=1.0, known=lambda: known)
     guarding._began -= 1.1

@@ -92,7 +92,7 @@ class Axioms:
         self._stop = stop
         self._refusals = 0  # constraints added so far, because evidence rejected a map
         self._conclusions: list[clingo.Symbol] = []
-        self._picked = frozenset[clingo.Symbol]()  # those of which one has to fail, in a query
+        self._picked = frozenset[clingo.Symbol]()  # in a query, one of these has to fail
         self._literals: dict[clingo.Symbol, int] = {}  # clingo's literals of atoms
         self._seen: list[_ArgumentModel] = []
         self._last_core: tuple[int, ...] = ()  # clingo's literals of the last unsat core

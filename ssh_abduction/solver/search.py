@@ -290,7 +290,7 @@ class Search:
             _reason(parts)
         _log.info(
             "ended after %.2f s%s: %s, %s%s",
-            watch.elapsed(),
+            watch.seconds(),
             f" ({self.stopped})" if self.stopped else "",
             self.status.value,
             counted(self.count, "maps"),

@@ -84,7 +84,7 @@ class Stages:
             and parts.known.status is Status.UNKNOWN
             and not self._find_minimum_soon("prefixes, second try")
         ):
-            _log.info("no minimal map after %.1f s step by step", parts.watch.elapsed())
+            _log.info("no minimal map after %.1f s step by step", parts.watch.seconds())
             if may_frame:
                 _log.info("looking for maps in which places have frames, as candidates")
                 parts.candidates.frame(parts.speedups)

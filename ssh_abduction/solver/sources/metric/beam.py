@@ -58,8 +58,8 @@ WIDER = 2
 # may crowd out others later, so each kind of beam finds maps that the other one drops.
 OTHERS, NARROW = 0.25, 4
 # With several drives or floors, it is open how they are joined. So keep up to LOST * ALIKE
-# hypotheses, of which at most ALIKE join them in the same way. Check the beam at once if it has
-# more than CROWDED times its width, so that false joins do not crowd out true ones.
+# hypotheses. At most ALIKE of them join the drives or floors in the same way. Check the beam at
+# once if it has more than CROWDED times its width, so that false joins do not crowd out true ones.
 LOST, ALIKE, CROWDED = 32, 4, 16
 # Of each earlier checked beam, keep this many hypotheses.
 SPARE = 2
