@@ -9,7 +9,6 @@ from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.output.headings import Turns
 from ssh_abduction.output.scene import (
     Disc,
     Label,
@@ -22,6 +21,7 @@ from ssh_abduction.output.scene import (
     escaped,
     scene_of,
 )
+from ssh_abduction.output.straight import Turns
 
 MARGIN = 24.0  # units of the page around the picture
 PIXELS, LARGEST = 96.0, 20.0  # units of the page in an inch, and inches of new axes at most

@@ -4,18 +4,12 @@ A dstate (distinctive state) is a place and a heading. A street is a line betwee
 a path.
 
 A map without poses has no distances, but it says to which side turns go. It is drawn with straight
-paths: first each path gets a heading (`headings`), then places are put along these headings
-(`streets`). If all turns fit right angles, the drawing is at right angles.
-
-A map with the fewest paths may contain a path that is not straight in the world. If turns would
-therefore go to a wrong side, or streets would bend, only the segments of each path are drawn
-straight. The robot travelled between the places of a segment.
+paths (`straight`). If all turns fit right angles, the drawing is at right angles.
 """
 
 from __future__ import annotations
 
 import cmath
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -25,13 +19,11 @@ import networkx as nx
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from ssh_abduction.data.maps import DState, MapPath, Pose, SSHMap
+from ssh_abduction.data.maps import MapPath, Pose, SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.output.headings import Course, Turns, degrees_of, headings_by, turns_between
-from ssh_abduction.output.streets import LOOSE, Point, StreetProgram, Streets
+from ssh_abduction.output.straight import GAP, Point, StraightDrawing, Turns, degrees_of
 
 FARTHEST = 1e7  # metres: a robot's positions are nearer than this
-GAP = 1.5  # distance in the drawing between parts of a map that nothing connects
 SAME = 1e-6  # square metres: the ends of lifts are at one position
 FLOOR_GAP = 0.25  # distance between two floors, as a share of the extent of the largest one
 
@@ -58,7 +50,8 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
     degrees = degrees_of(turns)
     poses = drawable_poses(ssh_map)
     if poses is None:
-        return _floor_by_floor(ssh_map, _Tracing(ssh_map, degrees).layout())
+        found = _straight(ssh_map, degrees) if ssh_map.places else _spread(ssh_map)
+        return _floor_by_floor(ssh_map, found)
     at = [(pose.x, pose.y, pose.heading) for pose in poses]
     first = {s.place: s.id for s in reversed(ssh_map.dstates)}  # the first dstate of each place
     spreads = tuple(pose.spread for pose in poses)
@@ -216,136 +209,24 @@ def untravelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
     ]
 
 
-class _Tracing:
-    """Computes the layout of a map without poses.
+def _straight(ssh_map: SSHMap, degrees: Mapping[str, tuple[float, float]]) -> Layout:
+    """Lay out a map with straight paths."""
+    drawing = StraightDrawing(ssh_map, degrees)
+    at, headings = drawing.positions()
+    return Layout(
+        {p: at[p] for p in ssh_map.places},
+        tuple((*at[s.site], headings[s.id]) for s in ssh_map.dstates),
+    )
 
-    Spots are those of `DState.site`. `degrees` has, for each action's name, the degrees clockwise
-    that it turns, and their weight.
-    """
 
-    def __init__(self, ssh_map: SSHMap, degrees: Mapping[str, tuple[float, float]]) -> None:
-        self.map = ssh_map
-        self.spot = [s.site for s in ssh_map.dstates]
-        self.spots = list(dict.fromkeys([*ssh_map.places, *self.spot]))
-        self.turns = list(turns_between(ssh_map, degrees, self.spot))
-        ends = [(ssh_map.dstates[s], ssh_map.dstates[x]) for s, _, x in ssh_map.links]
-        # Each path with two spots between which the robot travelled along it.
-        self.travels = {
-            (s.path, *sorted((self.spot[s.id], self.spot[x.id])))
-            for s, x in ends
-            if s.path is not None and s.path == x.path and s.place != x.place
-        }
-        # Travels between places of a path join these places to one segment.
-        self.segments: Any = nx.utils.UnionFind(
-            (path.id, place) for path in ssh_map.paths for place in path.order
-        )
-        for path, p, q in self.travels:
-            self.segments.union((path, p), (path, q))
-
-    def layout(self) -> Layout:
-        """Make four drawings, and choose the one with the fewest wrong turns and bent streets.
-
-        Two drawings keep whole paths straight, and the other two only segments. One drawing of each
-        pair has the headings that `headings_by` finds with `robust`.
-        """
-        if not self.map.places:
-            return self._spread()
-        best: tuple[dict[int, float], StreetProgram] | None = None
-        fewest = math.inf
-        for whole in (True, False):
-            courses = {s.id: self._course(s, whole) for s in self.map.dstates}
-            for robust in (True, False):
-                headings, wrong = headings_by(self.turns, courses, robust)
-                if wrong < fewest:
-                    program = StreetProgram(self.spots, self._streets(headings, whole))
-                    if wrong + program.bent < fewest:
-                        best, fewest = (headings, program), wrong + program.bent
-        assert best is not None  # the first drawing is better than `fewest`, which began as inf
-        headings, at = best[0], self._packed(best[1].put_apart())
-        return Layout(
-            {p: at[p] for p in self.map.places},
-            tuple((*at[self.spot[s.id]], headings[s.id]) for s in self.map.dstates),
-        )
-
-    def _spread(self) -> Layout:
-        """Lay out a map without places: linked dstates are near (Kamada & Kawai 1989)."""
-        graph: nx.Graph[Any] = nx.Graph()
-        graph.add_nodes_from(s.id for s in self.map.dstates)
-        floor = [s.floor for s in self.map.dstates]
-        graph.add_edges_from(
-            (s, x) for s, _, x in self.map.links if s != x and floor[s] == floor[x]
-        )
-        graph.add_edges_from(pairwise([min(part) for part in nx.connected_components(graph)]))
-        found = (
-            nx.kamada_kawai_layout(graph) if len(graph) > 1 else dict.fromkeys(graph, (0.0, 0.0))
-        )
-        at = np.array([found[s.id] for s in self.map.dstates])
-        nearest = max(float(np.min(pdist(at))), 1e-6) if len(at) > 1 else 1.0
-        return Layout({}, tuple((float(x), float(y), None) for x, y in at / nearest))
-
-    def _course(self, s: DState, whole: bool) -> tuple[Course, float]:
-        """The course of a dstate, and the angle from the course to the dstate in radians, 0 or pi.
-
-        A course is drawn straight: the whole path if `whole` is True, otherwise a part of it.
-        """
-        if s.path is None:
-            return (-1 - s.id,), 0.0
-        course = (s.path,) if whole else (s.path, *self.segments[s.path, self.spot[s.id]])
-        return course, 0.0 if s.direction == 1 else math.pi
-
-    def is_walked(self, source: int, target: int) -> bool:
-        """Whether a link between two dstates leads to another spot on the same floor."""
-        same = self.map.dstates[source].floor == self.map.dstates[target].floor
-        return same and self.spot[source] != self.spot[target]
-
-    def _streets(self, headings: Mapping[int, float], whole: bool) -> Streets:
-        """Find the streets to draw, each with its heading and its share of the costs.
-
-        They join neighbours on paths. If only segments are straight, the robot's travels along
-        paths are streets, too. In a map without paths, all travels are streets.
-        """
-        # The heading of direction +1 of each path at each of its spots.
-        facing = {
-            (s.path, self.spot[s.id]): headings[s.id] + (0.0 if s.direction == 1 else math.pi)
-            for s in reversed(self.map.dstates)
-        }
-        streets: dict[tuple[int, int], tuple[float, float]] = {}
-        for path in self.map.paths:
-            pairs = list(pairwise(path.order))
-            if not whole:
-                index = {place: i for i, place in enumerate(path.order)}
-                ends = [(p, q) for h, p, q in self.travels if h == path.id and {p, q} <= {*index}]
-                pairs[:0] = sorted((p, q) if index[p] < index[q] else (q, p) for p, q in ends)
-            for p, q in pairs:
-                is_travelled = whole or (path.id, *sorted((p, q))) in self.travels
-                way = facing.get((path.id, p), facing.get((path.id, q), 0.0))
-                if is_travelled or (p, q) not in streets:
-                    streets[p, q] = way, 1.0 if is_travelled else LOOSE
-        if not self.map.paths:
-            for s, _, x in self.map.links:
-                if self.is_walked(s, x):
-                    streets.setdefault((self.spot[s], self.spot[x]), (headings[s], 1.0))
-        # Of two streets between the same spots keep the one with the larger share, else the first.
-        kept: dict[tuple[int, int], tuple[float, float]] = {}
-        for (p, q), street in sorted(streets.items(), key=lambda street: -street[1][1]):
-            if (q, p) not in kept:
-                kept[p, q] = street
-        return kept
-
-    def _packed(self, at: Mapping[int, Point]) -> dict[int, Point]:
-        """Move parts that no street connects side by side. The first spot is at (0, 0)."""
-        graph: nx.Graph[Any] = nx.Graph()
-        graph.add_nodes_from(self.spots)
-        graph.add_edges_from(pair for path in self.map.paths for pair in pairwise(path.order))
-        if not self.map.paths:
-            links = ((s, x) for s, _, x in self.map.links if self.is_walked(s, x))
-            graph.add_edges_from((self.spot[s], self.spot[x]) for s, x in links)
-        packed: dict[int, Point] = {}
-        right = 0.0
-        for part in nx.connected_components(graph):
-            members = [p for p in self.spots if p in part]
-            (x0, y0), left = at[members[0]], min(at[p][0] for p in members)
-            shift = right - left if packed else -x0
-            packed |= {p: (at[p][0] + shift, at[p][1] - y0) for p in members}
-            right = max(packed[p][0] for p in members) + GAP
-        return packed
+def _spread(ssh_map: SSHMap) -> Layout:
+    """Lay out a map without places: linked dstates are near (Kamada & Kawai 1989)."""
+    graph: nx.Graph[Any] = nx.Graph()
+    graph.add_nodes_from(s.id for s in ssh_map.dstates)
+    floor = [s.floor for s in ssh_map.dstates]
+    graph.add_edges_from((s, x) for s, _, x in ssh_map.links if s != x and floor[s] == floor[x])
+    graph.add_edges_from(pairwise([min(part) for part in nx.connected_components(graph)]))
+    found = nx.kamada_kawai_layout(graph) if len(graph) > 1 else dict.fromkeys(graph, (0.0, 0.0))
+    at = np.array([found[s.id] for s in ssh_map.dstates])
+    nearest = max(float(np.min(pdist(at))), 1e-6) if len(at) > 1 else 1.0
+    return Layout({}, tuple((float(x), float(y), None) for x, y in at / nearest))
