@@ -53,7 +53,7 @@ SAID_BY = {
     "ssh_abduction/online/move_graph.py": ("route",),
     "ssh_abduction/online/routes.py": ("route",),
     "ssh_abduction/solver/search.py": ("solve",),
-    "ssh_abduction/solver/start.py": ("solve",),
+    "ssh_abduction/solver/parts.py": ("solve",),
     "ssh_abduction/theory": WITH_THEORY,
 }
 # The verbs of modules of the command line that have several. Each has some of the options that the

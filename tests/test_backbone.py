@@ -33,8 +33,8 @@ from ssh_abduction.solver import (
     Start,
     Status,
     find_backbone,
-    map_list,
 )
+from ssh_abduction.solver import search as search_module
 from ssh_abduction.solver.solution.result import summary_of
 from ssh_abduction.solver.solution.sharing import Backbone, Shared
 from ssh_abduction.solver.sources.exact import choosing, prefixes
@@ -112,7 +112,7 @@ def test_backbone_equals_the_brute_force(data: st.DataObject) -> None:
         patch.object(prefixes, "FIRST_PREFIX", first_prefix),
         patch.object(choosing, "FEW_STEPS", few_steps),
         stepwise(frame_after),
-        patch.multiple(map_list, ONE_MORE=0.0, ONE_MORE_SHARE=0.0),
+        patch.multiple(search_module, ONE_MORE=0.0, ONE_MORE_SHARE=0.0),
     ):
         every = solve(trace, theory, max_maps=None, time_limit=LIMIT)
         first = solve(trace, theory, max_maps=1, time_limit=LIMIT)

@@ -16,10 +16,10 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import each_heeding, heeding, look_at_clock
-from ssh_abduction.solver import Status, candidates, fallback
+from ssh_abduction.solver import Status, candidates, search
+from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.geometry import ranking
 from ssh_abduction.solver.geometry.fit import fit
-from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.sources.symbolic.merging import Merging
 from ssh_abduction.solver.sources.symbolic.sketch import Sketch
 from ssh_abduction.solver.steps.certificate import Certificate
@@ -128,7 +128,7 @@ def test_solve_returns_a_consistent_map_at_the_time_limit(
 ) -> None:
     """The checker refuses sketches with wrong returns, as displacements contradict them."""
     trace = driven(maze(4, 4, steps=steps, seed=steps, stars=stars).trace, wrong)
-    with patch.multiple(fallback, OVERTIME=100.0):
+    with patch.multiple(search, OVERTIME=100.0):
         solution = solve(trace, time_limit=1e-6)
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
     assert check(trace, solution.maps[0], solution.theory) == ()
@@ -146,7 +146,7 @@ def test_solve_tries_another_sketch_if_the_checker_refuses_one() -> None:
     trace = driven(maze(3, 3, steps=60, seed=1).trace, 4)
     theory = settle(trace).theory
     assert check(trace, sketched(trace, theory), theory)
-    with patch.multiple(fallback, OVERTIME=100.0), turn_with("sketch", share=1.0):
+    with patch.multiple(search, OVERTIME=100.0), turn_with("sketch", share=1.0):
         assert solve(trace, time_limit=1e-6).maps
 
 
@@ -161,7 +161,7 @@ def test_each_sketch_gets_a_share_of_the_time() -> None:
         raise over_time
 
     with (
-        patch.multiple(fallback, OVERTIME=100.0),
+        patch.multiple(search, OVERTIME=100.0),
         patch.object(candidates.Candidates, "_go_on_to_end", deaf),
         patch.object(candidates.Candidates, "_offer_separate", lambda _: None),
         patch.object(candidates.Candidates, "beam", lambda *_: None),

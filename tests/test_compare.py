@@ -37,7 +37,7 @@ from ssh_abduction.rivals.listing import PairInMap
 from ssh_abduction.rivals.questions import Matter, Question, deciding, independent
 from ssh_abduction.solver import find_backbone
 from ssh_abduction.solver import search as searching
-from ssh_abduction.solver.map_list import Priced
+from ssh_abduction.solver.parts import Priced
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 from ssh_abduction.solver.solution.weighed import Rival, Weighed
 

@@ -16,7 +16,7 @@ from benchmarks.instances import maze
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import Status, fallback
+from ssh_abduction.solver import Status, search
 from ssh_abduction.solver.asp.own_rules import can_be_asked, keeps_own_rules
 from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond, sketches_of
@@ -65,7 +65,7 @@ def test_greedy_map_satisfies_all_axioms(world: str) -> None:
 @pytest.mark.parametrize("world", ["junction of 5", "any angles"])
 def test_greedy_map_is_returned_at_the_time_limit(world: str) -> None:
     trace = drive(world, 0, 30)
-    with patch.multiple(fallback, OVERTIME=100.0):
+    with patch.multiple(search, OVERTIME=100.0):
         solution = solve(trace, time_limit=1e-6)
     assert solution.status is Status.FEASIBLE
     assert check(trace, solution.maps[0], solution.theory) == ()
@@ -114,7 +114,7 @@ def test_map_that_satisfies_own_rules_is_returned_at_the_limit(
 ) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
     theory = ruled(KEPT[name], Theory.topological().replace(**fault))
-    with patch.multiple(fallback, OVERTIME=100.0):
+    with patch.multiple(search, OVERTIME=100.0):
         solution = solve(trace, theory, time_limit=1e-6)
     assert solution.status is Status.FEASIBLE
     assert check(trace, solution.maps[0], Theory.topological()) == ()
@@ -123,7 +123,7 @@ def test_map_that_satisfies_own_rules_is_returned_at_the_limit(
 @pytest.mark.parametrize("name", BROKEN)
 def test_map_that_breaks_own_rules_is_not_returned(name: str) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
-    with patch.multiple(fallback, OVERTIME=100.0):
+    with patch.multiple(search, OVERTIME=100.0):
         assert solve(trace, ruled(BROKEN[name], Theory.topological()), time_limit=1e-6).maps == ()
 
 

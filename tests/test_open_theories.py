@@ -28,7 +28,7 @@ from ssh_abduction.data import TheoryError
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.solver import Search, Status
-from ssh_abduction.solver.judging import InternalError
+from ssh_abduction.solver.board import InternalError
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst

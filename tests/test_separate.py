@@ -13,7 +13,7 @@ from ssh_abduction import SSHMap, Theory, Trace, check, solve
 from ssh_abduction.cli import main, outcome
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.solver import Search, Status, candidates
-from ssh_abduction.solver.fallback import clash_in
+from ssh_abduction.solver.search import clash_in
 from ssh_abduction.solver.sources.symbolic.sketched import separate_map
 from ssh_abduction.theory.settle import settle
 

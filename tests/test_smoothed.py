@@ -21,10 +21,9 @@ from ssh_abduction.solver import Search
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.costs import beams
 from ssh_abduction.solver.costs.weighing import Weighing
-from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.parts import Limits, Parts, Start
 from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.solver.sources.metric.overlay import Overlay, smoothed_map
-from ssh_abduction.solver.start import Limits, Start
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import Speedups

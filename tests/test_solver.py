@@ -33,7 +33,8 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.solver import Progress, Search, Status, fallback, map_list
+from ssh_abduction.solver import Progress, Search, Status
+from ssh_abduction.solver import search as search_module
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.sources.exact import labels_first, prefixes, readable
 from ssh_abduction.solver.sources.exact.engine import Task
@@ -683,7 +684,7 @@ def test_map_of_a_prefix_is_extended_at_the_time_limit() -> None:
         with (
             patch.object(labels_first, "AT_ONCE", 250),
             patch.object(LabelsFirst, "grow", interrupted),
-            patch.object(fallback, "INTERRUPTED", 100.0),
+            patch.object(search_module, "INTERRUPTED", 100.0),
         ):
             found[most] = solve(trace)
         assert found[most].stopped == "interrupted"
@@ -705,7 +706,7 @@ def test_search_ends_after_the_last_requested_map() -> None:
 
     with (
         patch.object(LabelsFirst, "maps_of_cost", slow),
-        patch.object(map_list, "ONE_MORE", 0.01),
+        patch.object(search_module, "ONE_MORE", 0.01),
     ):
         search = Search(trace, Theory.causal(), max_maps=every.count, time_limit=100.0)
         asked_for = search.solution(tuple(search))

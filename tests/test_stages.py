@@ -15,7 +15,7 @@ from turns import STEPWISE, stepwise
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import fallback
+from ssh_abduction.solver import search
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.solver.sources.exact.engine import Task
@@ -104,7 +104,7 @@ def test_online_mapper_without_time_has_a_small_map() -> None:
     """The sketch is small enough. The robot was in 27 dstates."""
     trace = maze(3, 3, steps=120, seed=0).trace
     mapper = OnlineMapper(trace.steps[0].view or "", time_limit=0.01)
-    with stepwise(-1.0), patch.object(fallback, "OVERTIME", 100.0):
+    with stepwise(-1.0), patch.object(search, "OVERTIME", 100.0):
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):
             answer = mapper.observe(action, step.view or "")
     assert answer.cost

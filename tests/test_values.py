@@ -47,7 +47,7 @@ from ssh_abduction.data import (
 from ssh_abduction.learning.learner import LearnerError
 from ssh_abduction.robot_logs import log_report
 from ssh_abduction.solver import Certificate, Progress, Search, Status
-from ssh_abduction.solver.judging import InternalError
+from ssh_abduction.solver.board import InternalError
 from ssh_abduction.theory import Speedups
 
 ROOT = Path(__file__).parent.parent

@@ -21,7 +21,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Search, Start, Status
 from ssh_abduction.solver.asp.facts import most_paths
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.sources.exact import choosing, name_program, names
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.fitting import Fitting

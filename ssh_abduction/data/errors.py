@@ -2,7 +2,7 @@
 
 Errors of bad input are also ValueErrors, so that programs without knowledge of this package can
 catch them. If something is missing on the machine, the error is a plain AbductionError. A defect of
-this package is an `InternalError` (`solver/judging.py`). Reaching a limit of time or memory is no
+this package is an `InternalError` (`solver/board.py`). Reaching a limit of time or memory is no
 error: `Solution.stopped` names the limit.
 """
 

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp.own_rules import check_rules as check_rules
     from ssh_abduction.solver.asp.workers import end_all as end_all
     from ssh_abduction.solver.asp.workers import in_process as in_process
+    from ssh_abduction.solver.board import InternalError as InternalError
+    from ssh_abduction.solver.board import Judging as Judging
     from ssh_abduction.solver.costs.estimating import maps_apart as maps_apart
     from ssh_abduction.solver.costs.misfit import Misfit as Misfit
     from ssh_abduction.solver.derived_regions import find_regions as find_regions
@@ -36,11 +38,11 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.front import fault_front as fault_front
     from ssh_abduction.solver.geometry.fit import fit as fit
     from ssh_abduction.solver.geometry.ranking import Ranking as Ranking
-    from ssh_abduction.solver.judging import InternalError as InternalError
-    from ssh_abduction.solver.judging import Judging as Judging
     from ssh_abduction.solver.obeying import obeyed as obeyed
     from ssh_abduction.solver.obeying import with_correction_warnings as with_correction_warnings
     from ssh_abduction.solver.obeying import with_names as with_names
+    from ssh_abduction.solver.parts import Limits as Limits
+    from ssh_abduction.solver.parts import Start as Start
     from ssh_abduction.solver.search import Search as Search
     from ssh_abduction.solver.solution.recorded import drives_in as drives_in
     from ssh_abduction.solver.solution.recorded import trace_in as trace_in
@@ -64,8 +66,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.sources.symbolic.sketch import Sketch as Sketch
     from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond as sketch_beyond
     from ssh_abduction.solver.sources.symbolic.sketch import sketches_of as sketches_of
-    from ssh_abduction.solver.start import Limits as Limits
-    from ssh_abduction.solver.start import Start as Start
     from ssh_abduction.solver.steps.certificate import RESTS_ON as RESTS_ON
     from ssh_abduction.solver.steps.certificate import Certificate as Certificate
     from ssh_abduction.solver.steps.log import observation as observation

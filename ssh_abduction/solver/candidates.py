@@ -21,9 +21,7 @@ from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import STARVED, LimitError, Watch, processor_clock
-from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.known import Known
-from ssh_abduction.solver.projecting import projected
+from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.schedule import turn
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.symbolic.sketch import Sketch, sketch_beyond, sketches_of

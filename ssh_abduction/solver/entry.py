@@ -23,9 +23,10 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import counting, heeding
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
-from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.obeying import obeyed, with_correction_warnings, with_names
 from ssh_abduction.solver.onto import Solving, solve_onto
+from ssh_abduction.solver.parts import Limits, Start
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
@@ -33,7 +34,6 @@ from ssh_abduction.solver.sources.exact.backbone import prove_backbone
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine, may_name
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.readable import StepEngine
-from ssh_abduction.solver.start import Limits, Start
 from ssh_abduction.solver.values import Progress
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import ALL, Speedups, row

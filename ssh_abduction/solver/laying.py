@@ -23,11 +23,11 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of
 from ssh_abduction.solver.costs.estimating import may_join_more, rival_of, rivals_of
 from ssh_abduction.solver.derived_regions import Deriving
 from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning
-from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.schedule import turn
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
@@ -64,7 +64,7 @@ def laid(
     judging, existing, misfit = Judging(problem), ExistingMap(old, ssh_map), Misfit(problem)
     maps = _joint_maps(existing, old, ssh_map, trace, problem)
     found = sorted(((misfit.nats_of(m), m) for m in maps), key=lambda pair: pair[0])
-    while found and not judging.accepts_grown(
+    while found and not judging.accepts(
         found[0][1], since if _is_kept(ssh_map, found[0][1]) else 0
     ):
         del found[0]

@@ -30,7 +30,7 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.faulty import FaultyEngine
 from ssh_abduction.solver.sources.metric.wrong_displacements import wrong_displacements

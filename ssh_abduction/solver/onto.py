@@ -35,7 +35,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.limits import EARLY, LimitError, Watch
-from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.laying import Digest, can_lay, laid, unproven
 from ssh_abduction.solver.obeying import obeyed, with_names
 from ssh_abduction.solver.solution.recorded import Support

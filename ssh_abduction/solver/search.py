@@ -1,20 +1,21 @@
 """The search for the minimal maps of a trace: a stream of maps that ends with a `Solution`.
 
-A search makes a first map at once. Then it finds the minimal cost in stages (`stages.py`), and
-lists the maps of that cost (`map_list.py`). If it is stopped earlier, it makes some map of the
-whole trace (`fallback.py`). `exact/prefixes.py` proves that it is enough to solve the first
-steps.
+One loop runs the sources of the schedule, one after the other, each for its share of the work. If
+maps are counted, `counting.py` has the sources, else `costs/weighing.py`. Then the maps of least
+cost are listed. If the search is stopped earlier, it makes some map of the whole trace.
+`exact/prefixes.py` proves that it is enough to solve the first steps.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
-from itertools import groupby
-from typing import TYPE_CHECKING, get_args
+from itertools import groupby, zip_longest
+from typing import TYPE_CHECKING, Any, get_args
 
 from ssh_abduction.data.checks import an_instance, one_of
 from ssh_abduction.data.drives import Drive, drives_of, with_floors, with_named_faults
@@ -22,33 +23,35 @@ from ssh_abduction.data.errors import SolverError, TheoryError, brief
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
-from ssh_abduction.runtime.clock import counting, each_counting, each_heeding, heeding, now
+from ssh_abduction.runtime.clock import (
+    counting,
+    counts_work,
+    each_counting,
+    each_heeding,
+    each_looking,
+    heeding,
+    now,
+)
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.runtime.threads import one_thread
-from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import EARLY, LimitError, StageTimeError, Stop, Watch
 from ssh_abduction.solver.asp.own_rules import check_rules
-from ssh_abduction.solver.fallback import (
-    CLASHING,
-    OVERTIME,
-    best_map,
-    clash_in,
-    fall_back,
-    late_clash,
-    overtime,
-)
+from ssh_abduction.solver.board import projected
+from ssh_abduction.solver.candidates import has_quick_map
+from ssh_abduction.solver.counting import Counting
 from ssh_abduction.solver.geometry.ranking import Ranking
-from ssh_abduction.solver.map_list import Priced, by_count, listed
-from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.parts import Answer, Limits, Parts, Priced, Start
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.sharing import Backbone
-from ssh_abduction.solver.stages import Stages
-from ssh_abduction.solver.start import ANEW, Limits, Start
+from ssh_abduction.solver.sources.exact.choosing import FEW_STEPS
 from ssh_abduction.solver.values import Bound, Cost, Grounding, Progress, Status
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups
 from ssh_abduction.theory.theory import Theory
+
+if TYPE_CHECKING:
+    from ssh_abduction.solver.costs.weighing import Weighing
 
 # The time limit of a search for the maps of a mended trace is at least this many seconds.
 SHORTEST = 0.05
@@ -57,8 +60,20 @@ SHORTEST = 0.05
 REASONING = 5.0
 # After a limit, the poses and the cost of the best map may each take at least this many seconds.
 LEAST_WEIGHING = 0.2
-if TYPE_CHECKING:
-    from ssh_abduction.solver.costs.weighing import Weighing
+# After the last map asked for, look for one more for this many seconds, or for this share of the
+# time so far if that is more. If clingo proves that there is none, the list is complete.
+ONE_MORE = 1.0
+ONE_MORE_SHARE = 0.1
+# If the time limit stops a search, making and checking a map may take OVERTIME seconds more, plus
+# OVERTIME_SHARE of the limit.
+OVERTIME, OVERTIME_SHARE = 0.5, 0.05
+# After Ctrl-C, or at the memory limit, it may take this many seconds.
+INTERRUPTED = 0.6
+# If a stopped search has no map, it looks for a clash in stretches of this many steps, for at most
+# CLASHING seconds. A short stretch takes a few hundredths of a second.
+STRETCHES, CLASHING = (2, 3, 4, 6, 8, 12), 0.5
+# After these, it looks in stretches of whole visits to places, of up to VISITS visits.
+VISITS = 12
 
 COUNTED = (
     "weigh: maps are counted instead of weighed, as no displacements are used whose misfit could "
@@ -97,7 +112,7 @@ class Search:
         work_limit: float | None = None,
         speedups: Speedups = ALL,
         on_progress: Callable[[Progress], None] | None = None,
-        _start: Start = ANEW,
+        _start: Start | None = None,
     ) -> None:
         checked_trace(trace)
         self.limits = Limits(time_limit, memory_limit, max_maps, within, work_limit)
@@ -109,7 +124,8 @@ class Search:
                     f"on_progress: expected a function of one Progress, got {brief(on_progress)}"
                     "; give one, or None"
                 )
-            before = _start.after.task.problem if _start.after else None
+            begin = _start or Start()
+            before = begin.after.task.problem if begin.after else None
             problem = settle(trace, theory, before)
             self.theory = problem.theory
             self._asked_weigh = theory.weigh if theory else "auto"
@@ -122,11 +138,12 @@ class Search:
             self.trace = trace
             self.clash: range | None = None
             self._begun = False
-            self._reasons, self._known_maps = _start.reasons, _start.known
+            self._reasons, self._known_maps = begin.reasons, begin.known
             self._parts = Parts(
-                problem, self.limits, checked_speedups(speedups), on_progress, _start, began
+                problem, self.limits, checked_speedups(speedups), on_progress, begin, began
             )
-            self._stages = Stages(self._parts, self._solve_mended, goes_on=_start.after is not None)
+            goes_on = begin.after is not None
+            self._counting = Counting(self._parts, self._solve_mended, goes_on=goes_on)
             self._answer = Answer(self._parts)
             self._weighing: Weighing | None = None
             if self.theory.weigh == "cost":
@@ -303,18 +320,10 @@ class Search:
         try:
             _begin_with(self._known_maps, parts, self._weighing)
             with heeding(watch.check):
-                self._stages.make_first_map()
-                if self._weighing is None:
-                    self._stages.find_minimum()
-                else:
-                    self._weigh(self._weighing)
-            with closing(
-                self._weighing.maps()
-                if self._weighing
-                else by_count(parts, self._stages.mended_maps)
-            ) as found:  # clingo has to stop before it is asked again
-                maps = listed(parts, found, keeps_time=self._reasons)
-                yield from each_heeding(watch.check, maps)
+                self._find_least()
+            maps = (self._weighing or self._counting).maps()
+            with closing(maps):  # clingo has to stop before it is asked again
+                yield from each_heeding(watch.check, listed(parts, maps, keeps_time=self._reasons))
         except StageTimeError:
             is_listed = known.count == self.limits.most
             known.stopped = "maps limit" if is_listed else parts.limit_reached
@@ -328,50 +337,69 @@ class Search:
         finally:
             parts.end_clingo()
 
-    def _weigh(self, weighing: Weighing) -> None:
-        """Find the maps of least cost: guess some, find one with the fewest dstates, then prove."""
-        watch = self._parts.watch
+    def _find_least(self) -> None:
+        """Find the least counts, or cost, of the maps."""
+        parts = self._parts
+        # Some map by greedy merging: clingo then has to find a better one.
+        if self.status is not Status.OPTIMAL and len(self.trace) > FEW_STEPS:
+            parts.candidates.merge()
+        if self._weighing is None:
+            self._run(self._counting.sources())
+            return
+        # The matrices are small: threads of BLAS would mostly wait for each other.
+        with one_thread("blas"):
+            self._run(self._weighed_sources(self._weighing), self._weighing)
 
-        def maps_of(trace: Trace, theory: Theory) -> tuple[tuple[SSHMap, ...], bool]:
-            return self._solve_mended(trace, theory, 1, watch.left())
+    def _weighed_sources(self, weighing: Weighing) -> Iterator[Source]:
+        """Yield the sources of a search that weighs maps: guesses, the fewest dstates, proofs."""
+        parts, watch = self._parts, self._parts.watch
 
         def clashes() -> bool:
             twos = (range(t, t + 2) for t in range(len(self.trace) - 1))
-            self.clash = clash_in(self.trace, self.theory, twos, maps_of)
+            self.clash = clash_in(
+                self.trace,
+                self.theory,
+                twos,
+                lambda trace, theory: self._solve_mended(trace, theory, 1, watch.left()),
+            )
             return self.clash is not None
 
-        # The matrices are small: threads of BLAS would mostly wait for each other.
-        with one_thread("blas"):
-            # 1. Some map, so that there always is one.
-            if watch.left() > 0:
-                self._parts.candidates.sketch(turn("sketch").work(watch))
-                weighing.keep_best()
-            # 2. Maps of little cost, by guesses.
-            self._run(weighing.guesses(clashes), weighing)
-            # 3. The least number of dstates.
-            is_enough = weighing.best is not None and not self.theory.has_faults
-            fewest = turn("fewest dstates, map known" if is_enough else "fewest dstates")
-            self._run([Source(fewest, lambda: True, self._stages.find_fewest)], weighing)
-            if self._parts.known.status is Status.UNSATISFIABLE:
-                return
-            # 4. The proof. One map more than wanted shows that not all are listed.
-            most = self.limits.most and self.limits.most + 1
-            weighing.of_labels = lambda trace, theory, s: self._solve_mended(trace, theory, most, s)
-            weighing.begin_proof()
-            self._run(weighing.proofs(), weighing)
+        def find_fewest() -> None:
+            try:
+                self._run(self._counting.sources())
+            except LimitError as limit:
+                if limit.reason != "no proof":
+                    raise
 
-    def _run(self, sources: Iterable[Source], weighing: Weighing) -> None:
+        # 1. Some map, so that there always is one.
+        if watch.left() > 0:
+            parts.candidates.sketch(turn("sketch").work(watch))
+            weighing.keep_best()
+        # 2. Maps of little cost, by guesses.
+        yield from weighing.guesses(clashes)
+        # 3. The least number of dstates.
+        is_enough = weighing.best is not None and not self.theory.has_faults
+        fewest = turn("fewest dstates, map known" if is_enough else "fewest dstates")
+        yield Source(fewest, lambda: True, find_fewest)
+        # 4. The proof. One map more than wanted shows that not all are listed.
+        most = self.limits.most and self.limits.most + 1
+        weighing.of_labels = lambda trace, theory, s: self._solve_mended(trace, theory, most, s)
+        weighing.begin_proof()
+        yield from weighing.proofs()
+
+    def _run(self, sources: Iterable[Source], weighing: Weighing | None = None) -> None:
         """Run sources one after the other, each within its turn, while a map may be found."""
         parts, watch = self._parts, self._parts.watch
         for source in sources:
-            if self.status is Status.UNSATISFIABLE or not source.suits():
-                continue
-            _log.debug("%s", source.turn.name)
-            with suppress(StageTimeError), watch.stage(source.turn.ends(watch)):
-                source.run()
-            if parts.known.status is not Status.UNSATISFIABLE:
-                weighing.keep_best()
-            parts.report()
+            if source.suits():
+                _log.debug("%s", source.turn.name)
+                with suppress(StageTimeError), watch.stage(source.turn.ends(watch)):
+                    source.run()
+                if weighing is not None and self.status is not Status.UNSATISFIABLE:
+                    weighing.keep_best()
+                parts.report()
+            if self.status is Status.UNSATISFIABLE:
+                return
 
     def _solve_mended(
         self, mended: Trace, theory: Theory, most: int, seconds: float, *, late: bool = False
@@ -382,16 +410,14 @@ class Search:
         maps (none if the trace has no map) and True; or the best map known after that time and
         False. If `late`, the limits of this search are over, and hold no more.
         """
-        limit = max(seconds, SHORTEST)
+        limits: dict[str, Any] = self.limits.of_part(max(seconds, SHORTEST))
         search = Search(
             mended,
             theory,
-            time_limit=None if self._counts_work or limit == math.inf else limit,
-            work_limit=limit if self._counts_work else None,
             max_maps=most or None,
-            memory_limit=self.limits.memory_limit,
             speedups=self._parts.speedups,
             _start=Start(around=None if late else self._parts.watch),
+            **limits,
         )
         maps = tuple(search.unranked())
         if search.stopped == "interrupted":
@@ -509,3 +535,180 @@ def _with_names(ssh_map: SSHMap, trace: Trace, drives: Sequence[Drive]) -> SSHMa
 def _late(parts: Parts) -> float:
     """Return the seconds left to fit and weigh a map after a limit, on a busy machine too."""
     return max(overtime(parts), LEAST_WEIGHING)
+
+
+def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterator[Priced]:
+    """Yield the maps asked for, each with its preferred counts, after a check.
+
+    The clock of the search stops while the caller works with a map. `found` has the minimal maps,
+    and then maps that cost more. If `keeps_time`, some time is kept for finding the backbone later.
+    """
+    known, watch, most = parts.known, parts.watch, parts.limits.most
+    if known.status is Status.OPTIMAL:
+        _log.info("minimal maps cost %s; they are listed", _cost_in_words(parts))
+        kept = turn("backbone").share if keeps_time else 0.0
+        ends = (1 - kept) * (watch.elapsed() + watch.left()) if kept else math.inf
+        ends = ends if ends > watch.elapsed() else math.inf
+        watch.stage_ends = ends
+        for ssh_map, cost in _without_repeats(found, parts.task.theory):
+            if most and known.count == most:
+                known.stopped = "maps limit"
+                return
+            parts.judging.pass_map(ssh_map, parts.engine.size, watch.elapsed())
+            # Take the first map as the best one. The answer gives its counts as the cost.
+            known.best = known.best if known.count else ssh_map
+            known.count += 1
+            note(parts, ssh_map, cost)
+            parts.report()
+            watch.stop()
+            yield ssh_map, cost
+            watch.start()
+            # Clasp ends its search for one more map by its limit of conflicts if work is counted.
+            if known.count == most and not watch.counts_work:
+                spent = watch.elapsed()
+                watch.stage_ends = min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent))
+    known.complete = True
+
+
+def _without_repeats(found: Iterator[Priced], theory: Theory) -> Iterator[Priced]:
+    """Yield each map once, reduced to what the theory speaks of."""
+    given: set[SSHMap] = set()
+    for ssh_map, cost in found:
+        if theory.has_paths:
+            yield ssh_map, cost
+        elif (shown := projected(ssh_map, theory)) not in given:
+            given.add(shown)
+            yield shown, cost
+
+
+def note(parts: Parts, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
+    """Add a map to the known minimal maps (`parts.rivals`), if it is minimal."""
+    if parts.known.status is Status.OPTIMAL and cost == parts.known.cost:
+        parts.rivals.add(ssh_map, cost)
+
+
+def _cost_in_words(parts: Parts) -> str:
+    """Return the cost of minimal maps in words."""
+    cost = parts.known.best_cost
+    if cost is None:
+        return "nothing that is counted"
+    return ", ".join(counted(v, k) for k, v in cost.to_dict().items())
+
+
+def fall_back(parts: Parts, answer: Answer) -> None:
+    """Make some map of the whole trace if none is known, and prove a bound from distinct steps.
+
+    If the search was not stopped, or has proven its minimum, do nothing. The map, the bound and the
+    status go to `parts.known`.
+    """
+    known = parts.known
+    if not known.stopped or known.status is Status.OPTIMAL:
+        return
+    parts.watch.start()  # what is done after the limit counts, too
+    with suppress(KeyboardInterrupt):
+        parts.candidates.sketch(overtime(parts))
+    answer.count_apart()
+    if known.best is not None and known.status is Status.UNKNOWN:
+        known.status = Status.FEASIBLE
+
+
+def clash_in(
+    trace: Trace,
+    theory: Theory,
+    stretches: Iterable[range],
+    maps_of: Callable[[Trace, Theory], tuple[Sequence[SSHMap], bool]],
+) -> range | None:
+    """Find a stretch of consecutive steps that has no map by itself. Then the trace has no map.
+
+    `maps_of` solves a trace, and returns some maps and whether the answer is proven. Returns None
+    if there is no such stretch, or if the theory allows faults. Also None if it has rules of the
+    user, which may hold only for the whole trace.
+    """
+    if theory.has_faults or theory.rules:
+        return None
+    counting = theory.replace(weigh="count")
+    bare = counting.replace(displacement="none")
+    for found in each_looking(stretches):
+        *steps, last = trace.steps[found.start : found.stop]
+        if any(step.action and step.action.starts for step in steps):
+            continue
+        piece = Trace((*steps, replace(last, action=None)), odometry=trace.odometry)
+        # The axiom one_pose compares the first steps of visits. So a stretch of several visits
+        # must begin with a whole one.
+        is_one_visit = not any(_begins_visit(trace, t) for t in found[1:])
+        axioms = counting if is_one_visit or _begins_visit(trace, found.start) else bare
+        part = axioms.of_steps(found.start, len(found))
+        if has_quick_map(piece, part):
+            continue
+        maps, proven = maps_of(piece, part)
+        if proven and not maps:
+            return found
+    return None
+
+
+def _begins_visit(trace: Trace, step: int) -> bool:
+    """Whether a visit to a place begins at a step."""
+    return step == 0 or trace.actions[step - 1].kind != "turn"
+
+
+def _stretches(trace: Trace, ends: Sequence[int]) -> Iterator[range]:
+    """List stretches of steps that may clash, the shortest first. Each ends at one of `ends`."""
+    for length in STRETCHES:
+        yield from (range(max(t + 1 - length, 0), t + 1) for t in ends if length < len(trace))
+    begins = [
+        [i for i in range(t, -1, -1) if _begins_visit(trace, i)][1 : VISITS + 1] for t in ends
+    ]
+    # The whole trace is no stretch: its search would look for the same clash again, without end.
+    for starts in zip_longest(*begins):
+        yield from (
+            range(i, t + 1)
+            for i, t in zip(starts, ends, strict=True)
+            if i is not None and t + 1 - i < len(trace)
+        )
+
+
+def late_clash(
+    parts: Parts, maps_of: Callable[[Trace, Theory], tuple[Sequence[SSHMap], bool]]
+) -> range | None:
+    """Look for a short clash if a stopped search has no map.
+
+    A clash is consecutive steps that have no map by themselves. It may end at a step that
+    contradicted a sketch, or at a step that the theory asserts to be at the dstate or place of an
+    earlier one. `maps_of` is as in `clash_in`. `parts.known` gets the status if there is a clash.
+    """
+    known, task, clash = parts.known, parts.task, None
+    if known.best is not None or not known.stopped or known.status is not Status.UNKNOWN:
+        return None
+    # While a robot drives, the theory may already assert something about later steps.
+    said = [max(pair) for pair in (*task.theory.same, *task.theory.same_place)]
+    ends = dict.fromkeys((*parts.candidates.contradicting, *said))
+    stretches = _stretches(task.trace, [end for end in ends if end < len(task.trace)])
+    part = Watch().part(CLASHING, None if counts_work() else time.thread_time)
+    with suppress(LimitError, KeyboardInterrupt), heeding(part.check):
+        clash = clash_in(task.trace, task.theory, stretches, maps_of)
+    if clash is not None:
+        known.status, known.complete, known.stopped = Status.UNSATISFIABLE, True, None
+    return clash
+
+
+def best_map(parts: Parts) -> Iterator[Priced]:
+    """If no map was yielded yet, check the best known map and yield it with its cost."""
+    known, watch = parts.known, parts.watch
+    watch.start()
+    if known.status in (Status.FEASIBLE, Status.OPTIMAL) and not known.count and known.best:
+        with suppress(LimitError), heeding(Watch().part(overtime(parts)).check):
+            parts.judging.pass_map(known.best, parts.engine.size, watch.elapsed())
+        watch.stop()
+        known.count = 1
+        note(parts, known.best, known.cost)
+        yield known.best, known.cost
+    watch.stop()
+
+
+def overtime(parts: Parts) -> float:
+    """Return the seconds that are left to make a map without a search, or to check one."""
+    limits = parts.limits
+    limit = limits.time_limit if limits.work_limit is None else limits.work_limit
+    if parts.known.stopped != parts.limit_reached or limit is None:
+        return INTERRUPTED
+    return max(parts.watch.left() + OVERTIME_SHARE * limit + OVERTIME, 0.0)

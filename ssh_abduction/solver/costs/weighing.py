@@ -41,6 +41,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError
+from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.costs import scatter
 from ssh_abduction.solver.costs.beams import Beams
 from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of, misfit_of
@@ -56,11 +57,7 @@ from ssh_abduction.solver.costs.estimating import (
 from ssh_abduction.solver.costs.forced import Forcing
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.equations import spreads_of
-from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.known import Known
-from ssh_abduction.solver.map_list import Priced
-from ssh_abduction.solver.parts import Parts
-from ssh_abduction.solver.projecting import projected
+from ssh_abduction.solver.parts import Parts, Priced
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.solution.weighed import CHANCE, EQUAL, IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine

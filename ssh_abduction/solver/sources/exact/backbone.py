@@ -32,7 +32,7 @@ from itertools import combinations
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
-from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 from ssh_abduction.solver.sources.exact.engine import Doubt, Engine, LabellingEngine, Settled, Task
 from ssh_abduction.solver.sources.exact.readable import StepEngine, paths_needed

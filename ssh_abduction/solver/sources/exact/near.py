@@ -16,8 +16,7 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.control import Asker
-from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.known import Known
+from ssh_abduction.solver.board import Judging, Known
 from ssh_abduction.solver.sources.exact.choosing import step_engine
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes

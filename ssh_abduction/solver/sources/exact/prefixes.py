@@ -50,8 +50,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
-from ssh_abduction.solver.judging import Judging
-from ssh_abduction.solver.known import Known
+from ssh_abduction.solver.board import Judging, Known
 from ssh_abduction.solver.sources.exact.engine import Engine, Task
 from ssh_abduction.solver.sources.exact.readable import StepEngine, paths_needed
 from ssh_abduction.solver.steps.log import Outcome, Replay

@@ -1,13 +1,16 @@
-"""Check the maps of a search by the checker, which shares no code with the encodings.
+"""The board of a search: what is known about the maps of a trace, and the judge of its maps.
 
-Checking every step of a long trace, or every map of a long list, would take longer than finding the
-maps. So checks get only a share of the search time. The first maps are always checked, at least for
-the steps that clingo was given. Later maps are checked if the share is not used up.
+Only here does a map become an answer. A map is reduced to what the theory speaks of, and judged by
+the checker, which shares no code with the encodings. Checking every step of a long trace, or every
+map of a long list, would take longer than finding the maps. So checks get only a share of the
+search time. The first maps are always checked, at least for the steps that clingo was given. Later
+maps are checked if the share is not used up.
 """
 
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from functools import cached_property
 
 from ssh_abduction.checker.checker import AXIOMS, Violation, check, unchecked, violations
@@ -15,9 +18,12 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import now
+from ssh_abduction.solver.asp.limits import Stop
 from ssh_abduction.solver.asp.own_rules import can_be_asked, keeps_own_rules
+from ssh_abduction.solver.values import Bound, Cost, Found, Status, cost_as_counted
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.theory import Theory
 
 # Optional checks take at most SHARE of the search time plus BEYOND seconds.
 SHARE = 0.1
@@ -28,6 +34,70 @@ A_STEP = 5e-6  # seconds that the checker takes for a step, until the first chec
 # Without these axioms a dstate may have several places, courses or headings, but a map shows only
 # one. So the checker cannot judge it.
 UNSHOWN = frozenset({"one_place", "one_course", "one_heading", "gateway_heading"})
+
+
+class Known:
+    """What is known about the maps of a trace.
+
+    Attributes:
+        best: The best map of the whole trace; None if there is none.
+        cost: The preferred counts of the best map, the most important one first; () without one.
+        bound: Proven lower bounds on the counts of any map.
+        lower: A lower bound on the preferred counts of every map, proven on a prefix; None if there
+            is none.
+        partial: The map of a prefix that was found last; None before that.
+        complete: Whether all maps were given: all minimal ones and, with `within`, all others that
+            it asks for.
+        count: The number of maps given to the caller.
+        refused: For each kind of evidence, by name, how many sets of equalities it rejected.
+    """
+
+    def __init__(self, theory: Theory) -> None:
+        self.status = Status.UNKNOWN
+        self.best: SSHMap | None = None
+        self.cost: tuple[int, ...] = ()
+        self.bound = Bound()
+        self.lower: tuple[int, ...] | None = None
+        self.partial: SSHMap | None = None
+        self.complete = False
+        self.count = 0
+        self.refused: dict[str, int] = {}
+        self._stopped: Stop | None = None
+        self._theory = theory
+
+    @property
+    def stopped(self) -> Stop | None:
+        """Why the search ended before all maps were given; None if they were."""
+        return None if self.complete else self._stopped
+
+    @stopped.setter
+    def stopped(self, why: Stop | None) -> None:
+        self._stopped = why
+
+    def is_better(self, found: Found) -> bool:
+        """Whether a map of the trace, or of a prefix, costs less than the best map so far."""
+        return self.best is None or found.cost < self.cost
+
+    def keep(self, found: Found, labels: tuple[int, ...]) -> None:
+        """Make a map, perhaps of the first steps, the best one. `labels` is for the whole trace."""
+        self.best, self.cost = replace(found.map, dstate_at=labels), found.cost
+
+    def raise_bound(self, proven: int | None) -> None:
+        """Raise the lower bound on the count that is minimised first, if `proven` is larger."""
+        first = self._theory.priorities[0] if self._theory.priorities else None
+        if first and proven is not None and proven > (getattr(self.bound, first) or 0):
+            self.bound = replace(self.bound, **{first: proven})
+
+    def raise_lower(self, cost: tuple[int, ...]) -> None:
+        """Raise the lower bound on the cost of all maps to the least cost for the first steps."""
+        self.raise_bound(cost[0] if cost else None)
+        if self.lower is None or cost > self.lower:
+            self.lower = cost
+
+    @property
+    def best_cost(self) -> Cost | None:
+        """The counts of the best map; None if there is no map."""
+        return None if self.best is None else cost_as_counted(self.best, self.cost, self._theory)
 
 
 class InternalError(AbductionError):
@@ -84,22 +154,21 @@ class Judging:
         others = unchecked(self._theory.replace(rules=()))
         return not others and own.isdisjoint(AXIOMS) and can_be_asked(self._theory)
 
-    def accepts(self, ssh_map: SSHMap) -> bool:
-        """Whether a map of the whole trace satisfies all axioms and agrees with all evidence."""
-        accepted = self.accepts_grown(ssh_map, 0)
-        self._accepted = ssh_map if accepted else self._accepted
-        return accepted
+    def accepts(self, ssh_map: SSHMap, since: int = 0) -> bool:
+        """Whether a map of the whole trace satisfies all axioms and agrees with all evidence.
 
-    def accepts_grown(self, ssh_map: SSHMap, since: int) -> bool:
-        """Accept a map as `accepts` does. The evidence accepted its first `since` steps already."""
+        The evidence accepted its first `since` steps already.
+        """
         if not self.can_accept:
             return False
         self.broken = next(violations(self._trace, ssh_map, self._theory, since), None)
-        return (
+        accepted = (
             self.broken is None
             and self.allows_grown(self._trace, ssh_map, since)
             and keeps_own_rules(self._problem, ssh_map)
         )
+        self._accepted = ssh_map if accepted else self._accepted
+        return accepted
 
     def pass_map(self, ssh_map: SSHMap, prefix: int, elapsed: float) -> None:
         """Check a map of the whole trace before it is given, as far as there is time.
@@ -114,7 +183,8 @@ class Judging:
         if self.has_time_for(steps, elapsed) or (self._judged < ALWAYS and not shows_all):
             self._check(ssh_map, steps)
         elif self._judged < ALWAYS:
-            self._check(_of_first_steps(ssh_map, prefix), prefix)
+            first = replace(ssh_map, dstate_at=ssh_map.dstate_at[:prefix], starts=(), faults=())
+            self._check(first, prefix)
             self._look_at_sample(ssh_map, prefix)
         self._judged += 1
 
@@ -166,13 +236,9 @@ class Judging:
         )
 
 
-def _of_first_steps(ssh_map: SSHMap, steps: int) -> SSHMap:
-    """Cut the labels of a map to the first steps. These steps must show all dstates and links."""
-    return SSHMap(
-        ssh_map.dstate_at[:steps],
-        ssh_map.dstates,
-        ssh_map.links,
-        ssh_map.places,
-        ssh_map.paths,
-        ssh_map.excused,
-    )
+def projected(ssh_map: SSHMap, theory: Theory) -> SSHMap:
+    """Return the map without paths if no axiom of the theory says which paths there are."""
+    if theory.has_paths or not any(s.path is not None for s in ssh_map.dstates):
+        return ssh_map
+    dstates = tuple(replace(s, path=None, direction=None) for s in ssh_map.dstates)
+    return replace(ssh_map, dstates=dstates, paths=(), excused=())
