@@ -298,7 +298,7 @@ class World:
         path = a_path("path", path, SimulatorError)
         text = read_file(path, LARGEST, "a readable world", SimulatorError)
         try:
-            data = parse_json(text.decode("utf-8"))
+            data = parse_json(text)
         except ValueError as error:
             raise SimulatorError(
                 f"{named(path)}: expected a world in JSON, got something else "

@@ -174,7 +174,7 @@ def test_batch_prints_one_line_a_trace_in_order(
         "steps given to clingo"
     )
     assert broken.startswith(
-        "broken.jsonl: error: broken.jsonl:2: line: expected one JSON object, got broken JSON"
+        "broken.jsonl: error: broken.jsonl:2: line: expected JSON, got broken JSON"
     )
     assert quick.startswith("quick.jsonl: optimal: 8 dstates, 4 places, 4 paths; 1 minimal map;")
     assert missing.startswith("missing.jsonl: error: missing.jsonl: expected a readable trace file")
@@ -211,7 +211,7 @@ def test_batch_json_lines_equal_single_json_objects(
         assert {**line, "seconds": None} == {"trace": path, **data, "seconds": None}
     assert [*broken] == ["trace", "status", "error"]
     assert (broken["trace"], broken["status"]) == ("broken.jsonl", "error")
-    assert broken["error"].startswith("broken.jsonl:2: line: expected one JSON object")
+    assert broken["error"].startswith("broken.jsonl:2: line: expected JSON")
     (traces / "maps.json").write_text(json.dumps(lines[1]))
     assert main(["check", "maps.json", "quick.jsonl"]) == 0  # a line is what the other verbs read
 

@@ -121,7 +121,7 @@ def test_new_name_or_gateway_replaces_the_old_one() -> None:
         ("names:\n- {name: a, place: monday:1}\n- {name: a, region: monday:1}\n", "another name"),
         ("names:\n- {name: a, place: monday:1}\n- {name: b, place: monday:1}\n", "one name for"),
         ("names:\n- {name: a}\n", r"names\[0\]: expected one of place, path, region"),
-        ("names:\n- {name: a, place: p4}\n", r"names\[0\].place: expected a drive, a colon"),
+        ("names:\n- {name: a, place: p4}\n", r"names\[0\]: step: expected a drive, a colon"),
         ("names: kitchen\n", "names: expected a list"),
         ("names:\n- {name: a, place: monday:1}\nnames: []\n", "'names' twice, first in line"),
         ("same:\n- [monday:1]\n", r"same\[0\]: expected two steps"),

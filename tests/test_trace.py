@@ -109,7 +109,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "no version": (['{"format": "ssh-trace"}', LAST], "1: version: expected 1, got None"),
     "header of another type": (["[1, 2]", LAST], "1: line: expected a JSON object"),
-    "header alone": ([HEADER], "2: step: expected at least one"),
+    "header alone": ([HEADER], " expected at least one step"),
     "name that is no text": (
         ['{"format": "ssh-trace", "version": 1, "name": 3}', LAST],
         "1: name: expected a text",
@@ -128,7 +128,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "number of a million digits": (
         [HEADER, '{"view": ' + "1" * 10**6 + "}"],
-        "2: line: expected one JSON object, got a number",
+        "2: line: expected JSON, got a number",
     ),
     "no view": ([HEADER, '{"action": "travel"}', LAST], "2: view: expected"),
     "view of another type": (
@@ -253,15 +253,15 @@ BAD: dict[str, tuple[list[str], str]] = {
     "negative index": ([HEADER, '{"image": -1}'], "2: image: expected an index"),
     "broken JSON": (
         [HEADER, STEP, '{"view": "b"'],
-        "3: line: expected one JSON object, got broken JSON at column 13",
+        "3: line: expected JSON, got broken JSON at column 13",
     ),
     "two objects on a line": (
         [HEADER, LAST + LAST],
-        "2: line: expected one JSON object, got broken JSON",
+        "2: line: expected JSON, got broken JSON",
     ),
     "a field twice": (
         [HEADER, '{"view": "a", "view": "b"}'],
-        "2: line: expected one JSON object, got the field 'view' twice",
+        "2: line: expected JSON, got the field 'view' twice",
     ),
     "empty line inside": ([HEADER, STEP, "", LAST], "3: line: expected a step, got an empty line"),
     "a number on a line": ([HEADER, "5"], "2: line: expected a JSON object in braces, got 5"),
@@ -275,7 +275,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "nested too deeply": (
         [HEADER, '{"view": "a", "x": ' + "[" * 10**5 + "]" * 10**5 + "}"],
-        "2: line: expected one JSON object, got one nested",
+        "2: line: expected JSON, got one nested",
     ),
 }
 
@@ -297,7 +297,7 @@ def test_broken_json_error_names_the_line(tmp_path: Path) -> None:
     path = written(tmp_path, HEADER, *[STEP] * 4709, '{"view": "a", "action": travel}', LAST)
     with pytest.raises(
         TraceError,
-        match=r"trace\.jsonl:4711: line: expected one JSON object, got broken JSON at column 25",
+        match=r"trace\.jsonl:4711: line: expected JSON, got broken JSON at column 25",
     ):
         Trace.load(path)
 

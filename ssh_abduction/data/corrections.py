@@ -39,11 +39,11 @@ from ssh_abduction.data.checks import (
     one_of,
 )
 from ssh_abduction.data.drives import Drive, drives_of, fingerprints_of, step_name, step_of
-from ssh_abduction.data.errors import MapError, TraceError, brief, is_writable, named
+from ssh_abduction.data.errors import MapError, TraceError, brief, is_writable, named, said_of
 from ssh_abduction.data.files import json_line, parse_yaml, read_file, save_file
 from ssh_abduction.data.map_parts import NAMED, Name, region_of, thing_named
 from ssh_abduction.data.maps import SSHMap, checked_map
-from ssh_abduction.data.schema import FieldReader
+from ssh_abduction.data.schema import FieldReader, only_known
 from ssh_abduction.data.star import near_quarter, star_to_json, with_gateway
 from ssh_abduction.data.step import SEEN
 from ssh_abduction.data.trace import Trace, checked_trace
@@ -84,6 +84,12 @@ class Naming:
     step: str
     note: str | None = None
 
+    def __post_init__(self) -> None:
+        one_of("kind", self.kind, NAMED, MapError)
+        object.__setattr__(self, "name", _a_line("name", self.name).strip())
+        object.__setattr__(self, "step", _a_step(self.step))
+        _a_note(self.note)
+
     def __str__(self) -> str:
         return f"name {brief(self.name)} of the {self.kind} of {self.step}"
 
@@ -103,6 +109,18 @@ class Said:
     steps: tuple[str, str]
     note: str | None = None
 
+    def __post_init__(self) -> None:
+        one_of("kind", self.kind, ASSERTIONS, MapError)
+        if not isinstance(self.steps, tuple | list) or len(self.steps) != 2:
+            raise MapError(
+                f"expected two steps, such as [monday:12, tuesday:3], got {brief(self.steps)}; "
+                "name two"
+            )
+        object.__setattr__(self, "steps", tuple(map(_a_step, self.steps)))
+        if self.steps[0] == self.steps[1]:
+            raise MapError(f"expected two different steps, got {self.steps[0]} twice; name another")
+        _a_note(self.note)
+
     def __str__(self) -> str:
         return f"{self.kind}: {self.steps[0]}, {self.steps[1]}"
 
@@ -121,6 +139,19 @@ class Passage:
     is_open: bool
     seen: tuple[tuple[str, float], ...]
     note: str | None = None
+
+    def __post_init__(self) -> None:
+        a_flag("is_open", self.is_open, MapError)
+        ways = []
+        for i, at in enumerate(a_list("seen", self.seen, MapError)):
+            if not isinstance(at, tuple) or len(at) != 2:
+                raise MapError(
+                    f"seen[{i}]: expected a step and degrees, such as ('monday:12', 90.0), got "
+                    f"{brief(at)}; give both"
+                )
+            ways.append((_a_step(at[0]), a_number(f"seen[{i}]", at[1], MapError) % 360))
+        object.__setattr__(self, "seen", tuple(ways))
+        _a_note(self.note)
 
     def __str__(self) -> str:
         sights = ", ".join(f"{direction_in_words(way)} at {step}" for step, way in self.seen)
@@ -193,10 +224,9 @@ class Corrections:
         Raises:
             MapError: Another place, path or region has this name, or an argument is wrong.
         """
-        one_of("kind", kind, NAMED, MapError)
-        said = Naming(_a_name(name), kind, _a_step("step", step))
+        said = Naming(name, kind, step)
         # Keep the order: the first one of several names of a place counts.
-        names = [said if (n.kind, n.step) == (kind, step) else n for n in self.names]
+        names = [said if (n.kind, n.step) == (kind, said.step) else n for n in self.names]
         return replace(self, names=(*names, *([] if said in names else [said])))
 
     def with_pair(self, kind: str, first: str, second: str) -> Corrections:
@@ -212,13 +242,7 @@ class Corrections:
         Raises:
             MapError: An argument is wrong.
         """
-        one_of("kind", kind, ASSERTIONS, MapError)
-        said = Said(kind, (_a_step("first", first), _a_step("second", second)))
-        if said.steps[0] == said.steps[1]:
-            raise MapError(
-                f"second: expected a step other than {first}, got it twice; name two different "
-                "steps"
-            )
+        said = Said(kind, (first, second))
         about = [other for other in self.pairs if set(other.steps) == set(said.steps)]
         new = () if any(other.kind == kind for other in about) else (said,)
         wrong = [other for other in about if other.kind in _AGAINST[kind]]
@@ -235,17 +259,7 @@ class Corrections:
         Raises:
             MapError: An argument is wrong.
         """
-        a_flag("is_open", is_open, MapError)
-        ways = []
-        for i, at in enumerate(a_list("seen", seen, MapError)):
-            if not isinstance(at, tuple) or len(at) != 2:
-                raise MapError(
-                    f"seen[{i}]: expected a step and degrees, such as ('monday:12', 90.0), got "
-                    f"{brief(at)}; give both"
-                )
-            way = a_number(f"seen[{i}]", at[1], MapError)
-            ways.append((_a_step(f"seen[{i}]", at[0]), way % 360))
-        passage = Passage(is_open, tuple(ways))
+        passage = Passage(is_open, tuple(a_list("seen", seen, MapError)))
         kept = [said for said in self.gateways if not set(said.seen) & set(passage.seen)]
         return replace(self, gateways=(*kept, passage))
 
@@ -461,23 +475,29 @@ def checked_corrections(value: object) -> Corrections:
     return an_instance("corrections", value, Corrections, MapError, mend=mend)
 
 
-def _a_step(field: str, step: object) -> str:
+def _a_step(step: object) -> str:
     """Return the name of a step, such as "monday:12". Raise MapError for another text."""
-    text = a_text(field, step, MapError, mend="name a step, such as monday:12")
+    text = a_text("step", step, MapError, mend="name a step, such as monday:12")
     drive, _, number = text.rpartition(":")
     if not (drive and number.isascii() and number.isdecimal() and is_writable(text)):
         raise MapError(
-            f"{field}: expected a drive, a colon and a step, such as monday:12, got {brief(text)}; "
+            f"step: expected a drive, a colon and a step, such as monday:12, got {brief(text)}; "
             "name one"
         )
+    return f"{drive}:{int(number)}"
+
+
+def _a_line(field: str, value: object) -> str:
+    """Return a text on one line. Raise MapError for other values, or if the text is empty."""
+    text = a_text(field, value, MapError)
+    if not text.strip() or not text.isprintable():
+        raise MapError(f"{field}: expected a text on one line, got {brief(text)}; give one")
     return text
 
 
-def _a_name(name: object) -> str:
-    text = a_text("name", name, MapError, mend="give a name such as kitchen").strip()
-    if not text or not text.isprintable():
-        raise MapError(f"name: expected a name such as kitchen, got {brief(name)}; give one")
-    return text
+def _a_note(note: object) -> None:
+    if note is not None:
+        _a_line("note", note)
 
 
 FILE = "corrections.yaml"  # the name of the file beside a map
@@ -563,30 +583,32 @@ def to_yaml(corrections: Corrections) -> str:
     """Write names and corrections as YAML. `from_yaml` reads them."""
     import yaml  # loads slowly
 
+    said = corrections
     data: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
-        "drives": dict(corrections.drives),
-        "names": [{"name": n.name, n.kind: n.step, **_note(n)} for n in corrections.names],
+        "drives": dict(said.drives),
+        "names": [{"name": n.name, n.kind: n.step} | only_known(note=n.note) for n in said.names],
     }
     for kind in ASSERTIONS:
+        pairs = [pair for pair in said.pairs if pair.kind == kind]
         data[kind] = [
-            {"steps": [*said.steps], "note": said.note} if said.note else [*said.steps]
-            for said in corrections.pairs
-            if said.kind == kind
+            {"steps": [*pair.steps], "note": pair.note} if pair.note else [*pair.steps]
+            for pair in pairs
         ]
-    data["gateways"] = []
-    for gateway in corrections.gateways:
-        seen = {step: direction_in_words(way) for step, way in gateway.seen}
-        data["gateways"].append({"open" if gateway.is_open else "closed": seen, **_note(gateway)})
+    data["gateways"] = [
+        {
+            "open" if gateway.is_open else "closed": {
+                step: direction_in_words(way) for step, way in gateway.seen
+            }
+        }
+        | only_known(note=gateway.note)
+        for gateway in said.gateways
+    ]
     kept = {name: value for name, value in data.items() if value or name == "drives"}
     kept = json.loads(json_line(kept))  # YAML knows no texts of numpy
     how: dict[str, Any] = {"sort_keys": False, "allow_unicode": True, "default_flow_style": None}
     return str(yaml.safe_dump(kept, width=100, **how))
-
-
-def _note(said: Naming | Passage) -> dict[str, str]:
-    return {"note": said.note} if said.note else {}
 
 
 def from_yaml(text: str | bytes, source: str = "corrections") -> Corrections:
@@ -606,93 +628,63 @@ class _CorrectionsReader(FieldReader):
     def corrections(self, data: object, source: str) -> Corrections:
         """Convert the data of a file."""
         fields = ("format", "version", "drives", "names", *ASSERTIONS, "gateways")
-        record = self._object(data, "file", fields)
+        record = self._only(data, "file", fields)
         if record.get("format") != FORMAT:
             raise self.wrong("format", f'"{FORMAT}"', record.get("format"))
         if record.get("version") != str(VERSION):
             expected = f"{VERSION} (another one is of another ssh-abduction)"
             raise self.wrong("version", expected, record.get("version"))
         record = {name: value for name, value in record.items() if value}  # others say nothing
-        drives = self._object(record.get("drives", {}), "drives")
+        each = partial(self.each, record, optional=True)
         return Corrections(
-            {name: self._text(mark, f"drives.{name}") for name, mark in drives.items()},
-            self.each(record, "names", self._naming, optional=True),
-            tuple(
-                said
-                for kind in ASSERTIONS
-                for said in self.each(record, kind, partial(self._said, kind), optional=True)
-            ),
-            self.each(record, "gateways", self._passage, optional=True),
+            self.values(self.text)(record.get("drives", {}), "drives"),
+            each("names", self._naming),
+            tuple(said for kind in ASSERTIONS for said in each(kind, partial(self._said, kind))),
+            each("gateways", self._passage),
             source,
         )
 
     def _naming(self, value: object, where: str) -> Naming:
-        record = self._object(value, where, ("name", *NAMED, "note"))
+        record = self._only(value, where, ("name", *NAMED, "note"))
         kinds = [kind for kind in NAMED if kind in record]
         if len(kinds) != 1:
             raise self.wrong(where, f"one of {', '.join(NAMED)}", value)
-        name = self._text(record.get("name"), f"{where}.name").strip()
-        step = self._step(record[kinds[0]], f"{where}.{kinds[0]}")
-        return Naming(name, kinds[0], step, self._note(record, where))
+        return self._made(Naming, where, record, record.get("name"), kinds[0], record[kinds[0]])
 
     def _said(self, kind: str, value: object, where: str) -> Said:
-        note, steps = None, value
-        if isinstance(value, Mapping):
-            record = self._object(value, where, ("steps", "note"))
-            note, steps = self._note(record, where), record.get("steps")
-        if not isinstance(steps, list) or len(steps) != 2:
-            raise self.wrong(where, "two steps, such as [monday:12, tuesday:3]", value)
-        first, second = (self._step(step, f"{where}[{i}]") for i, step in enumerate(steps))
-        if first == second:
-            raise self.wrong(where, "two different steps", value)
-        return Said(kind, (first, second), note)
+        record = value if isinstance(value, Mapping) else {"steps": value}
+        self._only(record, where, ("steps", "note"))
+        return self._made(Said, where, record, kind, record.get("steps"))
 
     def _passage(self, value: object, where: str) -> Passage:
-        record = self._object(value, where, ("open", "closed", "note"))
+        record = self._only(value, where, ("open", "closed", "note"))
         if ("open" in record) == ("closed" in record):
             raise self.wrong(where, "one of open, closed", value)
         state = "open" if "open" in record else "closed"
-        field, seen = f"{where}.{state}", record[state]
-        if not seen or not isinstance(seen, Mapping):
-            raise self.wrong(field, "steps and directions, such as monday:12: left", seen)
-        ways = ((self._step(s, field), self._way(w, f"{field}.{s}")) for s, w in seen.items())
-        return Passage(state == "open", tuple(ways), self._note(record, where))
+        if not (seen := record[state]) or not isinstance(seen, Mapping):
+            expected = "steps and directions, such as monday:12: left"
+            raise self.wrong(f"{where}.{state}", expected, seen)
+        with said_of(f"{self.where}: {where}.{state}", MapError):
+            ways = tuple((step, direction(way)) for step, way in seen.items())
+        return self._made(Passage, where, record, state == "open", ways)
 
-    def _way(self, value: object, where: str) -> float:
-        text = self._text(value, where)
-        try:
-            return direction(text)
-        except MapError:
-            raise self.wrong(where, f"{', '.join(DIRECTIONS)}, or degrees", value) from None
+    def _made(self, kind: type[T], where: str, record: Mapping[str, Any], /, *values: Any) -> T:
+        """Make a sentence from its values and the note of its record, which may be empty."""
+        with said_of(f"{self.where}: {where}", MapError):
+            return kind(*values, record.get("note") or None)
 
-    def _step(self, value: object, where: str) -> str:
-        drive, colon, number = self._text(value, where).rpartition(":")
-        if not (drive and colon and number.isascii() and number.isdecimal()):
-            raise self.wrong(where, "a drive, a colon and a step, such as monday:12", value)
-        return f"{drive}:{int(number)}"
-
-    def _note(self, record: Mapping[str, object], where: str) -> str | None:
-        return self._text(record["note"], f"{where}.note") if record.get("note") else None
-
-    def _text(self, value: object, where: str) -> str:
-        if not isinstance(value, str) or not value.strip() or not value.isprintable():
-            raise self.wrong(where, "a text on one line", value)
-        return value
-
-    def _object(
-        self, value: object, where: str, fields: Sequence[str] | None = None
-    ) -> Mapping[str, Any]:
-        if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
-            expected = "fields such as name: kitchen" if fields is None else ", ".join(fields)
-            raise self.wrong(where, expected, value)
-        if fields is not None and (unknown := set(value) - set(fields)):
-            raise self.wrong(where, f"only {', '.join(fields)}", min(unknown))
+    def _only(self, value: object, where: str, fields: Sequence[str]) -> Mapping[str, Any]:
+        """Return an object that has no other fields than these."""
+        if not isinstance(value, Mapping):
+            raise self.wrong(where, ", ".join(fields), value)
+        if unknown := set(value) - set(fields):
+            raise self.wrong(where, f"only {', '.join(fields)}", min(unknown, key=str))
         return value
 
 
 def direction(text: str) -> float:
     """Read a direction: ahead, right, back, left, or degrees clockwise. Raises MapError."""
-    with suppress(ValueError):
+    with suppress(ValueError, TypeError):
         degrees = DIRECTIONS[text] if text in DIRECTIONS else float(text)
         if math.isfinite(degrees):
             return degrees % 360

@@ -8,14 +8,15 @@ import math
 import os
 import re
 import stat
+import sys
 import threading
 from collections import Counter
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, BinaryIO
 
 from ssh_abduction.data.errors import AbductionError, brief, named
 
@@ -29,6 +30,7 @@ LINE_OF_A_LOG = re.compile(
     rb"|VERTEX2|VERTEX_SE2|EDGE2|EDGE_SE2)\s",
     re.MULTILINE,
 )
+_BINARY = "save it as UTF-8, or is this a binary file?"
 _LONG_NUMBER = re.compile(rf"\d{{{LONGEST_NUMBER + 1}}}")
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 # Control characters that JSON need not escape, and that steer a terminal.
@@ -44,30 +46,37 @@ _MENDS = {
 }
 
 
-class NotFinite(ValueError):  # noqa: N818 - part of an error message, which the caller completes
-    """JSON contains NaN or Infinity, as `text`, in the field with the path `field`: "a.b[2]"."""
+class BadJson(ValueError):  # noqa: N818 - part of an error message, which the caller completes
+    """A text is not JSON as `parse_json` accepts it. The text of this error says what was found.
 
-    def __init__(self, field: str, text: str) -> None:
-        super().__init__(f"{text} in {field}" if field else text)
-        self.field, self.text = field, text
+    Attributes:
+        expected: What the text should be, or the value of the field.
+        mend: What to do; "" if only the caller knows.
+        field: The path of the wrong value, such as "a.b[2]"; "" if it is unknown.
+        line: The number of the wrong line; None if it is unknown.
+    """
+
+    def __init__(
+        self,
+        found: str,
+        mend: str = "",
+        expected: str = "JSON",
+        field: str = "",
+        line: int | None = None,
+    ) -> None:
+        super().__init__(found)
+        self.expected, self.mend, self.field, self.line = expected, mend, field, line
 
 
-class HalfCharacter(ValueError):  # noqa: N818 - part of an error message, which the caller completes
-    """JSON contains one half of a surrogate pair, which no encoding can write again."""
-
-
-def parse_json(text: str) -> Any:
-    """Parse a JSON text, more strictly than Python's `json` does.
+def parse_json(data: bytes) -> Any:
+    """Parse JSON in UTF-8, more strictly than Python's `json` does.
 
     An object may not have two fields with the same name. Numbers must be finite and have at most
     LONGEST_NUMBER digits. It must be possible to write all texts again. Objects and lists may be
     nested at most DEEPEST times.
 
     Raises:
-        json.JSONDecodeError: If the JSON is broken.
-        NotFinite: If a number is not finite.
-        HalfCharacter: If a text cannot be written again.
-        ValueError: If something else is wrong. The text says what was found.
+        BadJson: If the JSON is broken, or holds something that is not allowed.
     """
     not_finite: list[str] = []
 
@@ -76,21 +85,28 @@ def parse_json(text: str) -> Any:
         return math.nan
 
     try:
+        text = data.decode("utf-8")
         numbers = {"parse_int": _integer} if _LONG_NUMBER.search(text) else {}
         value = json.loads(text, object_pairs_hook=_object, parse_constant=constant, **numbers)  # type: ignore[arg-type]
+    except UnicodeDecodeError as error:
+        byte = f"the byte 0x{data[error.start]:02x} at column {error.start + 1}"
+        raise BadJson(byte, _BINARY, "text in UTF-8") from None
+    except json.JSONDecodeError as error:
+        found = f"broken JSON at column {error.colno} ({error.msg})"
+        raise BadJson(found, _BINARY if b"\0" in data else "", line=error.lineno) from None
     except RecursionError:
-        raise ValueError("one nested too deeply; flatten it") from None
+        raise BadJson("one nested too deeply", "flatten it") from None
     if text.count("[") + text.count("{") > DEEPEST and _is_deep(value):
-        raise ValueError("one nested too deeply; flatten it")
+        raise BadJson("one nested too deeply", "flatten it")
     if not_finite:
-        raise NotFinite(_where_nan(value), not_finite[0])
+        mend = "replace it, or leave the field out"
+        raise BadJson(not_finite[0], mend, "a finite number", _where_nan(value))
     if _SURROGATE.search(text):
         try:
             json.dumps(value, ensure_ascii=False).encode("utf-8")
         except UnicodeEncodeError as error:
-            raise HalfCharacter(
-                f"half a character, \\u{ord(error.object[error.start]):04x}; mend it"
-            ) from None
+            half = f"half a character, \\u{ord(error.object[error.start]):04x}"
+            raise BadJson(half, "replace it", "text") from None
     return value
 
 
@@ -131,6 +147,29 @@ def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
     if len(data) > most:
         raise ValueError(f"expected at most {most // 2**20} MiB, got more")
     return data
+
+
+def source_of(path: str) -> str:
+    """Return the name of a file for messages; "-" is standard input."""
+    return "standard input" if path == "-" else named(path)
+
+
+@contextmanager
+def opened(path: str, what: str, error: type[AbductionError]) -> Iterator[BinaryIO]:
+    """Open a file to read its bytes; "-" is standard input.
+
+    If it cannot be opened, or read in the block, raise `error`, which names `what`.
+    """
+    try:
+        if path == "-" and sys.stdin is None:
+            raise ValueError("got a closed stream")
+        with nullcontext(sys.stdin.buffer) if path == "-" else Path(path).open("rb") as file:
+            yield file
+    except AbductionError:
+        raise
+    except (OSError, ValueError) as found:
+        why = getattr(found, "strerror", None) or found
+        raise error(f"{source_of(path)}: expected {what}: {why}; check the path") from None
 
 
 def read_file(
@@ -214,11 +253,11 @@ def save_file(
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Make a JSON object from pairs. Raise ValueError if a field is given twice."""
+    """Make a JSON object from pairs. Raise BadJson if a field is given twice."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
         (twice, _), *_ = Counter(name for name, _ in pairs).most_common(1)
-        raise ValueError(f"the field {twice[:60]!r} twice; keep one of them")
+        raise BadJson(f"the field {twice[:60]!r} twice", "keep one of them")
     return fields
 
 
@@ -238,9 +277,9 @@ def _check_keys(node: Any) -> None:
 
 
 def _integer(text: str) -> int:
-    """Make an int from the digits in JSON. Raise ValueError if it is too long."""
+    """Make an int from the digits in JSON. Raise BadJson if it is too long."""
     if len(text) > LONGEST_NUMBER:
-        raise ValueError(f"a number of more than {LONGEST_NUMBER} digits; shorten it")
+        raise BadJson(f"a number of more than {LONGEST_NUMBER} digits", "shorten it")
     return int(text)
 
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import sys
 from collections.abc import Mapping, Sequence, Set
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from ssh_abduction.data.checks import a_path
-from ssh_abduction.data.errors import MapError, brief, is_writable, named
-from ssh_abduction.data.files import HalfCharacter, NotFinite, parse_json, save_file
+from ssh_abduction.data.errors import MapError, is_writable
+from ssh_abduction.data.files import BadJson, opened, parse_json, save_file, source_of
 from ssh_abduction.data.map_parts import (
     FAULTS,
     NAMED,
@@ -48,73 +44,43 @@ def read_json(path: str | os.PathLike[str]) -> Any:
             names the file and, if JSON is broken, the line.
     """
     path = a_path("path", path, MapError)
-    source = "standard input" if path == "-" else named(path)
-
-    def refused(what: str, mend: str = "write it with solve --json") -> MapError:
-        return MapError(f"{source}: expected {what}; {mend}")
-
+    source = source_of(path)
+    with opened(path, "a readable file of maps", MapError) as file:
+        text = file.read(LARGEST + 1)
+    fewer = "list fewer (solve --maps)"
+    if len(text) > LARGEST:
+        raise MapError(f"{source}: expected at most {LARGEST // 2**20} MiB, got more; {fewer}")
+    if not text.strip():
+        raise MapError(f"{source}: expected JSON, got an empty file; {FieldReader.mend}")
     try:
-        with nullcontext(sys.stdin.buffer) if path == "-" else Path(path).open("rb") as file:
-            text = file.read(LARGEST + 1)
-        if len(text) > LARGEST:
-            raise refused(f"at most {LARGEST // 2**20} MiB, got more", "list fewer (solve --maps)")
-        if not text.strip():
-            raise refused("JSON, got an empty file")
-        return parse_json(text.decode("utf-8"))
-    except MapError:
-        raise
-    except OSError as error:
-        why = error.strerror or error
-        raise refused(f"a readable file of maps: {why}", "check the path") from None
+        return parse_json(text)
     except MemoryError:
-        what = "a file of maps that fits into memory, got a larger one"
-        raise refused(what, "list fewer (solve --maps)") from None
-    except json.JSONDecodeError as error:
-        raise _broken(error, text, source) from None
-    except NotFinite as error:
         raise MapError(
-            f"{source}: {error.field or 'value'}: expected a finite number, got {error.text}; "
-            f"write it with solve --json"
+            f"{source}: expected maps that fit into memory, got a larger file; {fewer}"
         ) from None
-    except HalfCharacter as error:
-        raise refused(f"text, got {error}") from None
-    except (UnicodeDecodeError, AttributeError):  # text in another encoding, a closed stream
-        raise refused("JSON in UTF-8, got something else") from None
-    except ValueError as error:
-        raise refused(f"JSON, got {error}") from None
-
-
-def _broken(error: json.JSONDecodeError, text: bytes, source: str) -> MapError:
-    """Return the MapError for broken JSON, or for a file that holds a trace or several values."""
-    if text.startswith(b'{"format": "ssh-trace"'):
-        return MapError(
-            f"{source}: expected maps, got a trace; "
-            f"name the two files in the other order, or solve it first"
-        )
-    if error.msg == "Extra data":
-        return MapError(
-            f"{source}:{error.lineno}: expected one JSON value, got more after it; "
-            f"solve prints a line for each of several traces: take one of them"
-        )
-    return MapError(
-        f"{source}:{error.lineno}: expected JSON, got broken JSON at column {error.colno} "
-        f"({error.msg}); write it with solve --json"
-    )
+    except BadJson as error:
+        if text.startswith(b'{"format": "ssh-trace"'):
+            raise MapError(
+                f"{source}: expected maps, got a trace; "
+                f"name the two files in the other order, or solve it first"
+            ) from None
+        mend = error.mend or FieldReader.mend
+        if "Extra data" in str(error):
+            mend = "solve prints a line for each of several traces: take one of them"
+        where = source if error.line is None else f"{source}:{error.line}"
+        where += f": {error.field}" if error.field else ""
+        raise MapError(f"{where}: expected {error.expected}, got {error}; {mend}") from None
 
 
 def check_format(data: Mapping[str, Any], expected: str, where: str) -> None:
     """Raise MapError if the field `format` or `version` of a file has another value."""
-    if "format" in data and data["format"] != expected:
-        raise MapError(
-            f'{where}: format: expected "{expected}", got {brief(data["format"])}; '
-            f"write it with solve --json"
-        )
+    read = FieldReader(where)
+    if data.get("format", expected) != expected:
+        raise read.wrong("format", f'"{expected}"', data["format"])
     version = data.get("version", VERSION)
     if version != VERSION or isinstance(version, bool):
-        raise MapError(
-            f"{where}: version: expected {VERSION}, got {brief(version)}; "
-            f"read it with the ssh-abduction that wrote it, or solve again"
-        )
+        read.mend = "read it with the ssh-abduction that wrote it, or solve again"
+        raise read.wrong("version", str(VERSION), version)
 
 
 def map_fields(data: Any, where: str) -> dict[str, Any]:
@@ -170,10 +136,7 @@ class _MapReader(FieldReader):
         """Check that dstates are numbered, and places and paths listed if they are used."""
         ids = [s.id for s in dstates]
         if ids != list(range(len(dstates))):
-            raise MapError(
-                f"{self.where}: dstates: expected the ids 0, 1, 2, … in this order, got "
-                f"{brief(ids)}; renumber them"
-            )
+            raise self.wrong("dstates", "the ids 0, 1, 2, … in this order", ids)
         used_places = {s.place for s in dstates} | {q for p in paths for q in p.order}
         path_ids = [p.id for p in paths]
         for name, known, used in (
@@ -181,10 +144,8 @@ class _MapReader(FieldReader):
             ("paths", path_ids, {s.path for s in dstates}),
         ):
             if missing := used - {None, *known}:
-                raise MapError(
-                    f"{self.where}: {name}: expected every id that is used, "
-                    f"got none for {brief(sorted(missing, key=str))}; add it"
-                )
+                expected = f"every id that is used, also {min(missing, key=str)}"
+                raise self.wrong(name, expected, list(known))
             self._check_once(name, known)
 
     def _check_once(self, name: str, values: Sequence[object]) -> None:
@@ -198,10 +159,8 @@ class _MapReader(FieldReader):
             raise self.wrong("labels", "the dstate of each step", [])
         for i, label in enumerate(labels):
             if not 0 <= label < dstates:
-                raise MapError(
-                    f"{self.where}: labels[{i}]: expected the id of a dstate, got {label}; "
-                    f"there are {dstates} dstates"
-                )
+                expected = f"the id of one of {dstates} dstates"
+                raise self.wrong(f"labels[{i}]", expected, label)
         return labels
 
     def _starts(self, record: Mapping[str, Any], steps: int) -> tuple[int, ...]:

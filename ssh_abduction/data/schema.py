@@ -77,7 +77,7 @@ class FieldReader:
     """
 
     error: ClassVar[type[AbductionError]] = MapError  # the class of the errors that are raised
-    mend: ClassVar = "write the file with solve --json"  # what messages advise the user to do
+    mend: str = "write the file with solve --json"  # what messages advise the user to do
 
     def __init__(self, where: str) -> None:
         self.where = a_text("where", where, self.error)

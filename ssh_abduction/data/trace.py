@@ -15,9 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -37,7 +35,7 @@ from ssh_abduction.data.checks import (
     plain_text,
 )
 from ssh_abduction.data.errors import RangeError, TraceError, brief, checked_index, named
-from ssh_abduction.data.files import json_line, save_file
+from ssh_abduction.data.files import json_line, opened, save_file, source_of
 from ssh_abduction.data.odometry import (
     Closure,
     Covariance,
@@ -395,21 +393,9 @@ class Trace:
                 line and the field.
         """
         path = a_path("path", path, TraceError)
-        source = "standard input" if path == "-" else named(path)
-        try:
-            if path == "-" and sys.stdin is None:
-                raise TraceError(f"{source}: expected a trace, got a closed stream; name a file")
-            with nullcontext(sys.stdin.buffer) if path == "-" else Path(path).open("rb") as file:
-                return cls(**read_trace(file, source), source=source if path == "-" else path)
-        except TraceError:
-            raise
-        except OSError as error:
-            raise TraceError(
-                f"{source}: expected a readable trace file: {error.strerror or error}; "
-                f"check the path"
-            ) from None
-        except ValueError as error:  # a null character in the path
-            raise TraceError(f"{source}: expected a trace file: {error}; name one") from None
+        with opened(path, "a readable trace file", TraceError) as file:
+            read = read_trace(file, source_of(path))
+        return cls(**read, source="standard input" if path == "-" else path)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trace into a file. The file appears whole or not at all.

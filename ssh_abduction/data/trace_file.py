@@ -5,14 +5,15 @@ See docs/reference/formats.md.
 
 from __future__ import annotations
 
-import json
+import codecs
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, BinaryIO
 
 from ssh_abduction.data.action import Action, parse_action
+from ssh_abduction.data.checks import a_text
 from ssh_abduction.data.errors import TraceError, brief, said_of
-from ssh_abduction.data.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, parse_json
+from ssh_abduction.data.files import LINE_OF_A_LOG, BadJson, parse_json
 from ssh_abduction.data.odometry import Odometry, parse_closures
 from ssh_abduction.data.step import Step
 
@@ -67,11 +68,6 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
             f'{source}:1: header: expected {{"format": "{FORMAT}", "version": {VERSION}}}, '
             f"got an empty file; write the header, then a line per step"
         )
-    if not steps:
-        raise TraceError(
-            f"{source}:2: step: expected at least one after the header, got none; "
-            f"add what the robot saw first"
-        )
     return {
         "steps": tuple(steps),
         **{name: header.get(name) for name in ("name", "images", "odometry", "drive")},
@@ -82,37 +78,14 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
 
 def _record(raw: bytes, where: str) -> dict[str, Any]:
     """Parse a line and return its object. The first line may begin with a byte order mark."""
-    is_first = where.endswith(":1")
-    if is_first:
+    if where.endswith(":1"):
         _refuse_other_files(raw, where)
-    if b"\0" in raw:
-        raise TraceError(
-            f"{where}: line: expected text in UTF-8, got a null byte at column "
-            f"{raw.index(0) + 1}; save it as UTF-8, or is this a binary file?"
-        )
-    try:  # only the first line may begin with a byte order mark
-        record = parse_json(raw.rstrip().decode("utf-8-sig" if is_first else "utf-8"))
-    except UnicodeDecodeError as error:
-        raise TraceError(
-            f"{where}: line: expected text in UTF-8, got the byte 0x{raw[error.start]:02x} "
-            f"at column {error.start + 1}; save it as UTF-8, or is this a binary file?"
-        ) from None
-    except json.JSONDecodeError as error:
-        raise TraceError(
-            f"{where}: line: expected one JSON object, got broken JSON at column {error.colno} "
-            f"({error.msg}); correct this line"
-        ) from None
-    except NotFinite as error:
-        raise TraceError(
-            f"{where}: {error.field}: expected a finite number, got {error.text}; "
-            f"replace it, or leave the field out"
-        ) from None
-    except HalfCharacter as error:
-        raise TraceError(f"{where}: line: expected text, got {error}; replace it") from None
-    except ValueError as error:
-        raise TraceError(
-            f"{where}: line: expected one JSON object, got {error}; correct this line"
-        ) from None
+        raw = raw.removeprefix(codecs.BOM_UTF8)
+    try:
+        record = parse_json(raw.rstrip())
+    except BadJson as error:
+        what = f"{where}: {error.field or 'line'}: expected {error.expected}, got {error}"
+        raise TraceError(f"{what}; {error.mend or 'correct this line'}") from None
     if not isinstance(record, dict):
         raise TraceError(
             f"{where}: line: expected a JSON object in braces, got {brief(record)}; "
@@ -153,14 +126,11 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
             f"{where}: version: expected {VERSION}, got {brief(version)}; "
             f"convert the file, or take a newer ssh-abduction"
         )
-    for key in ("name", "images", "drive"):
-        if not isinstance(record.get(key), str | None):
-            raise TraceError(
-                f"{where}: {key}: expected a text, got {brief(record[key])}; "
-                f"quote it or leave it out"
-            )
     odometry = record.get("odometry")
     with said_of(where):
+        for key in ("name", "images", "drive"):
+            if record.get(key) is not None:
+                a_text(key, record[key], TraceError, mend="quote it or leave it out")
         return {
             **record,
             "odometry": None if odometry is None else Odometry.of(odometry),
