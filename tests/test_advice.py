@@ -50,7 +50,6 @@ SAID_BY = {
     "ssh_abduction/robot_logs/log_report.py": ("map",),
     "ssh_abduction/explain/pair_reasons.py": ("explain",),
     "ssh_abduction/page/server.py": ("view",),
-    "ssh_abduction/online/move_graph.py": ("route",),
     "ssh_abduction/online/routes.py": ("route",),
     "ssh_abduction/solver/search.py": ("solve",),
     "ssh_abduction/solver/parts.py": ("solve",),

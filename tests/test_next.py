@@ -376,20 +376,20 @@ def test_interrupted_plan_names_its_limit() -> None:
 @pytest.mark.parametrize(
     ("maps", "message"),
     [
-        ([], "maps: expected at least one"),
+        ([], "maps: expected maps, got none"),
         (["no map"], r"maps\[0\]: expected an SSHMap, got 'no map'"),
         (
             [
                 SSHMap((0,), (DState(0, "v"),), ()),
                 SSHMap((0, 0), (DState(0, "v"),), ((0, "a", 0),)),
             ],
-            r"maps\[1\]: labels: expected 1",
+            r"maps\[1\]: expected 1 steps",
         ),
         (
             [SSHMap((0, 0), (DState(0, "v"),), ((0, "a", 0),))],
             r"maps\[0\]: labels: expected 1, one for each step of the trace",
         ),
-        ([SSHMap((0,), (DState(0, "w"),), ())], r"maps\[0\]: dstates\[0\].view: expected 'v'"),
+        ([SSHMap((0,), (DState(0, "w"),), ())], r"maps\[0\]: expected view 'v' at step 0"),
         (
             [SSHMap((0,), (DState(0, "v"), DState(1, "v")), ((0, "a", 0), (0, "a", 1)))],
             r"links: expected that 'a' leads from dstate",
@@ -465,7 +465,7 @@ def test_next_errors_are_one_line(
         ),
         ([maps, maps], f"{maps}:1: header: expected a trace, got maps"),
         ([trace, trace], f"{trace}: expected maps, got a trace"),
-        ([str(none), trace], f"{none}: maps: expected one to seek an experiment for, got none"),
+        ([str(none), trace], f"{none}: expected maps, got none"),
         (
             [maps, trace, "--time-limit", "0"],
             "--time-limit: expected a number of seconds above 0, got 0.0",

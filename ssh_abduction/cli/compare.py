@@ -16,14 +16,13 @@ from ssh_abduction.cli.options import (
     add_trace,
     maps_path,
     solved_trace,
-    some_maps,
     theory_of,
     written_theory,
 )
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.parsing import Verbs
 from ssh_abduction.cli.text import compared, counted, depending, table
-from ssh_abduction.data.errors import MapError, brief, named, printable, said_of
+from ssh_abduction.data.errors import brief, named, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.schema import attributes_of
@@ -226,7 +225,6 @@ def run_next(options: argparse.Namespace) -> int:
     check_limit("--memory-limit", "MiB", options.memory_limit)
     trace = solved_trace(options)
     data = read_json(options.maps)
-    maps = some_maps(data, options.maps, "seek an experiment for")
     listing = Listing.from_dict(data, named(options.maps))
     found = written_theory(data)
     theory: Theory | None = theory_of(options, found)
@@ -239,15 +237,15 @@ def run_next(options: argparse.Namespace) -> int:
         watch.interrupted = True
 
     guard = Guard(interrupt)
-    with said_of(named(options.maps), MapError), on_ctrl_c(interrupt), guard:
-        experiment = next_experiment(maps, trace, theory=theory, complete=complete, watch=watch)
+    with on_ctrl_c(interrupt), guard:
+        experiment = next_experiment(listing, trace, theory=theory, complete=complete, watch=watch)
     if options.json:
         print(json_line(experiment.to_dict()))
     else:
         print("\n".join(_plan_lines(experiment)))
         if listing.sureness:
             print(listing.sureness)
-        weighed = listing.weighed if len(maps) == 1 else None
+        weighed = listing.weighed if len(listing.maps) == 1 else None
         if weighed and weighed.proven and not all(r.estimated for r in weighed.rivals[1:]):
             print("to tell it from maps that cost little more, list them: solve --set within=5")
     if experiment.warning:

@@ -35,26 +35,39 @@ from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Any, Literal, NoReturn
+from itertools import pairwise, permutations
+from typing import Any, Literal, NoReturn, TypeAlias
+
+import networkx as nx
 
 from ssh_abduction.data.checks import a_list, one_of
-from ssh_abduction.data.errors import MapError, printable
+from ssh_abduction.data.drives import Drive, step_of
+from ssh_abduction.data.errors import MapError, TraceError, brief, printable
 from ssh_abduction.data.map_parts import (
-    Region,
     course_named,
     named_by_number,
     right_of,
     signed_path,
+    thing_named,
 )
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.schema import attributes_of, only_known
 from ssh_abduction.data.trace import View
-from ssh_abduction.data.words import counted
-from ssh_abduction.online.move_graph import MoveGraph, Node
+from ssh_abduction.data.words import counted, meant
+from ssh_abduction.output.layout import drawable_poses
 from ssh_abduction.rivals.listing import Listing, Maps
 
 BY = ("actions", "places", "metres")
+# The number of a dstate (distinctive state: a place and a heading). Or a course (place, path,
+# direction) that no dstate of the map faces. In a map without paths, the last two are None.
+Node: TypeAlias = "int | tuple[int, int | None, int | None]"
+# Costs of moves in a route by places. Among routes with equally many travels, the one with fewer
+# actions wins. Among those with equally many actions, the one with more known moves wins.
+KNOWN_MOVE, UNTRIED_MOVE, OPEN_TURN = 1.0, 1.5, 2.5
+# Cost of an action in a route by metres, so that fewer actions win among routes of equal length.
+MICROMETRE = 1e-6
+# A dstate faces a gateway if its heading is at most this many degrees off the gateway's bearing.
+FACING = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,20 +245,14 @@ def route(
                 f"avoid: expected a dstate of '{name}' that is not avoided, got none; do not avoid "
                 "the start or the goal"
             )
-    start_place, goal_place = _place_of(graph, here), _place_of(graph, there)
-    aside: set[Node] = set()
-    if by == "places" and start_place is not None and goal_place is not None:
-        # First plan the coarse route by regions, then the route itself. By links alone, a robot may
-        # have to enter a region only to turn around. So close regions only for a route by places.
-        aside = graph.nodes_in(off_the_way(ssh_map, start_place, goal_place))
-    way = graph.shortest(here - closed, there - closed, closed | aside)
+    way = graph.shortest(here - closed, there - closed, closed)
     if way is None:
         by_places = False
         if by != "places" and ssh_map.places:
             with suppress(MapError):
                 by_places = bool(route(listing, start, goal, by="places", avoid=avoid, map=map))
         _raise_no_route(graph, here, there, closed, (start_named, goal_named), by_places)
-    moves = tuple(_move(graph, a, b) for a, b in pairwise(way))
+    moves = tuple(graph.move(a, b) for a, b in pairwise(way))
     begin, end = (graph.course(node)[0] for node in (way[0], way[-1]))
     first = way[0]
     assert isinstance(first, int)  # routes begin at dstates
@@ -256,18 +263,12 @@ def route(
         start=first,
         goal=goal_named,
         view=ssh_map.dstates[first].view,
-        place=ssh_map.dstates[first].place,
+        place=begin,
         moves=moves,
         agree=_agreeing(ssh_map, first, moves, listing.maps) if is_known else (),
         maps=len(listing.maps),
         legs=() if begin is None or end is None else coarse_route(ssh_map, begin, end),
     )
-
-
-def _place_of(graph: MoveGraph, nodes: AbstractSet[Node]) -> int | None:
-    """Find the place of these nodes; None if they have no place, or several."""
-    places = {graph.course(node)[0] for node in nodes}
-    return places.pop() if len(places) == 1 else None
 
 
 def action_in_words(move: Move) -> str:
@@ -288,22 +289,6 @@ def _closed(graph: MoveGraph, avoid: Iterable[int | str]) -> set[Node]:
     return closed
 
 
-def _move(graph: MoveGraph, source: Node, target: Node) -> Move:
-    """Make the move along an edge of the graph."""
-    place, path, direction = graph.course(target)
-    dstate = target if isinstance(target, int) else None
-    return Move(
-        action=graph.action(source, target),
-        known=graph.is_known(source, target),
-        dstate=dstate,
-        view=None if dstate is None else graph.map.dstates[dstate].view,
-        place=place,
-        path=path,
-        direction=direction,
-        metres=graph.metres(source, target),
-    )
-
-
 def _raise_no_route(
     graph: MoveGraph,
     here: AbstractSet[Node],
@@ -322,11 +307,14 @@ def _raise_no_route(
     if closed and graph.shortest(here, there, set()) is not None:
         mend = implied if by_places else "avoid less"
         raise MapError(f"avoid: expected a way around what is avoided, got none to {end}; {mend}")
-    opened = MoveGraph(replace(graph.map, faults=()), graph.by) if graph.closed else graph
+    opened = MoveGraph(replace(graph.map, faults=()), graph.by)
+    floors = [
+        {graph.map.dstates[n].floor for n in ns if isinstance(n, int)} for ns in (here, there)
+    ]
     mend = "the robot has not driven from here to there; drive on"
     if not any(here & {*piece} and there & {*piece} for piece in graph.map.pieces):
         mend = "it is in another piece of the map; add a drive that leads there (solve --onto)"
-    elif _floors(graph, here).isdisjoint(_floors(graph, there)):
+    elif floors[0].isdisjoint(floors[1]):
         mend = "the robot used no lift and no stairs that lead to its floor; drive on"
     elif by_places:
         mend = f"{implied}, or drive on"
@@ -340,11 +328,6 @@ def _raise_no_route(
     )
 
 
-def _floors(graph: MoveGraph, nodes: AbstractSet[Node]) -> set[int | None]:
-    """Find the floors of those nodes that are dstates. A map without floors has the floor None."""
-    return {graph.map.dstates[node].floor for node in nodes if isinstance(node, int)}
-
-
 def _agreeing(
     ssh_map: SSHMap, start: int, moves: Sequence[Move], maps: Sequence[SSHMap]
 ) -> tuple[int, ...]:
@@ -353,25 +336,282 @@ def _agreeing(
     In each map, the route begins at the dstates of the steps that are at `start` in `ssh_map`.
     """
     steps = [t for t, label in enumerate(ssh_map.dstate_at) if label == start]
-    agree = []
-    for i, rival in enumerate(maps, 1):
+
+    def leads_to_same_views(rival: SSHMap, dstate: int) -> bool:
         leads = {(source, action): target for source, action, target in rival.links}
-        starts = {rival.dstate_at[t] for t in steps}
-        if all(_leads_to(leads, rival, label, moves) for label in starts):
-            agree.append(i)
-    return tuple(agree)
+        for move in moves:
+            target = leads.get((dstate, move.action or ""))
+            if target is None or rival.dstates[target].view != move.view:
+                return False
+            dstate = target
+        return True
+
+    return tuple(
+        i
+        for i, rival in enumerate(maps, 1)
+        if all(leads_to_same_views(rival, label) for label in {rival.dstate_at[t] for t in steps})
+    )
 
 
-def _leads_to(
-    leads: dict[tuple[int, str], int], ssh_map: SSHMap, dstate: int, moves: Sequence[Move]
-) -> bool:
-    """Whether a map has links for the actions of these moves, and they lead to the same views."""
-    for move in moves:
-        target = leads.get((dstate, move.action or ""))
-        if target is None or ssh_map.dstates[target].view != move.view:
+class MoveGraph:
+    """A directed graph whose edges are the moves that are possible in a map, with costs.
+
+    Nodes are dstates, and also courses (place, path, direction) that no dstate faces. Edges are
+    links; for routes by places also moves that paths imply or, in a map without paths such as that
+    of a log, the way back of each travel. No edge passes a gateway that was closed when a drive
+    last saw it.
+
+    `by` says what the shortest route minimises: "actions", "places" or "metres". The drives of the
+    map's trace serve to find steps such as "monday:12". Raises MapError if the map has no poses for
+    "metres", or no places for "places".
+    """
+
+    def __init__(self, ssh_map: SSHMap, by: str, drives: Sequence[Drive] = ()) -> None:
+        self.map, self.by, self._drives = ssh_map, by, drives
+        self._poses = drawable_poses(ssh_map)
+        if by == "metres" and self._poses is None:
+            raise MapError(
+                "by: expected actions or places, got metres: the map has no poses; solve a trace "
+                "with displacements, and without a short time limit, or take --by actions"
+            )
+        if by == "places" and not ssh_map.places:
+            raise MapError(
+                "by: expected actions or metres, got places: the map has no places; "
+                "solve with --theory topological, or take --by actions"
+            )
+        # One travel costs more than all turns of a route together, as a route has at most as many
+        # moves as there are dstates and courses.
+        courses = 2 * sum(len(path.order) for path in ssh_map.paths) + len(ssh_map.places)
+        self._travel_cost = OPEN_TURN * (len(ssh_map.dstates) + courses)
+        self._shut = _closed_gateways(ssh_map)
+        self._graph: nx.DiGraph[Any] = nx.DiGraph()
+        self._graph.add_nodes_from(s.id for s in ssh_map.dstates)
+        # Sort in reverse, so that the first action by name remains if several join two dstates.
+        for source, action, target in sorted(ssh_map.links, reverse=True):
+            if source != target:
+                self._add(source, target, action, known=True)
+        if by == "places" and ssh_map.paths:
+            self._add_implied()
+        elif by == "places":
+            self._add_returns()
+
+    def nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
+        """Return the dstates that a user names, and words for them, such as "place 3".
+
+        `name` is a dstate, place or region by its number, such as 3, "p3" or "region2", or a name
+        that a person gave. A place or region stands for all dstates there, and a step such as
+        "monday:12" for its dstate. `field` is the name of the user's parameter, for messages.
+        Raises MapError, which lists what exists.
+        """
+        kind, number = thing_named(str(name), self.map.names) or (None, -1)
+        if kind is None and ":" in str(name) and self._drives:
+            try:
+                kind, number = "dstate", self.map.dstate_at[step_of(self._drives, str(name))]
+            except TraceError as error:
+                raise MapError(f"{field}: {error}") from None
+        region = next((r for r in self.map.regions or () if r.id == number), None)
+        places = {"place": {number}, "region": {*region.places} if region else set()}
+        found: set[Node] = {
+            s.id
+            for s in self.map.dstates
+            if (s.id == number if kind == "dstate" else s.place in places.get(kind or "", ()))
+        }
+        if found and kind:
+            return found, f"dstate {number}" if kind == "dstate" else self.map.called(kind, number)
+        known = f", or a place as p{self.map.places[0]}" if self.map.places else ""
+        known += ", or a region as region0" if self.map.regions else ""
+        names = [n.text for n in self.map.names if n.kind in ("place", "region")]
+        known += f", or {', '.join(names)}" if names else ""
+        raise MapError(
+            f"{field}: expected a dstate, 0 to {len(self.map.dstates) - 1}{known}, got "
+            f"{brief(name)}{meant(name, names, 3) or ';'} ssh-abduction show lists them"
+        )
+
+    def nodes_in(self, places: AbstractSet[int | None]) -> set[Node]:
+        """Find all nodes that are at these places."""
+        return {node for node in self._graph if self.course(node)[0] in places}
+
+    def shortest(
+        self, here: AbstractSet[Node], there: AbstractSet[Node], closed: AbstractSet[Node]
+    ) -> list[Node] | None:
+        """Return the nodes of the shortest way from some nodes to others; None if there is none.
+
+        The way includes both ends, and does not visit the nodes that are `closed`.
+        """
+        # If all dstates of a place are closed, close its other courses, too.
+        closed_places = {
+            self._place(node)
+            for node in closed
+            if all(s.id in closed for s in self.map.dstates if s.place == self._place(node))
+        }
+        graph = self._graph.subgraph(
+            node
+            for node in self._graph
+            if node not in closed and not (isinstance(node, tuple) and node[0] in closed_places)
+        )
+        cost, way = nx.multi_source_dijkstra(graph, here, weight="cost")
+        found = min(((cost[node], str(node), node) for node in there if node in cost), default=None)
+        return None if found is None else way[found[2]]
+
+    def dstates_from(self, here: AbstractSet[Node]) -> int:
+        """Count the dstates that can be reached from the given nodes, including these."""
+        reached = nx.multi_source_dijkstra_path_length(self._graph, here)
+        return sum(isinstance(node, int) for node in reached)
+
+    def move(self, source: Node, target: Node) -> Move:
+        """Return the move along an edge."""
+        move: Move = self._graph.edges[source, target]["move"]
+        return move
+
+    def course(self, node: Node) -> tuple[int | None, int | None, int | None]:
+        """Return the place, path and direction of a node. Each is None if the node has none."""
+        if isinstance(node, tuple):
+            return node
+        s = self.map.dstates[node]
+        return s.place, s.path, s.direction
+
+    def _metres(self, source: Node, target: Node) -> float | None:
+        """Return the straight distance of a move in metres; None if the map has no poses.
+
+        A lift has the length 0, as floors have no common frame.
+        """
+        if self._poses is None:
+            return None
+        if self._floor(source) != self._floor(target):
+            return 0.0
+        a, b = (self._poses[s.id] for node in (source, target) if (s := self._dstate(node)))
+        return math.hypot(a.x - b.x, a.y - b.y)
+
+    def _dstate(self, node: Node) -> DState | None:
+        """Return the dstate of a node; for a course, the first dstate at its place, if any."""
+        if isinstance(node, int):
+            return self.map.dstates[node]
+        return next((s for s in self.map.dstates if s.place == node[0]), None)
+
+    def _floor(self, node: Node) -> int | None:
+        """Return the floor of a node; None if the map has no floors."""
+        here = self._dstate(node)
+        return here.floor if here else None
+
+    def _add(self, source: Node, target: Node, action: str | None, *, known: bool) -> None:
+        """Add a move, unless it passes a gateway that was last seen closed."""
+        if self._passes_closed(source, target):
+            return
+        metres = self._metres(source, target)
+        travel = self._travel_cost * (self._place(source) != self._place(target))
+        unit = KNOWN_MOVE if known else UNTRIED_MOVE if action else OPEN_TURN
+        costs = {"actions": 1.0, "metres": (metres or 0.0) + MICROMETRE, "places": unit + travel}
+        dstate = target if isinstance(target, int) else None
+        view = None if dstate is None else self.map.dstates[dstate].view
+        move = Move(action, known, dstate, view, *self.course(target), metres)
+        self._graph.add_edge(source, target, cost=costs[self.by], move=move)
+
+    def _imply(self, source: Node, target: Node, action: str | None) -> None:
+        """Add an implied move, unless the map has a link for it or it leads to another floor."""
+        is_known = self._graph.has_edge(source, target)
+        if not is_known and self._floor(source) == self._floor(target):
+            self._add(source, target, action, known=False)
+
+    def _add_implied(self) -> None:
+        """Add the moves that the paths of the map imply.
+
+        A path leads both ways, so the robot can go back where it travelled. At a place it can turn
+        to each path through this place. Two places next to each other in the order of a path may
+        have a wall between them if no travel joins them.
+        """
+        travel, around = self._only_action(onward=True), self._only_action(onward=False)
+        facing: dict[Node, Node] = {}  # the first dstate of each course
+        at: dict[int, set[Node]] = {}  # the nodes of each place
+        for s in self.map.dstates:
+            if s.place is not None:
+                at.setdefault(s.place, set()).add(s.id)
+                if s.path is not None and s.direction is not None:
+                    facing.setdefault((s.place, s.path, s.direction), s.id)
+        for path in self.map.paths:
+            for course in ((place, path.id, way) for place in path.order for way in (1, -1)):
+                at.setdefault(course[0], set()).add(facing.get(course, course))
+        for source, _, target in self.map.links:
+            (here, path_id, way), (there, other, _) = self.course(source), self.course(target)
+            if here != there and path_id is not None and path_id == other and way is not None:
+                assert here is not None
+                assert there is not None
+                start, end = (there, path_id, -way), (here, path_id, -way)
+                self._imply(facing.get(start, start), facing.get(end, end), travel)
+        for courses_here in at.values():
+            for node in courses_here:
+                for aside in courses_here - {node}:
+                    self._imply(node, aside, around if self._is_around(node, aside) else None)
+
+    def _add_returns(self) -> None:
+        """Add the way back of each travel, and turns between all dstates of a place."""
+        at: dict[int, set[Node]] = {}  # the nodes of each place
+        for s in self.map.dstates:
+            if s.place is not None:
+                at.setdefault(s.place, {(s.place, None, None)}).add(s.id)
+        for here in at.values():
+            for node, aside in permutations(here, 2):
+                if isinstance(aside, int):
+                    self._imply(node, aside, None)
+        travels = []
+        for source, action, target in self.map.links:
+            back, there = self.course(source)[0], self.course(target)[0]
+            if back is not None and there is not None and back != there:
+                travels.append((action, there, back))
+        actions = {action for action, _, _ in travels}
+        for action, there, back in travels:
+            for node in at[there]:
+                self._imply(node, (back, None, None), action if len(actions) == 1 else None)
+
+    def _passes_closed(self, source: Node, target: Node) -> bool:
+        """Whether a move leaves or enters a place by a gateway that was last seen closed."""
+        if self._place(source) == self._place(target) or self._floor(source) != self._floor(target):
             return False
-        dstate = target
-    return True
+        return self._faces_closed(source, 0) or self._faces_closed(target, 180)
+
+    def _faces_closed(self, node: Node, turned: int) -> bool:
+        """Whether a robot at a node, turned by some degrees, faces a gateway last seen closed."""
+        place, path, way = self.course(node)
+        here = [s for s in self.map.dstates if s.place == place and s.heading is not None]
+        facing = [(s.heading, turned) for s in here if s.id == node]
+        if isinstance(node, tuple):  # no dstate faces this way, but one may face the other way
+            facing = [
+                (s.heading, turned + 180 * (s.direction != way)) for s in here if s.path == path
+            ]
+        for at, slot, bearing in self._shut:
+            unit, gateway = (90, slot) if bearing is None else (1, bearing)
+            off = [unit * ((heading or 0) - (gateway or 0)) + more for heading, more in facing]
+            if at == place and any(abs((degrees + 180) % 360 - 180) <= FACING for degrees in off):
+                return True
+        return False
+
+    def _is_around(self, source: Node, target: Node) -> bool:
+        """Whether two nodes at one place face the two directions of one path."""
+        (_, path, way), (_, other, other_way) = self.course(source), self.course(target)
+        return path is not None and path == other and way != other_way
+
+    def _only_action(self, *, onward: bool) -> str | None:
+        """Return the action that goes on along paths or, if not `onward`, turns around on them.
+
+        None if the links of the map have no such action, or several.
+        """
+        dstates, names = self.map.dstates, set()
+        for source, action, target in self.map.links:
+            s, x = dstates[source], dstates[target]
+            moves = s.place != x.place if onward else s.direction != x.direction
+            if s.path is not None and s.path == x.path and moves:
+                names.add(action)
+        return names.pop() if len(names) == 1 else None
+
+    def _place(self, node: Node) -> int:
+        """Return the place of a node, or the `DState.site` of a dstate without a place."""
+        return self.map.dstates[node].site if isinstance(node, int) else node[0]
+
+
+def _closed_gateways(ssh_map: SSHMap) -> list[tuple[int | None, int | None, int | None]]:
+    """List the place, slot and bearing of each gateway that was last seen closed."""
+    changes = (fault for fault in ssh_map.faults if fault.kind == "changed")
+    last = {(fault.place, fault.gateway, fault.bearing): fault for fault in changes}
+    return [at for at, fault in last.items() if str(fault.seen).startswith("closed")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,8 +660,9 @@ def coarse_route(ssh_map: SSHMap, start: int, goal: int) -> tuple[Leg, ...]:
     Reference:
         Kuipers 2000, "The Spatial Semantic Hierarchy": boundary relations guide the search.
     """
+    with_doors = [region for region in ssh_map.regions or () if region.door is not None]
     leave, enter = (
-        [r for r in _with_doors(ssh_map) if here in r.places and there not in r.places]
+        [r for r in with_doors if here in r.places and there not in r.places]
         for here, there in ((start, goal), (goal, start))
     )
     return (
@@ -429,23 +670,6 @@ def coarse_route(ssh_map: SSHMap, start: int, goal: int) -> tuple[Leg, ...]:
         *_passed(ssh_map, start, goal),
         *(Leg("enter", r.id, r.door) for r in enter),
     )
-
-
-def off_the_way(ssh_map: SSHMap, start: int, goal: int) -> set[int]:
-    """Find the places in regions that hold neither the place `start` nor the place `goal`.
-
-    Only regions behind one place, their door, are considered.
-
-    A route that enters such a region has to come back through the door. It would be shorter to turn
-    at the door. So the shortest route by places does not enter such regions.
-    """
-    closed = [r for r in _with_doors(ssh_map) if not {start, goal} & {*r.places}]
-    return {place for region in closed for place in region.places}
-
-
-def _with_doors(ssh_map: SSHMap) -> list[Region]:
-    """List the regions behind one place, the largest first."""
-    return [region for region in ssh_map.regions or () if region.door is not None]
 
 
 def _passed(ssh_map: SSHMap, start: int, goal: int) -> list[Leg]:

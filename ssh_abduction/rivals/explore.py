@@ -51,14 +51,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssh_abduction.data.checks import a_flag, a_function, a_list, an_instance
-from ssh_abduction.data.errors import MapError, brief, printable
-from ssh_abduction.data.groups import gathered
-from ssh_abduction.data.maps import SSHMap, check_labels, checked_map
+from ssh_abduction.data.errors import MapError, printable
+from ssh_abduction.data.groups import gathered, indices_of
+from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.trace import Action, Trace, checked_trace
 from ssh_abduction.data.words import counted
+from ssh_abduction.rivals.listing import Listing, Maps
 from ssh_abduction.rivals.machines import (
     UNKNOWN,
     Can,
@@ -69,7 +71,6 @@ from ssh_abduction.rivals.machines import (
     Observations,
     Row,
     Seen,
-    Walk,
     is_possible,
     leads_of,
     machine_of,
@@ -287,7 +288,7 @@ def _acts(actions: Sequence[str]) -> str:
 
 
 def next_experiment(
-    maps: Solution | SSHMap | Iterable[SSHMap],
+    maps: Maps,
     trace: Trace | None = None,
     *,
     theory: Theory | None = None,
@@ -302,7 +303,8 @@ def next_experiment(
     """Find the actions after which rival maps predict different observations.
 
     Args:
-        maps: Maps of one trace. A Solution also gives `theory` and `complete`.
+        maps: A Solution, a Listing, or maps of one trace. A Solution also gives `theory` and
+            `complete`.
         trace: The trace of the maps. If given, stars (the openings or gateways seen) are predicted
             in addition to views, and the kinds of actions are read from it.
         theory: The theory of the maps. It sets how stars are compared, and which axioms imply where
@@ -338,10 +340,11 @@ def next_experiment(
         an_instance("watch", watch, Watch, MapError, mend=mend)
     extra = [Action.of(action) for action in a_list("actions", actions, MapError)]
     if isinstance(maps, Solution):
-        theory, complete, maps = theory or maps.theory, maps.complete, maps.maps
-    maps = [maps] if isinstance(maps, SSHMap) else maps
-    rivals = a_list("maps", maps, MapError, what="a Solution or maps")
-    _check(rivals, trace)
+        theory, complete = theory or maps.theory, maps.complete
+    listing = Listing.of(maps)
+    rivals = listing.maps
+    if trace is not None:
+        check_of_trace(rivals, trace, listing.source, views=listing.one_view)
     watch = watch or Watch(time_limit, memory_limit)
     watch.start()
     laboratory = Laboratory(rivals, trace, theory, extra, can, implied, watch)
@@ -468,49 +471,40 @@ class Laboratory:
         """
         weights = np.array([len(self._groups[m]) for m in machines])
         total, least = int(weights.sum()), int(weights.max())
-        walk = Walk(self._table, machines, start, self._watch)
-        best: tuple[float, int, int] | None = None  # gain per action, row, action
-        for layer in walk.layers():
-            if best and math.log(total / least) / (layer.depth + 1) <= best[0]:
+        best: tuple[float, list[int], NDArray[np.int32], NDArray[np.int32]] | None = None
+        for joint in self._table.walk(machines, start, self._watch):
+            length = len(joint.way) + 1
+            if best and math.log(total / least) / length <= best[0]:
                 break  # longer sequences gain less per action
-            for first, action, there, seen in walk.moves(layer):
-                differ = (there >= 0).all(axis=1) & (seen != seen[:, :1]).any(axis=1)
-                for i in np.flatnonzero(differ).tolist():
-                    worst = int(np.bincount(seen[i], weights).max())
-                    gain = math.log(total / worst) / (layer.depth + 1)
-                    if best is None or gain > best[0]:
-                        best = gain, first + i, action
-                        end, sights = there[i].tolist(), seen[i].tolist()
+            differ = (joint.ends >= 0).all(axis=1) & (joint.seen != joint.seen[:, :1]).any(axis=1)
+            for action in np.flatnonzero(differ).tolist():
+                worst = int(np.bincount(joint.seen[action], weights).max())
+                gain = math.log(total / worst) / length
+                if best is None or gain > best[0]:
+                    best = gain, [*joint.way, action], joint.ends[action], joint.seen[action]
         if best is None:
             return None
+        _, actions, ends, seen = best
         parts: dict[int, tuple[list[int], list[int]]] = {}
-        for k, (state, sight) in enumerate(zip(end, sights, strict=True)):
-            part, states = parts.setdefault(sight, ([], []))
-            part.append(k)
-            states.append(state)
-        return [*walk.way(best[1]), best[2]], parts
+        for sight, which in indices_of(seen.tolist()).items():
+            parts[sight] = which, ends[which].tolist()
+        return actions, parts
 
     def _untried(self, machines: Sequence[int], start: Row) -> Untried | None:
         """Find the most informative action for which some machine (map) has no link, if any."""
-        walk = Walk(self._table, machines, start, self._watch)
-        best: tuple[tuple[int, int], int, int, dict[Consequence, list[int]]] | None = None
-        for layer in walk.layers():
-            for first, action, there, _ in walk.moves(layer):
-                for i in np.flatnonzero((there == UNKNOWN).any(axis=1)).tolist():
-                    said = self._say(machines, layer.rows[first - layer.first + i].tolist(), action)
-                    if said is None:
-                        continue
-                    informs = _informs(said)
-                    if best is None or informs < best[0]:
-                        best = informs, first + i, action, said
-        if best is None:
-            return None
-        (worst, pairs), row, action, said = best
-        expects = tuple(
-            Expectation(_numbers(group), consequence) for consequence, group in said.items()
-        )
-        way = tuple(self._actions[a].name for a in walk.way(row))
-        return Untried(way, self._actions[action].name, expects, worst, -pairs)
+        best: Untried | None = None
+        for joint in self._table.walk(machines, start, self._watch):
+            for action in np.flatnonzero((joint.ends == UNKNOWN).any(axis=1)).tolist():
+                said = self._say(machines, joint.states, action)
+                if said is None:
+                    continue
+                worst, pairs = _informs(said)
+                if best is None or (worst, -pairs) < (best.worst, -best.pairs):
+                    expects = (Expectation(_numbers(some), says) for says, some in said.items())
+                    way = tuple(self._actions[a].name for a in joint.way)
+                    name = self._actions[action].name
+                    best = Untried(way, name, tuple(expects), worst, pairs)
+        return best
 
     def _say(
         self, machines: Sequence[int], states: Sequence[int], action: int
@@ -542,19 +536,17 @@ class Laboratory:
 
 
 def _informs(said: dict[Consequence, list[int]]) -> tuple[int, int]:
-    """Compute a sort key of untried actions. The most informative action has the least key.
+    """Count how many rivals are left in the worst case, and the pairs that expect other outcomes.
 
-    The key is the number of rivals left in the worst case, and then minus the number of pairs of
-    rivals that expect different outcomes.
+    The most informative action leaves the fewest rivals. Ties go to the most pairs.
     """
     counts = {consequence: len(group) for consequence, group in said.items()}
-    total = sum(counts.values())
     worst = max(sum(n for other, n in counts.items() if not one.clashes(other)) for one in counts)
     # outcomes are compared by what is seen, as rivals may number a dstate differently
     seen = Counter[object]()
     for consequence, n in counts.items():
         seen[consequence.is_sure, consequence.seen] += n
-    return worst, -(total * (total - 1) - sum(n * (n - 1) for n in seen.values())) // 2
+    return worst, math.comb(seen.total(), 2) - sum(math.comb(n, 2) for n in seen.values())
 
 
 def _numbers(rivals: Iterable[int]) -> tuple[int, ...]:
@@ -570,47 +562,6 @@ def _to_known_views(
         s: {action: x for action, x in tried.items() if ssh_map.dstates[x].view is not None}
         for s, tried in links.items()
     }
-
-
-def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
-    """Raise MapError unless these are maps of one trace, and of `trace` if it is given."""
-    if not maps:
-        raise MapError(
-            "maps: expected at least one map to find an experiment for, got none; "
-            "see the status that solve gave"
-        )
-    for i, ssh_map in enumerate(maps):
-        checked_map(ssh_map, f"maps[{i}]")
-        labels = ssh_map.dstate_at
-        if len(labels) != len(maps[0].dstate_at):
-            raise MapError(
-                f"maps[{i}]: labels: expected {len(maps[0].dstate_at)}, as the first map has, "
-                f"got {len(labels)}; take the maps of one trace"
-            )
-        if trace is None:
-            continue
-        check_labels(ssh_map, trace, f"maps[{i}]")
-        # an ignored view or action may differ from the map
-        wrong = {(fault.step, fault.kind) for fault in ssh_map.faults}
-        links = set(ssh_map.links)
-        for t, step in enumerate(trace.steps):
-            view = ssh_map.dstates[labels[t]].view
-            if step.view is not None and step.view != view and (t, "misread") not in wrong:
-                raise MapError(
-                    f"maps[{i}]: dstates[{labels[t]}].view: expected {brief(step.view)}, as at "
-                    f"{trace.at(t)}, got {brief(view)}; solve this trace"
-                )
-            if (
-                step.action
-                and not step.action.starts
-                and (labels[t], step.action.name, labels[t + 1]) not in links
-                and (t, "slipped") not in wrong
-            ):
-                link = [labels[t], step.action.name, labels[t + 1]]
-                raise MapError(
-                    f"maps[{i}]: links: expected {brief(link)}, as at {trace.at(t)}, got none; "
-                    "solve this trace"
-                )
 
 
 def _sharing(maps: Sequence[SSHMap]) -> str:

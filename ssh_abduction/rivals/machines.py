@@ -5,7 +5,7 @@ Rivals with equal machines predict the same for all actions, so they share one m
 780 rivals that differ only in paths have one machine.
 
 A robot that follows links of all rivals is at one dstate in each of them. These dstates are a
-*joint state*: a row of numbers, one for each machine. numpy moves many rows at once.
+*joint state*: a row of numbers, one for each machine.
 
 If the action was tried at a dstate, its link is known. Otherwise the axioms, or the order of a
 path, may still tell where the action leads:
@@ -22,10 +22,11 @@ path, may still tell where the action leads:
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +47,6 @@ from ssh_abduction.theory.theory import Theory
 Array: TypeAlias = NDArray[np.int32]
 Row: TypeAlias = tuple[int, ...]
 UNKNOWN = -1  # the state after an action for which a machine has no link
-# The greatest number of entries in the rows that are moved at once. They take about ten megabytes.
-CHUNK = 2**21
 # A function from a step to a key of its star, and to the star. Stars that cannot be distinguished
 # share a key.
 _Reading: TypeAlias = Callable[[int], tuple[object, tuple[Any, ...] | None]]
@@ -234,8 +233,26 @@ def machine_of(
     return Machine(tuple(sights[s] for s in number), tuple(ends)), tuple(number)
 
 
+class JointState(NamedTuple):
+    """A state of each of m machines, and where each of the n actions leads from there.
+
+    On the way to this joint state all machines predict the same observations.
+    """
+
+    way: tuple[int, ...]  # the indices of the actions that lead here from the start
+    states: tuple[int, ...]  # the state of each machine
+    ends: Array  # the states after each action, (n, m); UNKNOWN where a machine has no link
+    seen: Array  # the numbers of what is seen there, (n, m)
+
+
 class MachineTable:
-    """Machines as arrays, so that an action is followed in all of them at once."""
+    """Machines as arrays, so that an action is followed in all of them at once.
+
+    >>> blind = Machine((0, 0), ((("a", 1),), (("a", 0),)))
+    >>> walk = MachineTable([blind, blind], ["a"]).walk([0, 1], (0, 0), Watch())
+    >>> [(joint.states, joint.way) for joint in walk]
+    [((0, 0), ()), ((1, 1), (0,))]
+    """
 
     def __init__(self, machines: Sequence[Machine], actions: Sequence[str]) -> None:
         column = {action: i for i, action in enumerate(actions)}
@@ -250,89 +267,26 @@ class MachineTable:
                 for action, target in ends:
                     self.ends[i, s, column[action]] = target
 
-    def follow(self, group: Array, rows: Array, action: int) -> tuple[Array, Array]:
-        """Follow an action from joint states. Return the joint states after it, and what is seen.
+    def walk(self, group: Sequence[int], start: Row, watch: Watch) -> Iterator[JointState]:
+        """Yield the joint states that links of all machines reach, the nearest first.
 
-        `group` has the indices of the machines, (m,), and `rows` the state of each, (n, m).
-        Both results are (n, m). Entries are UNKNOWN if the machine lacks the link.
+        Links are followed as long as all machines predict the same observations. `group` has the
+        indices of the machines, and `start` the state in which each of them begins.
         """
-        there = self.ends[group, rows, action]
-        return there, np.where(there < 0, UNKNOWN, self.sights[group, there])
-
-
-@dataclass(frozen=True, slots=True)
-class Layer:
-    """The joint states that are reached first after `depth` actions.
-
-    On the way there all machines predict the same observations.
-    """
-
-    depth: int  # the number of actions
-    first: int  # the number of the first row, counted over all layers
-    rows: Array  # the joint states, shape (n, m): the state of each machine
-
-
-class Walk:
-    """A breadth-first search over joint states.
-
-    It follows links that all machines have, as long as all predict the same observations. `group`
-    has the indices of the machines to follow, and `start` the state in which each of them begins.
-
-    >>> blind = Machine((0, 0), ((("a", 1),), (("a", 0),)))
-    >>> walk = Walk(MachineTable([blind, blind], ["a"]), [0, 1], (0, 0), Watch())
-    >>> [layer.rows.tolist() for layer in walk.layers()], walk.way(1)
-    ([[[0, 0]], [[1, 1]]], [0])
-    """
-
-    def __init__(self, table: MachineTable, group: Sequence[int], start: Row, watch: Watch) -> None:
-        self.table, self.group, self._watch = table, np.array(group, np.int32), watch
-        self._start = start
-        # for each row, the row before it and the action between them
-        self._came: list[tuple[int, int]] = [(0, 0)]
-
-    def layers(self) -> Iterator[Layer]:
-        """Yield the joint states layer by layer, the nearest first."""
-        known = {np.array(self._start, np.int32).tobytes()}
-        layer = Layer(0, 0, np.array([self._start], np.int32))
-        while len(layer.rows):
-            yield layer
-            rows: list[Array] = []
-            for numbers, action, there, seen in self.moves(layer):
-                alike = (there >= 0).all(axis=1) & (seen == seen[:, :1]).all(axis=1)
-                for i in np.flatnonzero(alike).tolist():
-                    key = there[i].tobytes()
-                    if key not in known:
-                        known.add(key)
-                        rows.append(there[i])
-                        self._came.append((numbers + i, action))
-            width = len(self.group)
-            layer = Layer(
-                layer.depth + 1,
-                layer.first + len(layer.rows),
-                np.array(rows, np.int32).reshape(len(rows), width),
-            )
-
-    def moves(self, layer: Layer) -> Iterator[tuple[int, int, Array, Array]]:
-        """Follow each action from the joint states of a layer, some rows at a time.
-
-        Yield four values for each part of the layer and each action: the number of the first row
-        of the part; the index of the action; the joint states after it; and the numbers of what is
-        seen there.
-        """
-        size = max(CHUNK // len(self.group), 1)
-        for start in range(0, len(layer.rows), size):
-            part = layer.rows[start : start + size]
-            for action in range(self.table.ends.shape[2]):
-                self._watch.check()
-                yield layer.first + start, action, *self.table.follow(self.group, part, action)
-
-    def way(self, row: int) -> list[int]:
-        """List the indices of the actions that lead from the start to the row with this number."""
-        found: list[int] = []
-        while row:
-            row, action = self._came[row]
-            found.append(action)
-        return found[::-1]
+        waiting: dict[Row, tuple[int, ...]] = {start: ()}
+        queue = deque(waiting)
+        while queue:
+            watch.check()
+            states = queue.popleft()
+            ends = self.ends[group, states].T
+            seen = np.where(ends < 0, UNKNOWN, self.sights[group, ends])
+            yield JointState(waiting[states], states, ends, seen)
+            alike = (ends >= 0).all(axis=1) & (seen == seen[:, :1]).all(axis=1)
+            for action in np.flatnonzero(alike).tolist():
+                there = tuple(ends[action].tolist())
+                if there not in waiting:
+                    waiting[there] = (*waiting[states], action)
+                    queue.append(there)
 
 
 @dataclass(frozen=True, slots=True)

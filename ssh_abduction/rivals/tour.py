@@ -27,19 +27,21 @@ where the robot may stand. A move is an action that leads from one stance to ano
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, TypeAlias, TypeVar
+from typing import Literal, TypeAlias
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
 from ssh_abduction.data.action import QUARTERS
-from ssh_abduction.data.groups import firsts, gathered, numbered, parts, reached
+from ssh_abduction.data.groups import firsts, gathered, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Frame, Star, angle_between
 from ssh_abduction.data.trace import Action, Trace
@@ -56,7 +58,6 @@ How: TypeAlias = Literal["known", "implied", "expected", "unknown"]
 # The cost of an unknown move in actions: go there, turn around, and come back.
 THERE_AND_BACK = 3
 AROUND = Action.of("around")
-T = TypeVar("T")
 # Seconds for the search for one flow. If it takes longer, the robot goes to the nearest untried
 # move instead.
 PATIENCE = 2.0
@@ -113,15 +114,15 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
     # believing a return may add dstates to doubted places beside it: repeat until nothing changes
     while True:
         at = _copies(ssh_map, trace, believed)
-        dstates: dict[Copy, set[int]] = {}
-        for copy, label in zip(at, ssh_map.dstate_at, strict=True):
-            dstates.setdefault(copy, set()).add(label)
-        beside = [(one, other) for one, other in pairwise(at) if one[1] and other[1]]
-        more: set[int] = set()
-        for copy in dstates:
-            near = followed_from([*beside, *((other, one) for one, other in beside)], copy)
-            if copy[1] and sum(len(dstates[other]) for other in near) > margin:
-                more.add(copy[1])
+        seen = {*zip(at, ssh_map.dstate_at, strict=True)}
+        beside = nx.Graph((one, other) for one, other in pairwise(at) if one[1] and other[1])
+        beside.add_nodes_from(copy for copy in at if copy[1])
+        enough = (
+            near
+            for near in nx.connected_components(beside)
+            if sum(copy in near for copy, _ in seen) > margin
+        )
+        more = {return_step for near in enough for _, return_step in near}
         if not more:
             break
         believed |= more
@@ -256,26 +257,21 @@ class Stances:
         Dstates that are linked by turns are one room. Their headings differ by the angles of the
         turns. The first dstate of a room faces 0 degrees.
         """
-        turns: dict[int, list[tuple[int, float]]] = {n: [] for n in self._links}
+        turns: nx.DiGraph[int] = nx.DiGraph()
+        turns.add_nodes_from(self._links)
         for n, tried in self._links.items():
             for name, target in tried.items():
                 action = self._actions[name]
                 degrees = _degrees(action, self._frames[n]) if action.kind == "turn" else None
                 if degrees is not None:
-                    turns[n].append((target, degrees))
-                    turns[target].append((n, -degrees))
-        # each connected group of dstates is a room, in which the first one faces 0 degrees
+                    turns.add_edge(target, n, degrees=-degrees)
+                    turns.add_edge(n, target, degrees=degrees)
         at: dict[int, tuple[int, float]] = {}
         for n in turns:
-            if n in at:
-                continue
-            at[n] = n, 0.0
-            queue = [n]
-            for source in queue:
-                for target, degrees in turns[source]:
-                    if target not in at:
-                        at[target] = n, (at[source][1] + degrees) % 360
-                        queue.append(target)
+            if n not in at:
+                at[n] = n, 0.0
+                for one, other in nx.bfs_edges(turns, n):
+                    at[other] = n, (at[one][1] + turns.edges[one, other]["degrees"]) % 360
         return [at[n] for n in sorted(at)]
 
     def _possible(self, n: int) -> list[Action]:
@@ -378,7 +374,7 @@ def shortest_walk(
     times = shortest_flow(moves, start, due, unseen)
     if times is None:
         return ()
-    left = {k: n for k, n in enumerate(times) if n}
+    left = Counter({k: n for k, n in enumerate(times) if n})
     actions: list[str] = []
     at = start
     while left:
@@ -388,10 +384,9 @@ def shortest_walk(
         )
         # take a move unless the rest of the walk would be cut off
         for k in choices:
-            after = {j: n - (j == k) for j, n in left.items() if n > (j == k)}
-            if {moves[j].source for j in after} <= reached_from(
-                [moves[j] for j in after], moves[k].target
-            ):
+            after = left - Counter([k])
+            rest = [moves[j] for j in after]
+            if {move.source for move in rest} <= reached_from(rest, moves[k].target):
                 break
         else:
             return ()
@@ -443,13 +438,14 @@ def shortest_flow(
             return None
         times = np.round(found.x[: len(moves)]).astype(int)
         used = [move for move, n in zip(moves, times, strict=True) if n]
-        if not (cut_off := _parts_cut_off(used, start)):
+        near = reached_from(used, start)
+        cut_off = _graph(move for move in used if move.source not in near)
+        if not cut_off:
             break
-        for part in cut_off:
+        for part in nx.weakly_connected_components(cut_off):
             entering = [float(x.target in part and x.source not in part) for x in moves]
             entering += [0.0] * (len(costs) - len(moves))
             rules.append(LinearConstraint(np.array([entering]), 1, np.inf))
-    near = reached_from(used, start)
     return [int(n) if move.source in near else 0 for move, n in zip(moves, times, strict=True)]
 
 
@@ -460,23 +456,25 @@ def _program(
 
     The variables are the count of each move, and for each stance whether it is the last one.
     """
-    number = {n: i for i, n in enumerate(sorted(reached_from(moves, start)))}
-    m, size = len(moves), len(number)
+    graph = _graph(moves)
+    graph.add_node(start)
+    stances = sorted(graph)
+    m, size = len(moves), len(stances)
     sources, targets = (
-        np.array([number[n] for n in ends])
+        np.searchsorted(stances, ends)
         for ends in ([x.source for x in moves], [x.target for x in moves])
     )
     # Balance: a stance is entered as often as it is left, but for the start and the last one.
-    signs = np.r_[np.ones(m), -np.ones(m), -np.ones(size)]
-    at = np.r_[targets, sources, :size], np.r_[:m, :m, m : m + size]
-    balance = coo_array((signs, at), (size, m + size)).tocsr()
-    enters = coo_array((np.ones(m), (targets, np.arange(m))), (size, m + size)).tocsr()
-    begins = -1.0 * (np.arange(size) == number[start])
-    rows = sorted(number[n] for n in unseen - {start})
+    enters, leaves = (
+        coo_array((np.ones(m), (ends, np.arange(m))), (size, m)) for ends in (targets, sources)
+    )
+    last = sparse.eye_array(size)
+    begins = -1.0 * (np.array(stances) == start)
+    visited = np.isin(stances, sorted(unseen - {start})).astype(float)
     rules = [
-        LinearConstraint(balance, begins, begins),
+        LinearConstraint(sparse.hstack([enters - leaves, -last]), begins, begins),
         LinearConstraint(np.r_[np.zeros(m), np.ones(size)][None], 1, 1),
-        *([LinearConstraint(enters[rows], 1, np.inf)] if rows else []),
+        LinearConstraint(sparse.hstack([enters, 0 * last]), visited, np.inf),
     ]
     costs = np.r_[[float(move.cost) for move in moves], np.zeros(size)]
     bounds = Bounds(
@@ -486,14 +484,6 @@ def _program(
     return costs, bounds, rules
 
 
-def _parts_cut_off(used: Sequence[StanceMove], start: int) -> list[set[int]]:
-    """Find the parts of a flow that `start` is not connected to, as sets of stances."""
-    near = reached_from(used, start)
-    left = [(move.source, move.target) for move in used if move.source not in near]
-    beside = gathered([*left, *((target, source) for source, target in left)])
-    return [set(part) for part in parts(beside, beside.__getitem__)]
-
-
 def nearest_of(
     moves: Sequence[StanceMove], start: int, due: set[int], unseen: set[int]
 ) -> tuple[str, ...]:
@@ -501,30 +491,28 @@ def nearest_of(
 
     Parameters as in `shortest_walk`. Return the names of the actions; empty if there is no way.
     """
-    after = gathered(
-        (move.source, k)
-        for k, move in sorted(enumerate(moves), key=lambda pair: pair[0] not in due)
-    )
-    ways: dict[int, tuple[str, ...]] = {start: ()}
-    queue = deque([start])
-    while queue:
-        n = queue.popleft()
-        for k in after.get(n, ()):
-            way = (*ways[n], moves[k].action.name)
-            if k in due or moves[k].target in unseen:
-                return way
-            if moves[k].target not in ways and moves[k].how != "unknown":
-                ways[moves[k].target] = way
-                queue.append(moves[k].target)
-    return ()
+    graph = _graph(move for move in moves if move.how != "unknown")
+    graph.add_node(start)
+    ways = nx.single_source_shortest_path(graph, start)
+    goals = [
+        (len(ways[move.source]), k not in due, k)
+        for k, move in enumerate(moves)
+        if (k in due or move.target in unseen) and move.source in ways
+    ]
+    if not goals:
+        return ()
+    last = moves[min(goals)[-1]]
+    way = (graph.edges[edge]["action"] for edge in pairwise(ways[last.source]))
+    return (*way, last.action.name)
 
 
 def reached_from(moves: Iterable[StanceMove], start: int) -> set[int]:
     """Find all stances (place, heading) that moves from `start` reach, including `start`."""
-    return followed_from(((move.source, move.target) for move in moves), start)
+    graph = _graph(moves)
+    return {start} | (nx.descendants(graph, start) if start in graph else set())
 
 
-def followed_from(links: Iterable[tuple[T, T]], start: T) -> set[T]:
-    """Find all nodes that links (pairs of source and target) reach, including `start`."""
-    after = gathered(links)
-    return set(reached([start], lambda n: after.get(n, ())))
+def _graph(moves: Iterable[StanceMove]) -> nx.DiGraph[int]:
+    """Make the graph of the stances and of the moves between them."""
+    edges = ((move.source, move.target, {"action": move.action.name}) for move in moves)
+    return nx.DiGraph(edges)
