@@ -21,9 +21,9 @@ import numpy as np
 from arguments import seeds_from
 from numpy.typing import NDArray
 
+from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning, PerceptionError
 from perception.images import images_of
-from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
 from simulator.driver import Tolerance
 from simulator.robot import Laser

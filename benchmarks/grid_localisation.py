@@ -46,8 +46,8 @@ from grid_worlds import Scene, boxes, comb, maze, rectangle, ring, taylor_hall
 from localisation import first, in_front, spliced
 from numpy.typing import NDArray
 
+from perception.appearance import ReciprocalTransformer
 from perception.images import images_of
-from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
 from simulator.world import World
 from ssh_abduction import Localiser, Trace

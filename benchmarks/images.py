@@ -19,7 +19,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.reciprocal import ReciprocalTransformer
+from perception.appearance import ReciprocalTransformer
 from perception.recognition import PlaceRecogniser
 from perception.views import ViewClusterer
 from simulator.robot import Laser

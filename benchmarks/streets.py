@@ -23,8 +23,8 @@ import networkx as nx
 import planar
 from arguments import add_number
 
+from perception.appearance import ReciprocalTransformer
 from perception.images import images_of
-from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
 from simulator.errors import SimulatorError
 from simulator.tours import simulate

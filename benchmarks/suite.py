@@ -61,8 +61,8 @@ def taylor_hall(seed: int) -> Walk:
 
 
 def _taylor_hall(seed: int) -> Walk:
+    from perception.appearance import ReciprocalTransformer
     from perception.images import images_of
-    from perception.reciprocal import ReciprocalTransformer
     from perception.views import ViewClusterer
     from simulator.tours import simulate
     from simulator.world import World

@@ -215,8 +215,8 @@ def taylor_hall(tours: int, seeds: Sequence[int], noise: Noise) -> Iterator[Know
 
 def drive(tours: int, seed: int, body: Body) -> Trace:
     """Simulate tours of Taylor Hall, and cluster the images into views."""
+    from perception.appearance import ReciprocalTransformer
     from perception.images import images_of
-    from perception.reciprocal import ReciprocalTransformer
     from perception.views import ViewClusterer
     from simulator.tours import simulate
     from simulator.world import World

@@ -19,10 +19,9 @@ from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator
 from sklearn.pipeline import Pipeline
 
-from perception.appearance import PanoramaTransformer
+from perception.appearance import PanoramaTransformer, ReciprocalTransformer
 from perception.errors import PerceptionError
 from perception.images import refuse_huge
-from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import ImageLikelihood, PlaceRecogniser
 from perception.views import ViewClusterer
 from ssh_abduction.data.errors import brief, is_whole

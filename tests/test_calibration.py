@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from perception.places.closures import VisitMatch, factor_of
-from perception.places.matching import Match
+from perception.places.distinctive import Visit
+from perception.places.local_map import Match
 from perception.places.track import Array, Track, points_turned
-from perception.places.visits import Visit
 
 # The stated standard deviations of a motion, in metres and radians.
 STATED = np.array([0.02, 0.02, 0.01])

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from perception.places.closures import VisitMatch, agreeing, fitted_poses
-from perception.places.matching import Match
+from perception.places.distinctive import Visit
+from perception.places.local_map import Match
 from perception.places.track import Array, Track, points_turned
-from perception.places.visits import Visit
 
 # The robot drives 12 m and comes back on the other side of a long loop.
 OUT = np.column_stack([np.arange(0.0, 12.1, 0.5), np.zeros(25), np.zeros(25)])

@@ -9,11 +9,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from perception.places.distinctive import find_visits
+from perception.places.distinctive import Visit, Way, find_visits
 from perception.places.local_map import CELL, LocalMaps, Patch, Recent
 from perception.places.skeleton import junctions
 from perception.places.track import Track
-from perception.places.visits import Visit, Way
 from perception.readers.scans import LaserScanner, RobotLog, Scan
 from simulator.robot import meetings
 from ssh_abduction.data.odometry import radians_between

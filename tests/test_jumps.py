@@ -16,12 +16,12 @@ from coarse import every_second_beam, hall
 
 from perception.errors import LogError
 from perception.places import importing
+from perception.places.distinctive import Visit
 from perception.places.following import turned_wrongly
 from perception.places.importing import import_log, tracked
 from perception.places.jumps import Unknown, describe_cuts, keep_one_source, unknown_steps
 from perception.places.tracing import starts_of_drives
 from perception.places.track import Track
-from perception.places.visits import Visit
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.drives import drives_of, starts_of

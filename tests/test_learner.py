@@ -22,11 +22,10 @@ from sklearn.cluster import DBSCAN, AgglomerativeClustering
 from sklearn.mixture import GaussianMixture
 from sklearn.model_selection import cross_val_score
 
+from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning, PerceptionError
-from perception.features import telling_features
 from perception.images import images_of
-from perception.reciprocal import ReciprocalTransformer
-from perception.recognition import learning_curve
+from perception.recognition import learning_curve, telling_features
 from perception.views import ViewClusterer
 from simulator.robot import BEARINGS, Laser
 from simulator.tours import simulate

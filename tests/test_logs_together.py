@@ -18,12 +18,10 @@ import pytest
 from coarse import every_second_beam
 
 from perception.errors import LogError
-from perception.places.closures import VisitMatch
+from perception.places.closures import DriveScenes, VisitMatch, agreeing_matches, without_clashes
 from perception.places.importing import Imported, import_log
 from perception.places.joining import join_logs
-from perception.places.local_map import CELL, Patch
-from perception.places.matching import LocalScene, Match
-from perception.places.unrelated import DriveScenes, agreeing_matches, without_clashes
+from perception.places.local_map import CELL, LocalScene, Match, Patch
 from perception.readers.scans import RobotLog
 from perception.readers.writers import write_carmen
 from simulator.tours import record

@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 from test_distinctive import log_of
 
-from perception.places import closures, matching
+from perception.places import closures, local_map
 from perception.places.closures import VisitMatch, find_closures, uncertainty
-from perception.places.distinctive import WINDOW, find_visits
+from perception.places.distinctive import WINDOW, Visit, Way, find_visits
 from perception.places.following import ScanMotion, Surfaces
-from perception.places.local_map import CELL, PackedPatch, Patch
-from perception.places.matching import LocalScene, Match, Turned, match
+from perception.places.local_map import CELL, LocalScene, Match, PackedPatch, Patch, Turned, match
 from perception.places.tracing import closure_of, to_trace
 from perception.places.track import Track, odometer_covariance, points_turned
-from perception.places.visits import Visit, Way
 from perception.readers.scans import LaserScanner, RobotLog, Scan
 from ssh_abduction.data.odometry import displacement_between
 
@@ -63,7 +61,7 @@ def test_match_finds_turn_and_shift_of_a_room(turn: float, x: float, y: float) -
 def test_match_that_slides_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     shifted, room = scene(patch_of(0.3, 0.6, -0.4)), Turned.of(scene(patch_of()), [0.3])
     assert match(shifted, room) is not None
-    monkeypatch.setattr(matching, "SLID", 0.1)  # the coarse shift is 0.2 m off
+    monkeypatch.setattr(local_map, "SLID", 0.1)  # the coarse shift is 0.2 m off
     assert match(shifted, room) is None
 
 

@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from perception.places.closures import VisitMatch
-from perception.places.matching import Match
+from perception.places.distinctive import Visit
+from perception.places.local_map import Match
 from perception.places.partings import PACE, lead_apart, with_partings
 from perception.places.track import Array, Track, points_moved
-from perception.places.visits import Visit
 
 Points = Sequence[tuple[float, float]]
 

@@ -33,9 +33,8 @@ from sklearn.preprocessing import FunctionTransformer
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from perception import quality, store, views
-from perception.appearance import PanoramaTransformer
+from perception.appearance import PanoramaTransformer, ReciprocalTransformer
 from perception.errors import ImageWarning, PerceptionError
-from perception.features import strongest, telling_features
 from perception.quality import (
     cluster_quality,
     cluster_spread,
@@ -46,8 +45,13 @@ from perception.quality import (
     uncertainty_coefficient,
     warn_of_doubts,
 )
-from perception.reciprocal import ReciprocalTransformer
-from perception.recognition import PlaceRecogniser, learning_curve, recogniser
+from perception.recognition import (
+    PlaceRecogniser,
+    learning_curve,
+    recogniser,
+    strongest,
+    telling_features,
+)
 from perception.views import ViewClusterer, as_view_clusterer
 from ssh_abduction.data.errors import AbductionError
 

@@ -20,8 +20,8 @@ os.environ["SOURCE_DATE_EPOCH"] = (
 import matplotlib
 import numpy as np
 
-from perception.features import telling_features
 from perception.images import images_of
+from perception.recognition import telling_features
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Theory, Trace, solve

@@ -30,11 +30,18 @@ from itertools import chain
 
 import numpy as np
 
+from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning, LogError
 from perception.places import following, jumps, log_checks
 from perception.places.agreement import disagreement
-from perception.places.closures import agreeing, factor_of, find_closures, fitted_poses
-from perception.places.distinctive import WIDTH, WINDOW, find_visits, visits_of
+from perception.places.closures import (
+    agreeing,
+    closures_across_cuts,
+    factor_of,
+    find_closures,
+    fitted_poses,
+)
+from perception.places.distinctive import WIDTH, WINDOW, Visit, find_visits, patches_of, visits_of
 from perception.places.following import (
     Followed,
     GrowingTrack,
@@ -47,10 +54,7 @@ from perception.places.log_checks import HOPELESS, LEAST_WAY, Units, units_of
 from perception.places.partings import with_partings
 from perception.places.tracing import starts_of_drives, to_trace
 from perception.places.track import Array, Track
-from perception.places.unrelated import closures_across_cuts
-from perception.places.visits import Visit, patches_of
 from perception.readers.scans import Damage, RobotLog, Scan, ScanTable, without_ranges
-from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer
 from ssh_abduction.data.checks import a_function, a_number
 from ssh_abduction.data.errors import brief, named

@@ -16,11 +16,11 @@ from itertools import accumulate, chain
 
 import numpy as np
 
+from perception.places.closures import closures_between
+from perception.places.distinctive import Visit
 from perception.places.importing import Imported, with_views
 from perception.places.tracing import closure_of
 from perception.places.track import Array, Track
-from perception.places.unrelated import closures_between
-from perception.places.visits import Visit
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.trace import Trace

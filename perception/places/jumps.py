@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.readers.poses import RecordedTrack as Odometry
-from perception.readers.poses import sources_of
+from perception.readers.bags import RecordedTrack as Odometry
+from perception.readers.bags import sources_of
 from perception.readers.scans import Array, RobotLog, Scan, in_turn
 from ssh_abduction.data.odometry import Pose, displacement_between
 from ssh_abduction.data.words import counted

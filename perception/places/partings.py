@@ -29,9 +29,8 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist, pdist, squareform
 
 from perception.places.closures import VisitMatch
-from perception.places.distinctive import RIM, STAY
+from perception.places.distinctive import RIM, SAME, STAY, Visit, Way, taken
 from perception.places.track import Array, Track, points_turned
-from perception.places.visits import SAME, Visit, Way, taken
 
 # A stretch reaches REACH metres of trajectory to both sides of a visit. Partings between them and
 # FARTHER metres are found after those, as the trajectories are aligned less well there. The points

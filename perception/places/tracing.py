@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.places.closures import DRIFT, NOISE, VisitMatch, uncertainty
-from perception.places.distinctive import RIM, SMALL
+from perception.places.distinctive import RIM, SMALL, Visit, Way, patches_of
 from perception.places.local_map import CELL, PackedPatch
 from perception.places.track import Array, Track, covariance_turned, points_turned, wrapped
-from perception.places.visits import Visit, Way, patches_of
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.odometry import (
     Closure,

@@ -19,8 +19,8 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.runtime import program
 
 if TYPE_CHECKING:
+    from perception.places.distinctive import Visit
     from perception.places.importing import Imported
-    from perception.places.visits import Visit
     from perception.readers.scans import RobotLog
 
 

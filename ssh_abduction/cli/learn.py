@@ -352,8 +352,8 @@ def run_recognise(options: argparse.Namespace) -> int:
 
 def run_tell_apart(options: argparse.Namespace) -> int:
     """Run the verb `tell-apart`: print the laser beams that distinguish pairs of dstates."""
-    from perception.features import strongest, telling_features
-    from perception.reciprocal import ReciprocalTransformer
+    from perception.appearance import ReciprocalTransformer
+    from perception.recognition import strongest, telling_features
 
     check_picture(options.plot)
     ranges, labels, ssh_map, features = _mapped(options)

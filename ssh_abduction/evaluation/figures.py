@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.features import TellingFeatures
-from perception.recognition import LearningCurve
+from perception.recognition import LearningCurve, TellingFeatures
 from simulator.robot import BEARINGS
 from simulator.world import World
 from ssh_abduction.data.checks import needed

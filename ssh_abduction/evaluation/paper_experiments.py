@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from sklearn.metrics import confusion_matrix
 from sklearn.model_selection import StratifiedKFold
 
+from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning
 from perception.images import images_of
 from perception.quality import uncertainty_coefficient
-from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import LearningCurve, learning_curve, recogniser
 from perception.views import ViewClusterer
 from simulator.driver import STILL
