@@ -25,7 +25,7 @@ from scipy.spatial.distance import cdist
 
 from ssh_abduction import Solution, SSHMap, Trace
 from ssh_abduction.evaluation import told_poses
-from ssh_abduction.robot_logs.log_picture import edges_of, frechet, resampled
+from ssh_abduction.robot_logs.log_picture import edges_of, resampled
 
 Array = NDArray[np.float64]
 # Two visits are at one place if their middles are within ONE metres. Within SURE metres, no
@@ -167,6 +167,19 @@ def course_of(way: Array, middles: Array, radii: Sequence[float]) -> Array:
     first = int(np.argmax(outside[0])) if outside[0].any() else len(fine)
     last = len(fine) - int(np.argmax(outside[1][::-1])) if outside[1].any() else 0
     return resampled(np.concatenate([middles[:1], fine[first:last], middles[1:]]), STEP)
+
+
+def frechet(first: Array, second: Array) -> float:
+    """Compute the discrete Fréchet distance of two sequences of points, (n, 2), in metres."""
+    far = cdist(first, second)
+    best = np.empty(far.shape)
+    best[0] = np.maximum.accumulate(far[0])
+    best[:, 0] = np.maximum.accumulate(far[:, 0])
+    for i in range(1, len(far)):
+        before = np.minimum(best[i - 1, 1:], best[i - 1, :-1])
+        for j in range(1, far.shape[1]):
+            best[i, j] = max(far[i, j], min(best[i, j - 1], before[j - 1]))
+    return float(best[-1, -1])
 
 
 def is_one(first: Array, second: Array) -> bool:

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from worlds import rectangle
 
 from ssh_abduction import SSHMap, Trace, solve
-from ssh_abduction.cli import jobs, main, verbosity, view
+from ssh_abduction.cli import jobs, main, verbosity
 
 # Hypothesis has no deadlines, because clingo takes a hundred times as long for some random traces
 # as for others. Examples are the same in each run, unless NEW_EXAMPLES is set.
@@ -31,9 +31,6 @@ settings.load_profile("the same everywhere")
 
 # Commands print no progress by default. Tests of progress set the interval.
 verbosity.EVERY = math.inf
-
-# A page may spend three seconds on the costs of assumptions. Only tests of these costs allow it.
-view.ASSUMING = 0.1
 
 # Background processes and their children ignore Ctrl-C. Restore the handler for tests.
 with contextlib.suppress(ValueError):

@@ -29,9 +29,7 @@ from ssh_abduction.cli.parsing import Parser
 from ssh_abduction.data import Action, DState, MapError, Step, TraceError, together
 from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
-from ssh_abduction.explain.pair_reasons import explain_pair
 from ssh_abduction.page import html
-from ssh_abduction.page.answers import assumptions
 from ssh_abduction.page.content import DRAWN, content_of
 from ssh_abduction.page.html import Page
 from ssh_abduction.page.replays import ALPHABET, LOST, beams_of, drawn_images
@@ -133,20 +131,17 @@ def test_page_draws_ranges_at_the_bearings_of_the_header() -> None:
         drawn_images(replace(trace, extra={"beams": {"first": 0, "step": 200}}))
 
 
-def test_page_shows_images_of_a_sidecar_file_and_panoramas(
+def test_page_shows_ranges_of_a_sidecar_file_and_no_panoramas(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shape = [2, 3, 1]
     np.savez(tmp_path / "images.npz", images=np.arange(12).reshape(2, 6) * 20)
     steps = (Step("a", Action("on"), image=1), Step("b", image=0))
-    trace = Trace(
-        steps, images="images.npz", extra={"panorama": shape}, source=str(tmp_path / "trace.jsonl")
-    )
+    trace = Trace(steps, images="images.npz", source=str(tmp_path / "trace.jsonl"))
     drawn = drawn_images(trace)
     assert drawn is not None
-    assert (drawn["kind"], drawn["rows"], drawn["columns"]) == ("panorama", 2, 3)
     assert drawn["images"][1][0] == ALPHABET[0]
     assert drawn["images"][0][0] > drawn["images"][1][0]
+    assert drawn_images(replace(trace, extra={"panorama": [2, 3, 1]})) is None
     monkeypatch.setattr("ssh_abduction.page.replays.MOST", 1)
     with pytest.warns(UserWarning, match="2 images are more than a page holds"):
         assert drawn_images(trace) is None
@@ -295,9 +290,8 @@ def test_view_page_refuses_a_trace_of_other_maps(rivals: Solution, route: Trace)
 
 
 def test_view_writes_a_page_with_beliefs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("ssh_abduction.cli.view.ASSUMING", 1000.0)  # enough for all costs
     trace = Trace.from_steps("abcbabcb", ["on"] * 7)
     maps, run, page = (str(tmp_path / name) for name in ("maps.json", "it's.jsonl", "page.html"))
     solution = solve(trace, Theory.causal())
@@ -312,8 +306,6 @@ def test_view_writes_a_page_with_beliefs(
     assert shown["replays"][0]["beliefs"]["0"] == again["replays"][0]["beliefs"]["0"]
     assert shown["flags"] == " --theory causal"
     assert shown["trace"] == f"'{tmp_path}/it'\"'\"'s.jsonl'"
-    assert main(["view", maps, "-o", page]) == 0  # solve -o puts the trace into the file
-    assert shown_in(page)["assuming"] == shown["assuming"]
     bare = tmp_path / "bare.json"
     bare.write_text(json.dumps(solution.to_dict()))
     for words, said in (
@@ -322,24 +314,6 @@ def test_view_writes_a_page_with_beliefs(
     ):
         assert main(["view", *words, "--set", "open=false"]) == 1
         assert said in capsys.readouterr().err
-
-
-def test_page_costs_of_assumptions_equal_explain_pair() -> None:
-    trace = Trace.from_steps("abab", ["travel", "travel", "around"])
-    solution = solve(trace, max_maps=None)
-    known = assumptions(Listing.of(solution), trace, Theory(), seconds=1000)
-    assert known == {pair: explain_pair(trace, *pair, max_maps=None).assuming for pair in known}
-    assert {text for told in known.values() for text in told.values()} > {
-        "no map satisfies the axioms"
-    }
-    agreed = {
-        (i, j)
-        for j in range(4)
-        for i in range(j)
-        if len({m.labels[i] == m.labels[j] for m in solution.maps}) == 1
-    }
-    assert known.keys() == agreed
-    assert assumptions(Listing.of(solution), trace, Theory(), seconds=1e-9) == {}
 
 
 def shown_in(page: str) -> Any:
@@ -525,11 +499,7 @@ class Shown:
 
 def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, Any]) -> None:
     file = tmp_path / "page.html"
-    assuming = {
-        "texts": ["no map satisfies the axioms", "costs nothing, as it holds in every map"],
-        "pairs": {"0,1": [0, 1]},
-    }
-    Page({**content, "assuming": assuming}).save(file)
+    Page(content).save(file)
     page = Shown(browser, file.as_uri())
     assert (
         page["sentence"].text
@@ -547,8 +517,6 @@ def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, An
     assert page["at"].text == "1 of 22"
     assert "in all maps" in page["rivals"].text
     page.click("one")
-    page.choose(0, 1)
-    assert page["costs"].text.split("\n")[1::2] == assuming["texts"]
     assert page["joins"].text.split("\n") == [f"steps {a} and {b}" for a, b, _ in content["joins"]]
     page["joins"].find_element("tag name", "button").click()
     assert page["verdict"].text.startswith("Steps 0 and 9: one dstate in every minimal map")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import shlex
 import tempfile
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,9 +27,6 @@ if TYPE_CHECKING:
     from ssh_abduction.page.replays import Run
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.theory.theory import Theory
-
-
-ASSUMING = 3.0  # Seconds to compute the costs of assumptions that the page may ask about.
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -106,10 +102,7 @@ def run(options: argparse.Namespace) -> int:
     if options.serve:
         assert trace is not None
         return _serve(options, listing, trace, theory, localised, called)
-    content = content_of(listing, trace, localised, called)
-    if trace is not None and theory is not None:
-        content["assuming"] = _assuming(listing, trace, theory)
-    page = Page(content)
+    page = Page(content_of(listing, trace, localised, called))
     file = options.output or str(Path(tempfile.mkdtemp(prefix="ssh-abduction-")) / "maps.html")
     page.save(file)
     print(file)
@@ -130,24 +123,6 @@ def _check(options: argparse.Namespace, trace: Trace | None) -> None:
         )
     if not 0 <= options.port <= 65535:
         raise AbductionError(f"port: expected 0 to 65535, got {options.port}; name a free port")
-
-
-def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
-    """Compute the costs of assumptions that the page can show without a server.
-
-    `pairs` has, for each pair of steps "i,j", the indices of two of the `texts`: the cost if both
-    are one dstate, and if they are different ones.
-    """
-    from ssh_abduction.page.answers import assumptions
-
-    try:
-        known = assumptions(listing, trace, theory, ASSUMING)
-    except AbductionError:  # the theory of the file does not suit this trace
-        known = {}
-    both = {f"{i},{j}": (c["same"], c["different"]) for (i, j), c in known.items()}
-    number = {text: k for k, text in enumerate(dict.fromkeys(chain(*both.values())))}
-    pairs = {pair: [number[text] for text in texts] for pair, texts in both.items()}
-    return {"texts": list(number), "pairs": pairs}
 
 
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:

@@ -20,7 +20,7 @@ import json
 import math
 import os
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -668,7 +668,9 @@ class _CorrectionsReader(FieldReader):
             ways = tuple((step, direction(way)) for step, way in seen.items())
         return self._made(Passage, where, record, state == "open", ways)
 
-    def _made(self, kind: type[T], where: str, record: Mapping[str, Any], /, *values: Any) -> T:
+    def _made(
+        self, kind: Callable[..., T], where: str, record: Mapping[str, Any], /, *values: Any
+    ) -> T:
         """Make a sentence from its values and the note of its record, which may be empty."""
         with said_of(f"{self.where}: {where}", MapError):
             return kind(*values, record.get("note") or None)

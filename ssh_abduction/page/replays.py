@@ -2,7 +2,7 @@
 
 A belief gives the probability that the robot is at each dstate (a place and a heading) of a map.
 
-Images are laser ranges or panoramas, all on one scale. Each number becomes one character, which
+Images are laser ranges, all on one scale. Each number becomes one character, which
 compresses better than digits. The alphabet has no character that HTML or JSON would escape.
 """
 
@@ -35,7 +35,6 @@ MOST = 100_000  # characters of all images of a page
 # The most beams of an image. If FEWEST beams per image are too many for the page, all images are
 # left out.
 BEAMS, FEWEST = 181, 24
-PIXELS = (12, 90)  # the most rows and columns of a panorama
 # The longest range that is drawn, as a percentile of all ranges. The longest of all may be that of
 # a corridor, which would make all rooms small.
 FAR = 95
@@ -193,13 +192,12 @@ def beams_of(trace: Trace, count: int) -> tuple[float, float]:
 
 
 def drawn_images(trace: Trace) -> dict[str, Any] | None:
-    """Encode the images of a trace.
+    """Encode the laser images of a trace.
 
     Returns:
-        A dict with `kind` and with `images`, which has a text or None for each step. The kind
-        "ranges" also has `first` and `step` (degrees counterclockwise) and `reach` (the metres that
-        the last character of the alphabet means). The kind "panorama" also has `rows`, `columns`
-        and `colours`. None if the trace has no images that can be read, or too many for a page.
+        A dict with `images`, which has a text or None for each step; `first` and `step` (degrees
+        counterclockwise); and `reach` (the metres that the last character of the alphabet means).
+        None if the trace has no laser images that can be read, or too many for a page.
     """
     try:
         held = images_held(trace)
@@ -207,22 +205,21 @@ def drawn_images(trace: Trace) -> dict[str, Any] | None:
         warnings.warn(f"{error}; the page is made without images", stacklevel=2)
         return None
     known = [image for image in held if image is not None]
-    if not known:
+    if not known or "panorama" in trace.extra:
         return None
-    panorama = trace.extra.get("panorama")
-    if panorama is not None:
-        return _panoramas(held, panorama, MOST // len(known))
     most = max(len(image) for image in known)
     first, step = beams_of(trace, most)
     # Leave out beams until all images fit. If too few would remain, leave out the images.
     every = max(-(-most // BEAMS), -(-most * len(known) // MOST))
     if -(-most // every) < min(FEWEST, most):
-        _warn_of_too_many(len(known))
+        warnings.warn(
+            f"{len(known)} images are more than a page holds; the page is made without images",
+            stacklevel=2,
+        )
         return None
     ranges = np.concatenate([image[np.isfinite(image) & (image > 0)] for image in known])
     reach = float(np.percentile(ranges, FAR)) if len(ranges) else 1.0
     return {
-        "kind": "ranges",
         "first": round(first, 3),
         "step": round(step * every, 4),
         "reach": round(reach, 2),
@@ -236,42 +233,4 @@ def _text(shares: NDArray[np.float64]) -> str:
     return "".join(
         LOST if math.isnan(x) else ALPHABET[round(last * min(max(x, 0.0), 1.0))]
         for x in shares.tolist()
-    )
-
-
-def _panoramas(
-    held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
-) -> dict[str, Any] | None:
-    """Encode panoramas at a lower resolution. None for a wrong shape, or for too many images."""
-    is_shape = isinstance(shape, list) and all(isinstance(n, int) and n > 0 for n in shape)
-    if not is_shape or len(shape) != 3:
-        return None
-    if any(image is not None and len(image) != math.prod(shape) for image in held):
-        return None
-    # Halve the rows and columns until an image is short enough.
-    rows, columns = min(PIXELS[0], shape[0]), min(PIXELS[1], shape[1])
-    while rows * columns * shape[2] > each:
-        if rows * columns == 1:
-            _warn_of_too_many(sum(image is not None for image in held))
-            return None
-        rows, columns = max(1, rows // 2), max(1, columns // 2)
-    row, column = (
-        np.linspace(0, n - 1, k).round().astype(int)
-        for n, k in ((shape[0], rows), (shape[1], columns))
-    )
-    return {
-        "kind": "panorama",
-        "rows": rows,
-        "columns": columns,
-        "colours": shape[2],
-        "images": [
-            None if image is None else _text(image.reshape(shape)[row][:, column].ravel() / 255)
-            for image in held
-        ],
-    }
-
-
-def _warn_of_too_many(count: int) -> None:
-    warnings.warn(
-        f"{count} images are more than a page holds; the page is made without images", stacklevel=3
     )

@@ -12,9 +12,6 @@ A course is the way of the robot from the middle of one place to the middle of t
 says where these middles are. Travels between the same two places are on one edge if their courses
 lie close together. So two ways that leave a place in nearly one direction are two edges, and a
 robot that cuts a corner is on the same edge as one that does not.
-
-Reference:
-    Eiter & Mannila 1994, "Computing discrete Fréchet distance".
 """
 
 from __future__ import annotations
@@ -83,7 +80,7 @@ SURE = 0.95
 # The colour of edges that belong to no meaningful path, of walls, and of the robot's way.
 EDGE, WALL, WAY = "#0072b2", "#8a8a8a", "#c9d4df"
 ASIDE = 5.0  # metres between drives that no map joins
-# Two courses are one edge if their Fréchet distance is at most APART metres. They are compared at
+# Two courses are one edge if their Hausdorff distance is at most APART metres. They are compared at
 # points STEP metres apart.
 APART, STEP = 1.5, 0.25
 # Standard deviations of the heading at a dstate in radians, and of the chord of a course in metres.
@@ -429,26 +426,16 @@ def grouped(travels: Iterable[tuple[Any, Any, Array]]) -> list[int]:
     The places can be compared. A course is (n, 2) metres, with points STEP apart. Any two travels
     on one edge are close together.
     """
-    between: dict[tuple[Any, Any], list[tuple[int, Array]]] = defaultdict(list)
+    between: dict[tuple[Any, Any], dict[int, Array]] = defaultdict(dict)
     for k, (first, last, course) in enumerate(travels):
-        ends = min(first, last), max(first, last)
-        between[ends].append((k, course if first == ends[0] else course[::-1]))
+        between[min(first, last), max(first, last)][k] = course
     edges: dict[int, tuple[Any, ...]] = {}
     for ends, alike in between.items():
-        far = [
-            _apart(one, other, loop=ends[0] == ends[1])
-            for (_, one), (_, other) in combinations(alike, 2)
-        ]
+        far = [apart(one, other) for one, other in combinations(alike.values(), 2)]
         parts = fcluster(linkage(far, "complete"), APART, "distance") if far else [1]
-        edges |= {k: (*ends, part) for (k, _), part in zip(alike, parts, strict=True)}
+        edges |= {k: (*ends, part) for k, part in zip(alike, parts, strict=True)}
     numbers: dict[tuple[Any, ...], int] = {}
     return [numbers.setdefault(edges[k], len(numbers)) for k in sorted(edges)]
-
-
-def _apart(one: Array, other: Array, loop: bool) -> float:
-    """The distance of two courses in metres. For loops it does not depend on their directions."""
-    far = frechet(one, other)
-    return min(far, frechet(one[::-1], other)) if loop else far
 
 
 def _laid(trace: Trace, ssh_map: SSHMap, t: int) -> Array:
@@ -483,14 +470,7 @@ def resampled(way: Array, step: float) -> Array:
     return np.stack([np.interp(at, far[moving], way[moving, k]) for k in (0, 1)], axis=1)
 
 
-def frechet(first: Array, second: Array) -> float:
-    """Compute the discrete Fréchet distance of two sequences of points, (n, 2), in metres."""
+def apart(first: Array, second: Array) -> float:
+    """Compute the Hausdorff distance of two sequences of points, (n, 2), in metres."""
     far = cdist(first, second)
-    best = np.empty(far.shape)
-    best[0] = np.maximum.accumulate(far[0])
-    best[:, 0] = np.maximum.accumulate(far[:, 0])
-    for i in range(1, len(far)):
-        before = np.minimum(best[i - 1, 1:], best[i - 1, :-1])
-        for j in range(1, far.shape[1]):
-            best[i, j] = max(far[i, j], min(best[i, j - 1], before[j - 1]))
-    return float(best[-1, -1])
+    return float(max(far.min(axis=0).max(), far.min(axis=1).max()))

@@ -60,7 +60,6 @@ def report(
         "<h2>Settings</h2>" + _settings(run),
         "<h2>Time</h2>" + _time(run),
         "<h2>The log</h2>" + _log(log),
-        "<h2>Visits</h2>" + _visits(imported, solution),
     ]
     body = "\n".join(part for part in parts if part)
     return filled(TEMPLATE, name=html_text(name), body=body)
@@ -180,9 +179,7 @@ def _settings(run: Mapping[str, Any]) -> str:
     """Make the table of the settings: what is a place, the width of the robot, the theory."""
     told = ((n, value) for n, value in run["theory"].items() if value not in (None, False, [], 0))
     theory = "; ".join(f"{name}={_setting(value)}" for name, value in told)
-    why = "where the free space forks, or the robot turned, began or ended"
     rows = [
-        ("places", "junctions, turning points, ends", why),
         ("width", f"{run['width']:g} m", "of the robot; it cannot pass narrower parts"),
         ("theory", theory, "which axioms hold, and what is minimised"),
     ]
@@ -221,26 +218,3 @@ def _log(log: RobotLog) -> str:
         )
         said += [f"{damage.line}: {damage.what}" for damage in log.damaged[:10]]
     return "<ul>" + "".join(f"<li>{html_text(line)}</li>" for line in said) + "</ul>"
-
-
-def _visits(imported: Imported, solution: Solution) -> str:
-    """Make a table with a row for each step: what was seen and done, and its dstate and place."""
-    labels = solution.maps[0].dstate_at if solution.maps else None
-    states = {state.id: state for state in solution.maps[0].dstates} if solution.maps else {}
-    rows = []
-    for t, step in enumerate(imported.trace.steps):
-        state = states[labels[t]] if labels else None
-        # A question mark means that it is uncertain what was seen.
-        star = " ".join(
-            "?"
-            if entry is None
-            else f"{entry:zg}"
-            if isinstance(entry, int | float)
-            else f"{entry.bearing:zg}°{'' if entry.open else '?'}"
-            for entry in step.star or ()
-        )
-        seen = (step.extra["visit"], step.extra["scan"], "?" if step.view is None else step.view)
-        place = "–" if state is None or state.place is None else state.place
-        action = step.action.name if step.action else ""
-        rows.append((t, *seen, star, action, state.id if state else "–", place))
-    return _table(("step", "visit", "scan", "view", "star", "action", "dstate", "place"), rows)

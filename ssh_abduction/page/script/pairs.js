@@ -81,8 +81,6 @@ function tellVerdict(a, b) {
             ? `more than the ${least} dstates of these maps, if there is such a map`
             : "no listed map does this";
   }
-  const told = data.assuming?.pairs[`${Math.min(a, b)},${Math.max(a, b)}`];
-  if (told && !theory()) [cost.same, cost.different] = told.map((k) => data.assuming.texts[k]);
   tellCosts(cost);
 }
 

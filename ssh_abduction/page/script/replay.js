@@ -120,27 +120,11 @@ function tellBelief() {
   }
 }
 
-// Draw ranges around the robot, which is in the middle and faces up, or a panorama as a strip.
+// Draw ranges around the robot, which is in the middle and faces up.
 function drawImage(images, text, star) {
   $("image").replaceChildren();
   const value = (c) => ALPHABET.indexOf(c) / (ALPHABET.length - 1);
-  if (images?.kind === "panorama" && text !== null) {
-    const { rows, columns, colours } = images,
-      canvas = element(
-        "canvas",
-        { width: columns, height: rows, role: "img", "aria-label": "panorama" },
-        null,
-        $("image"),
-      );
-    const context = canvas.getContext("2d"),
-      pixels = context.createImageData(columns, rows);
-    for (let k = 0; k < rows * columns; k++)
-      for (let c = 0; c < 4; c++)
-        pixels.data[4 * k + c] =
-          c === 3 ? 255 : 255 * value(text[k * colours + Math.min(c, colours - 1)]);
-    context.putImageData(pixels, 0, 0);
-  }
-  const ranges = images?.kind === "ranges" && text !== null;
+  const ranges = text !== null;
   if (!ranges && !star?.length) return;
   const behind =
     (ranges &&
