@@ -22,6 +22,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
+from scipy.spatial.distance import cdist
 from skimage.graph import MCP_Geometric
 
 from simulator.driver import Driver
@@ -34,6 +35,8 @@ Cells = NDArray[np.intp]
 Point = tuple[float, float]
 # Side of a cell in metres.
 CELL = 0.1
+# The share of a cell by which rounding may move a point.
+TINY = 1e-6
 # Largest area to plan on, in square metres.
 LARGEST = 200_000
 # The grid reaches this many metres beyond the walls. A part of it reaches this far beyond the
@@ -114,11 +117,10 @@ def _around_obstacles(
     it.
     """
     seen = _obstacles(driver, space, image)
-    ahead = slice(at, at + round(WATCH / CELL))
-    if not len(seen):
-        return way, numbers
-    apart = _apart(space.middles(way[ahead]), space.middles(seen))
-    blocked = np.flatnonzero(apart < space.least)
+    ahead = way[at : at + round(WATCH / CELL)]
+    # Points of the route ahead that are too close to the cells of new obstacles.
+    cells, others = (space.middles(np.column_stack(space.cells(p))) for p in (ahead, seen))
+    blocked = np.flatnonzero((cdist(cells, others) < space.least).any(axis=1))
     if not len(blocked):
         return way, numbers
     # Rejoin the route at the first free point behind the obstacle that can be reached.
@@ -142,14 +144,9 @@ def _obstacles(driver: Driver, space: FreeSpace, image: Array) -> Array:
     angles = heading + BEARINGS[near]
     points = np.column_stack([x + image[near] * np.cos(angles), y + image[near] * np.sin(angles)])
     cells = space.cells(points)
-    new = (space.off[cells] > KNOWN) & ~space.occupied[cells]
-    space.occupied[cells[0][new], cells[1][new]] = True
+    new = (space.clearance[cells] > KNOWN) & ~space.occupied[cells]
+    space.occupied[cells] |= new
     return points[new]
-
-
-def _apart(points: Array, others: Array) -> Array:
-    """The distance from each point to the nearest of other points, (n,)."""
-    return np.asarray(np.hypot(*(points[:, None] - others).transpose(2, 0, 1)).min(1))
 
 
 def _error(driver: Driver, expected: str, got: str) -> SimulatorError:
@@ -167,12 +164,13 @@ class FreeSpace:
     corner: Point  # (x, y) of the lower left corner in metres
     occupied: Mask = field(repr=False)  # (rows, columns) mask of the cells with walls or obstacles
     radius: float  # radius of the robot in metres
-    # (rows, columns) distance in metres to the nearest wall. Obstacles that are marked later do not
-    # count.
-    off: Array = field(init=False, repr=False)
+    # (rows, columns) distance in metres to the nearest cell that is occupied or outside. Obstacles
+    # that are marked later do not count.
+    clearance: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self.off = _clearance(self.occupied)
+        free = np.pad(~self.occupied, 1)
+        self.clearance = distance_transform_edt(free)[1:-1, 1:-1] * CELL
 
     @classmethod
     def of(cls, segments: Array, radius: float) -> FreeSpace:
@@ -202,10 +200,7 @@ class FreeSpace:
         cells = np.zeros_like(self.occupied)
         for x1, y1, x2, y2 in segments:
             count = 2 + math.ceil(math.hypot(x2 - x1, y2 - y1) / (CELL / 2))
-            rows, columns = self.cells(
-                np.column_stack([np.linspace(x1, x2, count), np.linspace(y1, y2, count)])
-            )
-            cells[rows, columns] = True
+            cells[self.cells(np.linspace((x1, y1), (x2, y2), count))] = True
         return cells
 
     def cells(self, points: Array) -> tuple[Cells, Cells]:
@@ -213,56 +208,45 @@ class FreeSpace:
 
         A point outside the grid has the nearest cell.
         """
-        columns, rows = np.floor((points - np.array(self.corner)) / CELL).astype(np.intp).T
-        return rows.clip(0, self.occupied.shape[0] - 1), columns.clip(0, self.occupied.shape[1] - 1)
+        cells = np.floor((points - np.array(self.corner)) / CELL + TINY).astype(np.intp)
+        columns, rows = cells.clip(0, np.array(self.occupied.shape[::-1]) - 1).T
+        return rows, columns
 
-    def middles(self, points: Array) -> Array:
-        """Move points, (n, 2) in metres, to the centres of their cells."""
-        return _middles(np.column_stack(self.cells(points)), self.corner)
+    def middles(self, cells: Cells) -> Array:
+        """Compute the centres, (n, 2) metres, of cells, (n, 2) rows and columns."""
+        return np.asarray((cells[:, ::-1] + 0.5) * CELL + np.array(self.corner))
 
-    def part(self, points: Array, closed: Mask | None = None) -> FreeRectangle:
-        """Make a `FreeRectangle`: a rectangle of the grid around some points, (n, 2) metres.
+    def off(self, points: Array) -> Array:
+        """Measure how far points, (n, 2), are from occupied cells: (n,), metres."""
+        return np.asarray(self.clearance[self.cells(points)])
 
-        `closed` is a mask, (rows, columns), of further cells that count as occupied.
+    def part(self, points: Array, closed: Mask | None = None) -> FreeSpace:
+        """Cut out a rectangle of the grid around some points, (n, 2) metres.
+
+        Obstacles that were marked before count. `closed` is a mask, (rows, columns), of further
+        cells that count as occupied.
         """
         rows, columns = self.cells(np.vstack([points.min(0) - MARGIN, points.max(0) + MARGIN]))
         window = slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1)
-        occupied = (
-            self.occupied[window] if closed is None else self.occupied[window] | closed[window]
-        )
+        occupied = self.occupied if closed is None else self.occupied | closed
         corner = self.corner[0] + CELL * int(columns[0]), self.corner[1] + CELL * int(rows[0])
-        return FreeRectangle(corner, _clearance(occupied), self.least)
-
-
-@dataclass(frozen=True)
-class FreeRectangle:
-    """A rectangular part of free space."""
-
-    corner: Point  # (x, y) of the lower left corner in metres
-    # (rows, columns) distance in metres to the nearest occupied cell.
-    clearance: Array = field(repr=False)
-    least: float  # smallest distance of the robot's middle from occupied cells, in metres
+        return FreeSpace(corner, occupied[window], self.radius)
 
     def way(self, start: Point, goal: Point) -> Array | None:
         """Find a route between points (x, y): short, and ROOM metres from walls if possible.
 
         It is (n, 2) metres, with a point in each cell; None if there is no route.
         """
-        ends = np.column_stack(self._cells(np.array([start, goal])))
+        ends = np.column_stack(self.cells(np.array([start, goal])))
         cells = _shortest(self.clearance, self.least, *map(tuple, ends.tolist()))
         if cells is None:
             return None
-        way = _middles(cells, self.corner)
+        way = self.middles(cells)
         way[0], way[-1] = start, goal
         # Use a smoothed point only if it is far enough from obstacles.
         smooth = gaussian_filter1d(way, SMOOTH / CELL, axis=0, mode="nearest")
         smooth[0], smooth[-1] = start, goal
-        safe = self.clearance[self._cells(smooth)] >= self.least
-        return np.where(safe[:, None], smooth, way)
-
-    def off(self, points: Array) -> Array:
-        """Measure how far points, (n, 2), are from occupied cells: (n,), metres."""
-        return np.asarray(self.clearance[self._cells(points)])
+        return np.where((self.off(smooth) >= self.least)[:, None], smooth, way)
 
     @cached_property
     def regions(self) -> Cells:
@@ -271,7 +255,7 @@ class FreeRectangle:
 
     def region(self, points: Array) -> Cells:
         """Look up the number of the region of each point, (n, 2) metres; see `regions`."""
-        return np.asarray(self.regions[self._cells(points)])
+        return np.asarray(self.regions[self.cells(points)])
 
     def nearest(self, region: int, goal: Point, room: float) -> Point:
         """Find the point (x, y) of a region, by its number, that is nearest to a goal.
@@ -281,25 +265,9 @@ class FreeRectangle:
         """
         cells = np.argwhere(self.regions == region)
         clearance = self.clearance[tuple(cells.T)]
-        cells = cells[clearance >= min(room, float(clearance.max()))]
-        middles = _middles(cells, self.corner)
+        middles = self.middles(cells[clearance >= min(room, float(clearance.max()))])
         x, y = middles[int(np.hypot(*(middles - np.array(goal)).T).argmin())]
         return float(x), float(y)
-
-    def _cells(self, points: Array) -> tuple[Cells, Cells]:
-        columns, rows = np.floor((points - np.array(self.corner)) / CELL + 1e-6).astype(np.intp).T
-        height, width = self.clearance.shape
-        return rows.clip(0, height - 1), columns.clip(0, width - 1)
-
-
-def _clearance(occupied: Mask) -> Array:
-    """The distance from each cell to the nearest cell that is occupied or outside, in metres."""
-    return np.asarray(distance_transform_edt(np.pad(~occupied, 1))[1:-1, 1:-1] * CELL)
-
-
-def _middles(cells: Cells, corner: Point) -> Array:
-    """The centres, (n, 2) metres, of cells, (n, 2) rows and columns, of a grid with this corner."""
-    return np.asarray((cells[:, ::-1] + 0.5) * CELL + np.array(corner))
 
 
 def _shortest(

@@ -14,6 +14,7 @@ opening (its jambs) are walls, too.
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -23,9 +24,10 @@ from itertools import pairwise
 import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import mode
 from skimage.measure import points_in_poly
 
-from simulator.cruise import CELL, FreeRectangle, FreeSpace, drive_along
+from simulator.cruise import CELL, FreeSpace, drive_along
 from simulator.driver import Driver
 from simulator.errors import SimulatorError
 from simulator.plans import Door, Plan, Room
@@ -38,6 +40,8 @@ from ssh_abduction.data.words import counted
 DOOR, OFF = 1.0, 0.1
 # Walls within this many metres before and behind a door are removed, since they would close it.
 DEPTH = 0.25
+# Walls that are shorter than this, in metres, are points.
+TINY = 1e-6
 Point = tuple[float, float]
 # A room, and the doors by which the robot enters and leaves. None instead of a door means the
 # middle of the room.
@@ -73,18 +77,16 @@ class Rooms:
         # A door becomes an edge if it is in the main connected region of both of its rooms.
         fits = [number for number in range(len(building.openings)) if self._fits(number)]
         reached: Counter[int] = Counter()
-        for room in range(len(building.plan.rooms)):
+        for room, drawn in enumerate(building.plan.rooms):
             doors = [number for number in fits if room in self._sides[number]]
+            if not doors:
+                continue
             part = self._part(room)
-            regions = part.region(
-                np.array([self._sides[number][room] for number in doors]).reshape(-1, 2)
-            ).tolist()
-            if any(regions):
-                region, _ = Counter(filter(None, regions)).most_common(1)[0]
-                self.middles[room] = part.nearest(region, building.plan.rooms[room].centre, MIDDLE)
-                reached.update(
-                    number for number, found in zip(doors, regions, strict=True) if found == region
-                )
+            regions = part.region(np.array([self._sides[number][room] for number in doors]))
+            if regions.any():
+                region = int(mode(regions[regions > 0]).mode)
+                self.middles[room] = part.nearest(region, drawn.centre, MIDDLE)
+                reached.update(np.array(doors)[regions == region].tolist())
         self.graph = nx.MultiGraph()
         self.graph.add_edges_from(
             (*building.plan.doors[number].rooms, number) for number in fits if reached[number] == 2
@@ -115,12 +117,12 @@ class Rooms:
 
     def _fits(self, door: int) -> bool:
         """Whether the robot can drive straight through a door."""
-        line = (
-            _line(*self._sides[door].values()) if len(self._sides[door]) == 2 else np.empty((0, 2))
-        )
-        return len(line) > 0 and bool((self.space.part(line).off(line) >= self.space.least).all())
+        if len(self._sides[door]) < 2:
+            return False
+        line = _line(*self._sides[door].values())
+        return bool((self.space.part(line).off(line) >= self.space.least).all())
 
-    def _part(self, room: int) -> FreeRectangle:
+    def _part(self, room: int) -> FreeSpace:
         """The part of the building around a room, with all doors shut."""
         sides = [sides[room] for sides in self._sides if room in sides]
         return self.space.part(
@@ -132,11 +134,9 @@ def _sides(building: Building, number: int) -> dict[int, Point]:
     """Where the robot begins and ends to drive through a door, by room; empty if unclear."""
     opening, door = building.openings[number], building.plan.doors[number]
     sides = [opening.point(0.0, side * (opening.depth / 2 + APPROACH)) for side in (-1, 1)]
-    here, there = (building.plan.rooms[room] for room in door.rooms)
+    here, there = (building.plan.rooms[room].polygon for room in door.rooms)
     for one, other in (sides, sides[::-1]):
-        if (holds(here.polygon, one) and not holds(here.polygon, other)) or (
-            holds(there.polygon, other) and not holds(there.polygon, one)
-        ):
+        if holds(here, one) > holds(here, other) or holds(there, other) > holds(there, one):
             return {door.rooms[0]: one, door.rooms[1]: other}
     return {}
 
@@ -316,20 +316,16 @@ class Opening:
 
         Across counts to the left.
         """
-        cos, sin = math.cos(self.along), math.sin(self.along)
-        off = points - np.array(self.middle)
-        return np.column_stack(
-            [cos * off[:, 0] + sin * off[:, 1], cos * off[:, 1] - sin * off[:, 0]]
-        )
+        turned = ((points - np.array(self.middle)) @ (1, 1j)) * np.exp(-1j * self.along)
+        return np.column_stack([turned.real, turned.imag])
 
     def point(self, along: float, across: float) -> tuple[float, float]:
         """Compute the point (x, y) at a distance in metres along the wall, and across it.
 
         Along counts from the middle, and across to the left of the direction of the wall.
         """
-        cos, sin = math.cos(self.along), math.sin(self.along)
-        x, y = self.middle
-        return x + cos * along - sin * across, y + sin * along + cos * across
+        point = complex(*self.middle) + complex(along, across) * cmath.rect(1, self.along)
+        return point.real, point.imag
 
     @property
     def threshold(self) -> Array:
@@ -370,7 +366,7 @@ def _outline(room: Room) -> Array:
     """The walls of a room: (n, 4), metres."""
     corners = np.array(room.polygon)
     walls = np.hstack([corners, np.roll(corners, -1, axis=0)])
-    return np.asarray(walls[np.hypot(*(walls[:, 2:] - walls[:, :2]).T) > 1e-6])
+    return np.asarray(walls[np.hypot(*(walls[:, 2:] - walls[:, :2]).T) > TINY])
 
 
 def _opening(plan: Plan, door: Door) -> Opening:
@@ -416,16 +412,9 @@ def _cut(walls: Array, opening: Opening) -> Array:
     half = np.array([opening.width / 2, opening.depth / 2 + DEPTH])
     way = ends - starts
     # For each axis: the shares of a wall's length at which it enters and leaves the rectangle.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        one, other = (-half - starts) / way, (half - starts) / way
-    still = way == 0
-    inside = np.abs(starts) <= half
-    enter = (
-        np.where(still, np.where(inside, -np.inf, np.inf), np.minimum(one, other)).max(1).clip(0, 1)
-    )
-    leave = (
-        np.where(still, np.where(inside, np.inf, -np.inf), np.maximum(one, other)).min(1).clip(0, 1)
-    )
+    way = np.where(np.abs(way) < TINY, TINY, way)
+    shares = np.sort([(-half - starts) / way, (half - starts) / way], axis=0)
+    enter, leave = shares[0].max(1).clip(0, 1), shares[1].min(1).clip(0, 1)
     hit = enter < leave
     way = walls[:, 2:] - walls[:, :2]
     before = np.hstack([walls[:, :2], walls[:, :2] + enter[:, None] * way])[hit & (enter > 0)]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from simulator.cruise import FreeSpace, drive_along
-from simulator.driver import STILL, Corridors, Driver, Tolerance
-from simulator.errors import SimulatorError
+from simulator.driver import STILL, TURNS, Corridors, Driver, Tolerance
+from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.junctions import ACTIONS, Pilot
 from simulator.panorama import Camera
 from simulator.robot import (
@@ -24,16 +27,32 @@ from simulator.robot import (
     Recorder,
     Report,
     SimulatedRobot,
+    meetings,
 )
-from simulator.watch import DriveWatch
-from simulator.world import Array, World
+from simulator.world import Array, World, are_square
 from ssh_abduction.data.checks import a_flag, a_number, a_whole_number, an_instance
-from ssh_abduction.data.odometry import Covariance, Displacement, Odometry
+from ssh_abduction.data.odometry import (
+    Covariance,
+    Odometry,
+    Pose,
+    displacement_between,
+    radians_between,
+)
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.data.words import counted
 
 # More tours than this would take days, and all steps are kept in memory.
 MOST_TOURS = 100_000
+# Largest error, in metres and radians, of a pose that is the same at both ends of a displacement.
+SAME = math.sqrt(3) / 1000
+# Largest distance from the expected place in metres (`reach` if that is larger), and largest
+# difference of heading in radians.
+NEAR, FACING = 0.5, math.radians(45)
+# The next place on a path is at most this far to the side, as a share of its distance ahead.
+STRAIGHT = 0.2
+# With larger errors, the control laws may fail: relative errors of motions and odometry, and errors
+# of ranges in metres.
+NOISY, BLURRED = 0.1, 0.03
 
 
 def simulate(
@@ -68,36 +87,29 @@ def simulate(
             the same seed the drive is the same.
 
     Returns:
-        A trace with tours x actions steps at dstates; its last step has no action. Its `odometry`
-        is the noise model of the displacements. The truth of each step has dstate, place, path and
-        pose, for evaluation only.
+        A trace with tours x actions steps at dstates; its last step has no action. Each
+        displacement has a covariance of its own. The truth of each step has dstate, place, path
+        and pose, for evaluation only.
 
     Raises:
         SimulatorError: The route cannot be driven.
     """
     _check(world, stars, every, camera)
     driver = _driver(world, tours, seed, laser, body, tolerance)
-    body, tolerance = driver.robot.body, driver.tolerance
-    log = OdometryLog(driver.robot)
     # The camera has its own noise, so that it does not change the drive.
     noise = np.random.default_rng([seed, 1])
-    eye = Eye(camera, len(world.segments), noise, tours * len(world.route))
+    log = StepLog(driver, camera, noise, len(world.segments), tours * len(world.route))
     if every is None:
-        steps = list(_at_dstates(driver, log, world, tours, stars, eye))
+        steps = list(_at_dstates(log, world, tours, stars))
     else:
-        steps = _evenly(driver, log, world, tours, every, eye)
+        steps = _evenly(log, world, tours, every)
     steps[-1] = replace(steps[-1], action=None)
-    if every is None and world.angles == "any":
-        # Each displacement has a covariance of its own, so only systematic errors are left.
-        odometry = Odometry(scale=abs(body.scale), bend=abs(body.bend))
-    else:
-        odometry = noise_model(log.reports, body, tolerance if every is None else None)
-    extra = {} if camera is None else {"panorama": list(camera.shape)}
     return Trace(
         tuple(steps),
         name=f"{world.name}, {tours} tours, seed {seed}",
-        odometry=odometry,
-        extra=extra,
+        # Each displacement has its own covariance, so only systematic errors are left.
+        odometry=Odometry(scale=abs(driver.robot.body.scale), bend=abs(driver.robot.body.bend)),
+        extra={} if camera is None else {"panorama": list(camera.shape)},
     )
 
 
@@ -236,38 +248,31 @@ def _check_world(world: World, body: Body) -> None:
         )
 
 
-def _at_dstates(
-    driver: Driver, log: OdometryLog, world: World, tours: int, stars: bool, eye: Eye
-) -> Iterator[Step]:
+def _at_dstates(log: StepLog, world: World, tours: int, stars: bool) -> Iterator[Step]:
     """Drive all tours, and make a step at each dstate."""
-    is_square = world.angles == "right"
+    driver, is_square = log.driver, world.angles == "right"
     pilot = Corridors(driver, looks_behind=stars) if is_square else Pilot(driver)
-    done = ""
+    # Where streets meet at any angles, the robot does not climb after a turn.
+    at_turns = driver.tolerance if is_square else replace(driver.tolerance, close=SAME)
     lifts = {lift.name for lift in world.lifts}
+    done = ""
     for number, action in _legs(driver, world, tours, pilot):
         if done in lifts:
             log.begun = False  # Each floor has a frame of its own.
-        image, displacement = driver.look(STILL), log.displacement()
-        # If streets meet at any angles, turns to look around differ. So each displacement has its
-        # own covariance.
-        covariance = None
-        if displacement is not None and not is_square:
-            covariance = covariance_of(log.reports[-1], driver.tolerance, done)
+        ranges = driver.look(STILL)
         does = Action.of(action) if is_square else ACTIONS[action]
-        yield Step(
-            image=eye.image(driver, image, number),
+        yield log.step(
+            ranges,
+            number,
+            driver.tolerance if done == "travel" else at_turns,
             action=Action(action, "lift") if action in lifts else does,
-            star=pilot.star(image) if stars else None,
-            displacement=displacement,
-            covariance=covariance,
+            star=pilot.star(ranges) if stars else None,
             truth=_truth(world, driver.robot.pose),
         )
         done = action
 
 
-def _evenly(
-    driver: Driver, log: OdometryLog, world: World, tours: int, every: float, eye: Eye
-) -> list[Step]:
+def _evenly(log: StepLog, world: World, tours: int, every: float) -> list[Step]:
     """Drive all tours, and make a step every `every` metres of odometry.
 
     In the truth, the route is divided into pieces of this length. Steps in one piece have one
@@ -285,14 +290,13 @@ def _evenly(
             piece = round((driver.robot.driven - leg_began) / every)
             spot = f"leg {leg % len(world.route)}, {piece}"
             truth = {"dstate": spot, "pose": [round(v, 4) for v in driver.robot.pose]}
-            image = eye.image(driver, driver.look(STILL), leg)
-            travel, onward = Action.of("travel"), log.displacement()
-            logged.append(Step(image=image, action=travel, displacement=onward, truth=truth))
+            ranges, travel = driver.look(STILL), Action.of("travel")
+            logged.append(log.step(ranges, leg, Tolerance(SAME, SAME), action=travel, truth=truth))
             due += every
 
-    driver.on_travel = look
-    for leg, _ in _legs(driver, world, tours):  # noqa: B007 - `look` reads the number of the leg
-        leg_began = driver.robot.driven
+    log.driver.on_travel = look
+    for leg, _ in _legs(log.driver, world, tours):  # noqa: B007 - `look` reads the number
+        leg_began = log.driver.robot.driven
     return logged
 
 
@@ -324,95 +328,225 @@ def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:
 
 
 @dataclass
-class Eye:
-    """Makes the logged image of a step: ranges of the laser, or a panorama."""
+class StepLog:
+    """Makes the steps of a trace: images, and the odometry since the last step."""
 
+    driver: Driver
     camera: Camera | None  # the camera; None to log ranges
-    walls: int  # number of segments of the world without clutter
     rng: np.random.Generator  # source of noise of the camera
+    walls: int  # number of segments of the world without clutter
     # Number of actions of the whole drive. The hour of the day follows from the share that is done.
     actions: int
-
-    def image(self, driver: Driver, ranges: Array, done: int) -> tuple[float, ...]:
-        """Make the image of a step, after `done` actions.
-
-        It has ranges of the laser in metres, or the pixels of a panorama, row by row.
-        """
-        if self.camera is None:
-            return tuple(round(float(r), 4) for r in ranges)
-        hour = self.camera.hour(done / max(self.actions - 1, 1))
-        shot = self.camera.shot(driver.world, driver.robot.pose, self.rng, hour, self.walls)
-        return tuple(shot.ravel().tolist())
-
-
-@dataclass
-class OdometryLog:
-    """Collects the odometry between the logged steps."""
-
-    robot: SimulatedRobot  # whose odometry is collected
-    # Motion by odometry from each step to the next.
-    reports: list[Report] = field(default_factory=list)
     begun: bool = False  # whether a step was logged already on this floor
 
-    def displacement(self) -> Displacement | None:
-        """Return metres ahead and to the left and radians turned since the last step by odometry.
+    def step(self, ranges: Array, done: int, tolerance: Tolerance, **more: Any) -> Step:
+        """Make a step after `done` actions, where the laser sees these ranges, (180,) metres.
 
-        They are rounded. None at a floor's first step.
+        The image has the ranges, or the pixels of a panorama, row by row. The tolerance is that of
+        the poses at both ends of the displacement. `more` has further fields of the step.
         """
-        report = self.robot.report()
-        if not self.begun:
-            self.begun = True
-            return None
-        self.reports.append(report)
-        dx, dy, turned = (round(v, DIGITS) for v in report.displacement)
-        return dx, dy, turned
+        driver, report = self.driver, self.driver.robot.report()
+        if self.camera is None:
+            image = tuple(round(float(r), 4) for r in ranges)
+        else:
+            hour = self.camera.hour(done / max(self.actions - 1, 1))
+            shot = self.camera.shot(driver.world, driver.robot.pose, self.rng, hour, self.walls)
+            image = tuple(shot.ravel().tolist())
+        if self.begun:
+            dx, dy, turned = (round(v, DIGITS) for v in report.displacement)
+            more |= {
+                "displacement": (dx, dy, turned),
+                "covariance": covariance_of(report, tolerance),
+            }
+        self.begun = True
+        return Step(image=image, **more)
 
 
-def noise_model(
-    reports: Sequence[Report], body: Body, tolerance: Tolerance | None = None
-) -> Odometry:
-    """Make a noise model of displacements between dstates, from reports of odometry and climbing.
-
-    The error of each small motion is proportional to the motion, so the relative error of many
-    motions together is smaller. The relative errors of the model are chosen so that they
-    reproduce the mean covariance of the reports. A map describes fixed points. Hill-climbing
-    ends only within its tolerance of the fixed points at both ends of a displacement. The model
-    assumes a uniform distribution of this error. A wrong heading at the beginning also moves
-    the end sideways. The tolerance is None if displacements are not between fixed points.
-    """
-    ways = math.fsum(math.hypot(*r.displacement[:2]) ** 2 for r in reports)
-    turns = math.fsum(r.displacement[2] ** 2 for r in reports)
-    along, across, heading = (
-        np.sum([np.diag(r.covariance) for r in reports], axis=0) if reports else np.zeros(3)
-    )
-    # Choose relative errors that reproduce the total variance of all reports.
-    share = 1 / ways if ways else 0.0
-    offset = tolerance.close / math.sqrt(3) if tolerance else 0.0
-    tilt = tolerance.straight / math.sqrt(3) if tolerance else 0.0
-    errors = {
-        "along": math.sqrt(along * share),
-        "across": math.sqrt(across * share + tilt**2),
-        "heading": math.sqrt(max(heading - body.odometry**2 * turns, 0.0) * share),
-        "turning": body.odometry,
-        "position": math.sqrt(2) * offset,
-        "angle": math.sqrt(2) * tilt,
-        "scale": abs(body.scale),
-        "bend": abs(body.bend),
-    }
-    return Odometry.of({name: round(error, 6) for name, error in errors.items()})
-
-
-def covariance_of(report: Report, tolerance: Tolerance, action: str) -> Covariance:
+def covariance_of(report: Report, tolerance: Tolerance) -> Covariance:
     """Compute the covariance of a displacement between fixed points, reported by odometry.
 
     It includes the errors of odometry and of hill-climbing, which ends anywhere within its
-    tolerance. At both ends of a turn, the fixed point is the same, to a millimetre.
+    tolerance.
     """
     dx, dy, _ = report.displacement
-    near = tolerance.close / math.sqrt(3) if action == "travel" else 0.001
-    left = np.diag([near**2, near**2, tolerance.straight**2 / 3])
+    left = np.diag([tolerance.close**2, tolerance.close**2, tolerance.straight**2]) / 3
     # A wrong heading moves the end sideways.
     by_start = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     whole = report.covariance + by_start @ left @ by_start.T + left
     a, b, c = (tuple(float(f"{v:.4g}") for v in row) for row in (whole + whole.T) / 2)
     return a, b, c  # type: ignore[return-value]
+
+
+@dataclass
+class DriveWatch:
+    """Checks that each action of a drive ends at the expected place, and each tour at its start.
+
+    The control laws see only images, so they do not notice when they confuse places. The watch
+    compares the true pose with the true dstates (places with headings) of the world, if the world
+    has any. Its methods are used as `with` blocks around motions. Errors name the action and the
+    likely cause.
+    """
+
+    world: World  # the world as in its file
+    driver: Driver  # of the robot that is watched
+    tours: int  # number of tours that are driven
+    _home: Pose | None = field(default=None, init=False)
+
+    @contextmanager
+    def start(self) -> Iterator[None]:
+        """Watch the robot on its way to its first dstate. Errors then name likely causes.
+
+        Raises SimulatorError if the robot does not reach a dstate.
+        """
+        try:
+            yield
+        except SimulatorError as error:
+            raise SimulatorError(f"{error}{self._because(self.driver.robot.pose)}") from None
+
+    @contextmanager
+    def action(self, number: int, name: str) -> Iterator[None]:
+        """Watch one action, by its number in all tours, and check its end.
+
+        Raises SimulatorError if it ends at a wrong place, or a tour does not end at its start.
+        """
+        before = self.driver.robot.pose
+        self._home = self._home or before
+        tour, place = divmod(number, len(self.world.route))
+        where = f"action {place + 1} of tour {tour + 1}, {name}"
+        try:
+            yield
+        except SimulatorError as error:
+            raise SimulatorError(f"{error} ({where}){self._because(before)}") from None
+        after = self.driver.robot.pose
+        # The robot may not be where the control law assumes: nearer to another place, or far away.
+        far = {name: math.dist(at, after[:2]) for name, at in self.world.places.items()}
+        expected = self._expected(name, before)
+        if expected and far[expected] > min(2 * self._near, *far.values()):
+            raise SimulatorError(
+                f"{self.world.name}: {where}: expected the robot to come to "
+                f"{_at(expected, self.world.places[expected])}, got it {_at('', after)}, "
+                f"{far[expected]:.1f} m off; so it drives another route{self._because(before)}"
+            )
+        if place == len(self.world.route) - 1 and not self._are_alike(self._home, after):
+            self._ended_elsewhere(tour, self._home, after)
+
+    def _ended_elsewhere(self, tour: int, home: Pose, pose: Pose) -> None:
+        """Warn that the tour did not end where it began. With several tours, raise an error."""
+        turned = math.degrees(abs(math.remainder(home[2] - pose[2], math.tau)))
+        text = (
+            f"{self.world.name}: tour {tour + 1}: expected it to end where it began, "
+            f"{_at('', home)}, got its end {_at('', pose)}, {math.dist(home[:2], pose[:2]):.1f} m "
+            f"and {turned:.0f} degrees off"
+        )
+        # Further tours would start from a wrong pose.
+        if self.tours > 1:
+            raise SimulatorError(f"{text}; mend the route, or drive one tour{self._because(pose)}")
+        warnings.warn(
+            f"{text}; it cannot be driven again from there", SimulatorWarning, stacklevel=2
+        )
+
+    @property
+    def _near(self) -> float:
+        return max(NEAR, self.world.reach)
+
+    def _are_alike(self, one: Pose, other: Pose) -> bool:
+        """Whether two poses are about the same."""
+        is_near = math.dist(one[:2], other[:2]) <= self._near
+        return is_near and radians_between(one[2], other[2]) <= FACING
+
+    def _expected(self, action: str, pose: Pose) -> str | None:
+        """The name of the place where an action from a pose should end; None if unknown."""
+        here = self.world.nearest(pose)
+        if here is None or not self._are_alike(here.pose, pose):
+            return None
+        if action in TURNS:
+            return here.place
+        if lift := self.world.lift_at(action, *pose[:2]):
+            at = self.world.places
+            return min(at, key=lambda place: math.dist(at[place], lift.end))
+        # The next place straight ahead on the same path.
+        ahead = []
+        for state in self.world.dstates if action == "travel" else ():
+            x, y, _ = displacement_between(here.pose, state.pose)
+            is_on_path = (state.path, state.direction) == (here.path, here.direction)
+            if is_on_path and x > NEAR and abs(y) <= STRAIGHT * x:
+                ahead.append((x, state.place))
+        return min(ahead)[1] if ahead else None
+
+    def _because(self, before: Pose) -> str:
+        """The likely causes of an error since a pose, to end a message; empty if there are none."""
+        world, body, noise = self.world, self.driver.robot.body, self.driver.laser.noise
+        is_square, half = world.angles == "right", self._half_width(before)
+        is_other = world.own_reach is not None and world.own_reach != world.reach
+        fits = (0.0 if is_square else 0.6 * half) <= world.reach <= 1.25 * half
+        start = world.nearest(world.start)
+        away = math.dist(start.pose[:2], world.start[:2]) if start else 0.0
+        off = _off_axis(world)
+        causes = (
+            (
+                is_other,
+                f"reach is {world.reach:g} m, and the world's own is {world.own_reach or 0:g} m "
+                "(leave --set reach out)",
+            ),
+            (
+                not is_other and 0 < half < math.inf and not fits,
+                f"reach is {world.reach:g} m, and half the width of the street there is {half:.2f} "
+                "m (give that as reach)",
+            ),
+            (
+                is_square and not are_square(world.segments),
+                'walls meet at other than right angles, and the world says "right" (write '
+                '"angles": "any")',
+            ),
+            (
+                body.odometry > NOISY,
+                f"the odometry errs by {100 * body.odometry:.0f} % (give less --set "
+                "odometry_noise)",
+            ),
+            (
+                body.slip > NOISY,
+                f"a motion errs by {100 * body.slip:.0f} % (give the body less slip)",
+            ),
+            (
+                abs(body.bend) > math.radians(2),
+                f"the odometry bends by {math.degrees(body.bend):.1f} degrees in each metre (give "
+                "less --set bend_error)",
+            ),
+            (
+                noise > BLURRED,
+                f"ranges err by {100 * noise:.0f} cm (give the laser less noise)",
+            ),
+            (
+                away > self._near,
+                f"the start is {away:.1f} m off the nearest dstate of the world, "
+                f"{start.name if start else ''} (move the start)",
+            ),
+            (
+                is_square and off > FACING / 2,
+                f"the start heads {math.degrees(off):.0f} degrees off the walls (turn the start)",
+            ),
+        )
+        found = "; or ".join(text for applies, text in causes if applies)
+        return f". Likely cause: {found}" if found else ""
+
+    def _half_width(self, before: Pose) -> float:
+        """Half the width of the street in metres, without clutter; infinite without walls.
+
+        It is measured halfway between a previous pose and the current one, in the narrowest
+        direction.
+        """
+        angles = np.radians(np.arange(360.0))
+        middle = np.append((np.array(before[:2]) + self.driver.robot.pose[:2]) / 2, 0.0)
+        ranges = meetings(self.world.segments, middle[None], angles).min(2)[0]
+        return float((ranges[:180] + ranges[180:]).min()) / 2
+
+
+def _off_axis(world: World) -> float:
+    """The smallest angle between the start heading and right-angled walls, in radians."""
+    ways = world.segments[:, 2:] - world.segments[:, :2]
+    longest = ways[int(np.hypot(*ways.T).argmax())]
+    return abs(math.remainder(world.start[2] - math.atan2(longest[1], longest[0]), math.pi / 2))
+
+
+def _at(what: str, pose: Sequence[float]) -> str:
+    return f"{what} at ({pose[0]:.2f}, {pose[1]:.2f})".lstrip()

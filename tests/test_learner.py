@@ -336,7 +336,7 @@ def large_room() -> Trace:
     )
     return replace(
         trace.without_displacements(),
-        steps=tuple(replace(s, displacement=None) for s in trace.steps),
+        steps=tuple(replace(s, displacement=None, covariance=None) for s in trace.steps),
     )
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from simulator.driver import LONG, Driver, act, climb, sight
 from simulator.errors import SimulatorError
 from simulator.robot import BEARINGS, Body, Laser, SimulatedRobot, reported
-from simulator.tours import noise_model, simulate
+from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Trace
 from ssh_abduction.data import Odometry
@@ -358,9 +358,7 @@ def whitened(error: Any, covariance: Any) -> np.ndarray:
     return np.asarray(np.linalg.solve(np.linalg.cholesky(np.array(covariance)), error))
 
 
-def errors_of(
-    trace: Trace, poses: list[tuple[float, float, float]], odometry: Odometry, kind: str
-) -> np.ndarray:
+def errors_of(trace: Trace, poses: list[tuple[float, float, float]], kind: str) -> np.ndarray:
     """Errors of displacements of some actions, (n, 3), in standard deviations."""
     found = []
     for before, after, step, action in zip(
@@ -368,12 +366,8 @@ def errors_of(
     ):
         assert step.displacement is not None
         if action.kind == kind:
-            found.append(
-                whitened(
-                    np.subtract(step.displacement, displacement_between(before, after)),
-                    odometry.covariance(step.displacement),
-                )
-            )
+            errors = np.subtract(step.displacement, displacement_between(before, after))
+            found.append(whitened(errors, step.covariance))
     return np.array(found)
 
 
@@ -470,38 +464,12 @@ def test_displacements_equal_motions_between_dstates(circuits: Trace, tours: Tra
     """Displacements of wheels lead between true poses; those of a map lead between fixed points."""
     for trace in (circuits, tours):
         assert trace.steps[0].displacement is None
-        assert trace.odometry is not None
-        turns = errors_of(
-            trace, [tuple(step.truth["pose"]) for step in trace.steps], trace.odometry, "turn"
-        )[:, 2]
+        turns = errors_of(trace, [tuple(step.truth["pose"]) for step in trace.steps], "turn")[:, 2]
         assert abs(turns.mean()) < 0.5
         assert 0.5 < (turns**2).mean() < 1.5
-        travels = errors_of(trace, fixed_points(trace), trace.odometry, "travel")
+        travels = errors_of(trace, fixed_points(trace), "travel")
         assert np.abs(travels.mean(0)).max() < 0.5
         assert 0.15 < (travels**2).mean() < 1.2
-
-
-def test_covariance_of_a_step_sums_its_motions() -> None:
-    """Without hill-climbing, the chi-square by the noise model has its degrees of freedom."""
-    rng = np.random.default_rng(0)
-    body = Body(wander=0, odometry=0.05)
-    reports, errors = [], []
-    for _ in range(300):
-        robot = SimulatedRobot(body, (0.0, 0.0, 0.0), rng)
-        for _ in range(60):
-            robot.move(0.15, 0.0)
-        reports.append(robot.report())
-        errors.append(np.subtract(reports[-1].displacement, robot.pose))
-    odometry = noise_model(reports, body)
-    assert odometry.along == pytest.approx(0.05 / math.sqrt(60), rel=0.05)
-    assert (odometry.position, odometry.angle, odometry.scale) == (0, 0, 0)
-    along = np.array(
-        [
-            whitened(e, odometry.covariance(r.displacement))[0]
-            for e, r in zip(errors, reports, strict=True)
-        ]
-    )
-    assert 0.8 < (along**2).mean() < 1.2
 
 
 def test_trace_declares_scale_and_drift_of_the_body() -> None:
