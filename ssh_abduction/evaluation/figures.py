@@ -22,6 +22,8 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.evaluation.paper_experiments import NotchOutcome
 from ssh_abduction.output import plot
 
+# The corners of the frame around a cell: x and y from its middle.
+FRAME = 0.47 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]])
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"
 
 
@@ -64,25 +66,24 @@ def draw_quality(
     path: str | Path, quality: Mapping[int, float], uncertainty: Mapping[int, float], chosen: int
 ) -> None:
     """Draw M for each k (number of clusters), and U, which may be unknown. Mark the chosen k."""
-    # M on the left axis, U on the right one.
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
     axes.plot(list(quality), list(quality.values()), "o-", color=BLUE, label="M")
     axes.axvline(chosen, color=GREY, linestyle=":", label=f"k = {chosen}")
     axes.set(xlabel="number of clusters k", ylabel="M: separation of clusters")
-    handles = axes.get_legend_handles_labels()
     if uncertainty:
-        right = axes.twinx()
-        right.plot(
-            list(uncertainty), list(uncertainty.values()), "s--", color=ORANGE, label="U(v|x)"
-        )
-        right.set(
-            ylabel="U: views determined by dstates", ylim=(min(0.7, *uncertainty.values()), 1.02)
-        )
-        right.spines["right"].set_visible(True)
-        more = right.get_legend_handles_labels()
-        handles = (handles[0] + more[0], handles[1] + more[1])
-    figure.legend(*handles, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 0.9), ncols=3)
+        limits = min(0.7, *uncertainty.values()), 1.02
+        right = _right_axis(axes, [*uncertainty], [*uncertainty.values()], "U(v|x)")
+        right.set(ylabel="U: views determined by dstates", ylim=limits)
+    figure.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 0.9), ncols=3)
     _save(figure, path)
+
+
+def _right_axis(axes: Any, x: Sequence[float], y: Sequence[float], label: str) -> Any:
+    """Draw a dashed curve against an axis on the right, and return the axis."""
+    right = axes.twinx()
+    right.plot(x, y, "s--", color=ORANGE, markersize=3, label=label)
+    right.spines["right"].set_visible(True)
+    return right
 
 
 def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None:
@@ -244,16 +245,13 @@ def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
 
     Offsets are in x and y (metres) and heading (radians).
     """
-    # Positions on the left axis, headings on the right one.
     table = np.array(spread)
     tours, largest = np.arange(1, len(table) + 1), 1000 * table[:, :2].max(1)
     figure, axes = _pyplot().subplots(figsize=(5.5, 2.8))
     axes.plot(tours, largest, "o-", color=BLUE, markersize=3, label="position")
     axes.set(xlabel="tour", ylabel="largest offset, mm", ylim=(0, None))
-    right = axes.twinx()
-    right.plot(tours, np.degrees(table[:, 2]), "s--", color=ORANGE, markersize=3, label="heading")
+    right = _right_axis(axes, tours.tolist(), np.degrees(table[:, 2]).tolist(), "heading")
     right.set(ylabel="largest offset, degrees", ylim=(0, None))
-    right.spines["right"].set_visible(True)
     figure.legend(frameon=False, loc="upper right", ncols=2)
     _save(figure, path)
 
@@ -266,43 +264,31 @@ def draw_outcomes(
     There is a panel each for k, U, whether the map is right, and the recognition rate. Results as
     in the paper get a frame. A cross marks the notch and the scale of the experiment.
     """
-    notches = sorted({o.notch for o in outcomes})
-    scales = sorted({o.scale for o in outcomes})
-    cell = {(o.notch, o.scale): o for o in outcomes}
-    spreads = [float(np.mean([cell[n, t].spread for n in notches])) for t in scales]
-    pyplot: Any = _pyplot()
-    figure, grid = pyplot.subplots(2, 2, figsize=(9, 6.4))
-    panels: list[tuple[str, Callable[[NotchOutcome], float], str]] = [
-        ("k chosen by M", lambda o: o.k, "viridis"),
-        ("U at that k", lambda o: o.uncertainty, "viridis"),
-        ("map right", lambda o: float(o.right), "Greens"),
-        ("recognition rate (true labels)", lambda o: o.rate, "viridis"),
+    notches, scales = sorted({o.notch for o in outcomes}), sorted({o.scale for o in outcomes})
+    by_both = {(o.notch, o.scale): o for o in outcomes}
+    cells = [[by_both[notch, scale] for scale in scales] for notch in notches]
+    spreads = np.mean([[1000 * o.spread for o in row] for row in cells], axis=0)
+    figure, grid = _pyplot().subplots(2, 2, figsize=(9, 6.4))
+    # Each panel has a title, the value of a cell and its text, and the lowest value of its colours.
+    panels: list[tuple[str, Callable[[NotchOutcome], float], Callable[[float], str], float]] = [
+        ("k chosen by M", lambda o: o.k, "{:.0f}".format, 2),
+        ("U at that k", lambda o: o.uncertainty, "{:.2f}".format, 0.7),
+        ("map right", lambda o: o.right, lambda right: "yes" if right else "no", 0),
+        ("recognition rate (true labels)", lambda o: o.rate, "{:.2f}".format, 0.4),
     ]
-    lowest = dict(zip((title for title, _, _ in panels), (2, 0.7, 0.0, 0.4), strict=True))
-    # One panel for each value. Each cell of a panel is one notch and spread.
-    for axes, (title, value, colours) in zip(grid.flat, panels, strict=True):
-        table = np.round([[value(cell[n, t]) for t in scales] for n in notches], 3)
-        axes.imshow(table, origin="lower", cmap=colours, aspect="auto", vmin=lowest[title])
-        for i, n in enumerate(notches):
-            for j, t in enumerate(scales):
-                o = cell[n, t]
-                text = {"k chosen by M": str(o.k), "map right": "yes" if o.right else "no"}.get(
-                    title, f"{table[i, j]:.2f}"
-                )
-                # Small values are dark in one colour map, and large ones in the other.
-                middle = (table.min() + table.max()) / 2
-                is_small = table[i, j] < max(middle, lowest[title])
-                is_dark = is_small if colours == "viridis" else table[i, j] > middle
-                ink = "white" if is_dark else "black"
-                axes.text(j, i, text, ha="center", va="center", fontsize=8, color=ink)
-                # As in the paper: four views, U = 1, the right map, and full recognition.
-                if o.k == 4 and o.uncertainty > 1 - 1e-9 and o.right and o.rate > 0.999:
-                    frame = {"fill": False, "edgecolor": ORANGE, "linewidth": 2}
-                    axes.add_patch(pyplot.Rectangle((j - 0.47, i - 0.47), 0.94, 0.94, **frame))
+    for axes, (title, value, text, lowest) in zip(grid.flat, panels, strict=True):
+        table = np.round([[float(value(o)) for o in row] for row in cells], 3)
+        axes.imshow(table, origin="lower", cmap="Blues", aspect="auto", vmin=lowest)
+        for (i, j), shown in np.ndenumerate(table):
+            dark = "white" if shown > (lowest + table.max()) / 2 else "black"
+            axes.text(j, i, text(shown), ha="center", va="center", fontsize=8, color=dark)
+            o = cells[i][j]
+            if o.k == 4 and o.uncertainty > 1 - 1e-9 and o.right and o.rate > 0.999:
+                axes.plot(j + FRAME[0], i + FRAME[1], color=ORANGE, linewidth=2)
         x = np.interp(here[1], scales, range(len(scales)))
         y = np.interp(here[0], notches, range(len(notches)))
         axes.plot(x, y, "x", color="red", markersize=10, markeredgewidth=2.5)
-        axes.set_xticks(range(len(scales)), [f"{1000 * s:.1f}" for s in spreads])
+        axes.set_xticks(range(len(scales)), [f"{spread:.1f}" for spread in spreads])
         axes.set_yticks(range(len(notches)), [f"{100 * n:g}" for n in notches])
         axes.set(
             title=title, xlabel="spread of positions (rms), mm", ylabel="depth of the notch, cm"

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.metrics import confusion_matrix
+from sklearn.metrics import confusion_matrix, rand_score
 from sklearn.model_selection import StratifiedKFold
 
 from perception.appearance import ReciprocalTransformer
@@ -40,97 +40,82 @@ from ssh_abduction.theory.theory import Theory
 # The paper's robot has no odometry that would distinguish places.
 VIEWS_ALONE = Theory.topological().replace(star="none", displacement="none")
 WITH_STARS = Theory.topological().replace(displacement="none")
+# U is at most 1. It counts as 1 above this, as it is rounded.
+SURE = 1 - 1e-9
+# How claims write the numbers of dstates, places and paths, and that errors do not grow.
+COUNTS, NONE = "{0.dstates}, {0.places}, {0.paths}", "no growth"
 
 
 @dataclass(frozen=True)
 class PaperExperiment:
-    """One of the paper's experiments."""
+    """One of the paper's experiments, in the world of the same name."""
 
-    world: str  # the name of the world
     tours: int  # the number of tours that the robot drives
     k_max: int  # the largest number of views (clusters of images) that is tried
+    images: int  # the number of images in the paper
     views: int  # the number of views in the paper
     dstates: int  # the number of dstates in the paper
     places: int  # the number of places in the paper
     paths: int  # the number of paths in the paper
+    # The claim about the largest k with U = 1, and its value: it is the chosen k, or above it.
+    largest: tuple[str, str]
 
 
+HIGHER = "higher k would still have been free of variability: largest k with U = 1"
 EXPERIMENTS = {
     "notched-rectangle": PaperExperiment(
-        "notched-rectangle", tours=50, k_max=12, views=4, dstates=8, places=4, paths=4
+        tours=50,
+        k_max=12,
+        images=400,
+        views=4,
+        dstates=8,
+        places=4,
+        paths=4,
+        largest=("largest k with U = 1", "the same k"),
     ),
     "taylor-hall": PaperExperiment(
-        "taylor-hall", tours=10, k_max=24, views=10, dstates=20, places=7, paths=4
+        tours=10,
+        k_max=24,
+        images=240,
+        views=10,
+        dstates=20,
+        places=7,
+        paths=4,
+        largest=(HIGHER, "above 10"),
     ),
 }
 
 
 @dataclass(frozen=True)
-class Clustering:
-    """The views (clusters of images) of one seed."""
-
-    k: int  # the chosen number of views
-    quality: dict[int, float]  # M for each number of views that was tried
-    uncertainty: dict[int, float]  # U for each number of views that was tried
-    largest_k: int  # the largest number of views with U = 1
-
-
-@dataclass(frozen=True)
-class FoundMaps:
-    """The minimal maps of one seed."""
-
-    # The numbers of dstates, places and paths of a minimal map; None if no map was found.
-    cost: dict[str, int] | None
-    maps: int  # the number of minimal maps
-
-    @classmethod
-    def of(cls, solution: Solution) -> FoundMaps:
-        """Read the counts of a solution."""
-        cost = solution.cost
-        if cost is None:
-            return cls(None, solution.count)
-        counts = {"dstates": cost.dstates, "places": cost.places, "paths": cost.paths}
-        return cls(counts, solution.count)
-
-
-@dataclass(frozen=True)
-class Labelling:
-    """The labels of steps that follow from the views alone, compared with the true dstates."""
-
-    right: bool  # whether the labels are the true dstates, one to one
-    aliased: int  # the number of pairs of true dstates that share a view
-    told_apart: int  # the number of these pairs that share no label
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """Results without a part of the paper's method.
-
-    Two parts are left out, one at a time. First there are no maps: images are clustered into as
-    many views as there are dstates. Second, images are taken at equal distances, not at dstates.
-    """
-
-    alone_uncertainty: float  # U if there is one cluster per dstate
-    alone_distinct: int  # the number of dstates that then share no cluster with another dstate
-    even_quality: float  # M at the chosen number of views, for images taken at equal distances
-    even_uncertainty: float  # U at the chosen number of views, for the same images
-
-
-@dataclass(frozen=True)
 class SeedRun:
-    """The results of an experiment for one seed."""
+    """The results of an experiment for one seed.
+
+    Two parts of the paper's method are left out, one at a time. `alone`: images are clustered into
+    as many views as there are dstates, without a map. `even`: images are taken at equal distances,
+    not at dstates.
+    """
 
     seed: int  # the seed of all noise
     images: int  # the number of images
-    clustering: Clustering  # the views
-    by_views: FoundMaps  # the minimal maps from the views alone
-    by_stars: FoundMaps  # the minimal maps from the views and the openings that the robot saw
-    labelling: Labelling  # the labels of steps that follow from the views alone
+    k: int  # the chosen number of views (clusters of images)
+    quality: dict[int, float]  # M for each number of views that was tried
+    uncertainty: dict[int, float]  # U for each number of views that was tried
+    largest_k: int  # the largest number of views with U = 1
+    # The numbers of dstates, places and paths of the minimal map from the views alone, and with the
+    # openings that the robot saw. If there are several minimal maps, their number follows.
+    by_views: str
+    by_stars: str
+    labels_right: bool  # whether labels from the views alone are the true dstates, one to one
+    aliased: int  # the number of pairs of true dstates that share a view
+    told_apart: int  # the number of these pairs that share no label
     curve: LearningCurve  # the learning curve on these labels
     # The rates, 0 to 1, at which the true dstate of an image is recognised after learning labels.
     # The keys are the sources of the labels: "clustering alone", "map", "truth".
     rates: dict[str, float]
-    contrast: Contrast  # results without a part of the method
+    alone_uncertainty: float  # U if there is one cluster per dstate
+    alone_distinct: int  # the number of dstates that then share no cluster with another dstate
+    even_quality: float  # M at the chosen number of views, for images taken at equal distances
+    even_uncertainty: float  # U at the chosen number of views, for the same images
     # For each tour, the largest offset of a pose from the mean pose of its dstate, in x and y
     # (metres) and heading (radians). Shape (tours, 3).
     spread: list[list[float]]
@@ -139,37 +124,57 @@ class SeedRun:
 def measure(name: str, seed: int) -> SeedRun:
     """Run "notched-rectangle" or "taylor-hall" from simulation to recognition rates."""
     warnings.simplefilter("ignore", ImageWarning)
-    e = EXPERIMENTS[name]
+    e, world = EXPERIMENTS[name], World.named(name)
 
     # The bootstrap loop, from the views alone.
-    trace = simulate(World.named(e.world), e.tours, seed)
+    trace = simulate(world, e.tours, seed)
     truth, ranges = true_dstates(trace), images_of(trace)
     clusterer = ViewClusterer(k_max=e.k_max, random_state=seed)
     learner = BootstrapLearner(VIEWS_ALONE, clusterer, time_limit=60).fit(trace)
+    found, labels = learner.clusterer_, learner.labels_
+    uncertainty = {k: uncertainty_coefficient(of, truth) for k, of in found.labels_by_k_.items()}
+    aliased = _aliased(learner.views_, truth)
 
     # The maps, with the openings that the robot saw.
     starred = solve(trace.with_views(learner.views_.tolist()), WITH_STARS, time_limit=60)
 
+    # Without a map, with as many clusters as dstates.
+    alone = found.labels_by_k_[e.dstates]
+    shared = {name for pair in _aliased(alone, truth) for name in pair}
+
+    # Images at even distances: |dx| + |dy| per step on average, in metres.
+    poses = np.array([step.truth["pose"][:2] for step in trace.steps])
+    every = round(float(np.abs(np.diff(poses, axis=0)).sum() / len(poses)), 2)
+    even = simulate(world, e.tours, seed, every=every)
+    of_even = ViewClusterer(k=found.k_, random_state=seed).fit(
+        ReciprocalTransformer().fit_transform(images_of(even))
+    )
+
     # Recognition by labels of the map, compared with clusters alone and with the truth.
-    alone = learner.clusterer_.labels_by_k_[e.dstates]
-    kinds = {
-        "clustering alone": alone,
-        "map": learner.labels_,
-        "truth": np.unique(truth, return_inverse=True)[1],
-    }
+    codes = np.unique(truth, return_inverse=True)[1]
+    kinds = {"clustering alone": alone, "map": labels, "truth": codes}
     shares = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
     sizes = sorted({max(2, round(len(trace) * share)) for share in shares})
+    offsets = np.abs(_means_and_offsets(trace, truth)[1])
     return SeedRun(
         seed=seed,
         images=len(trace),
-        clustering=_clustering(learner, truth),
-        by_views=FoundMaps.of(learner.solution_),
-        by_stars=FoundMaps.of(starred),
-        labelling=_labelling(learner, truth),
-        curve=learning_curve(ranges, learner.labels_, sizes, random_state=seed),
-        rates={kind: rate(ranges, labels, truth, seed) for kind, labels in kinds.items()},
-        contrast=_contrast(e, seed, trace, alone, learner.clusterer_.k_),
-        spread=_spread(trace, truth, e.tours),
+        k=found.k_,
+        quality=found.quality_,
+        uncertainty=uncertainty,
+        largest_k=max((k for k, u in uncertainty.items() if u > SURE), default=1),
+        by_views=_counts(learner.solution_),
+        by_stars=_counts(starred),
+        labels_right=one_to_one(labels, truth),
+        aliased=len(aliased),
+        told_apart=len(aliased) - len({*aliased} & {*_aliased(labels, truth)}),
+        curve=learning_curve(ranges, labels, sizes, random_state=seed),
+        rates={kind: rate(ranges, of, truth, seed) for kind, of in kinds.items()},
+        alone_uncertainty=uncertainty_coefficient(alone, truth),
+        alone_distinct=e.dstates - len(shared),
+        even_quality=of_even.quality_[of_even.k_],
+        even_uncertainty=uncertainty_coefficient(of_even.labels_, true_dstates(even)),
+        spread=[part.max(axis=0).tolist() for part in np.array_split(offsets, e.tours)],
     )
 
 
@@ -180,9 +185,7 @@ def true_dstates(trace: Trace) -> NDArray[Any]:
 
 def one_to_one(labels: NDArray[Any], truth: NDArray[Any]) -> bool:
     """Tell whether the labels of n steps and their true dstates are equal up to renaming."""
-    return bool((labels >= 0).all()) and len(set(zip(labels, truth, strict=True))) == len(
-        set(labels)
-    ) == len(set(truth))
+    return bool((labels >= 0).all()) and rand_score(truth, labels) == 1
 
 
 def rate(
@@ -212,61 +215,29 @@ def _aliased(views: NDArray[Any], truth: NDArray[Any]) -> list[tuple[str, str]]:
     return [(a, b) for i, a in enumerate(names) for b in names[i + 1 :] if seen[a] & seen[b]]
 
 
-def _clustering(learner: BootstrapLearner, truth: NDArray[Any]) -> Clustering:
-    """Measure the views of a learner for each number of views that was tried."""
-    clusterer = learner.clusterer_
-    uncertainty = {
-        k: uncertainty_coefficient(labels, truth) for k, labels in clusterer.labels_by_k_.items()
-    }
-    largest = max((k for k, u in uncertainty.items() if u > 1 - 1e-9), default=1)
-    return Clustering(clusterer.k_, clusterer.quality_, uncertainty, largest)
+def _counts(solution: Solution) -> str:
+    """Write the numbers of dstates, places and paths, and the number of maps if it is not 1."""
+    cost = solution.cost
+    if cost is None:
+        return "no map"
+    several = "" if solution.count == 1 else f" (#{solution.count})"
+    return f"{cost.dstates}, {cost.places}, {cost.paths}{several}"
 
 
-def _labelling(learner: BootstrapLearner, truth: NDArray[Any]) -> Labelling:
-    """Compare the labels of a learner with the true dstates."""
-    labels = learner.labels_
-    pairs = _aliased(learner.views_, truth)
-    told_apart = sum(not set(labels[truth == a]) & set(labels[truth == b]) for a, b in pairs)
-    return Labelling(one_to_one(labels, truth), len(pairs), told_apart)
+def _means_and_offsets(
+    trace: Trace, truth: NDArray[Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Compute the mean pose at the true dstate of each of n steps, and the offset from it: (n, 3).
 
-
-def _contrast(e: PaperExperiment, seed: int, trace: Trace, alone: NDArray[Any], k: int) -> Contrast:
-    """Measure the results without a part of the method.
-
-    `alone` has the cluster of each image, with as many clusters as dstates. `k` is the chosen
-    number of views, also of images at equal distances.
+    `truth` has the name of the dstate of each step.
     """
-    truth = true_dstates(trace)
-    shared = {name for pair in _aliased(alone, truth) for name in pair}
-    even = simulate(World.named(e.world), e.tours, seed, every=_step(trace))
-    clusterer = ViewClusterer(k=k, random_state=seed).fit(
-        ReciprocalTransformer().fit_transform(images_of(even))
-    )
-    return Contrast(
-        alone_uncertainty=uncertainty_coefficient(alone, truth),
-        alone_distinct=e.dstates - len(shared),
-        even_quality=clusterer.quality_[clusterer.k_],
-        even_uncertainty=uncertainty_coefficient(clusterer.labels_, true_dstates(even)),
-    )
-
-
-def _step(trace: Trace) -> float:
-    """The distance at which to take images evenly: |dx| + |dy| per step on average, in metres."""
-    poses = np.array([step.truth["pose"][:2] for step in trace.steps])
-    return round(float(np.abs(np.diff(poses, axis=0)).sum() / len(poses)), 2)
-
-
-def _spread(trace: Trace, truth: NDArray[Any], tours: int) -> list[list[float]]:
-    """Compute `SeedRun.spread`: the largest offset of a pose from its dstate's mean, by tour."""
     poses = np.array([step.truth["pose"] for step in trace.steps])
-    off = np.zeros_like(poses)
+    means = np.empty_like(poses)
     for name in set(truth):
         here = truth == name
-        turned = np.angle(np.exp(1j * (poses[here, 2] - poses[here, 2][0])))
-        off[here] = np.column_stack(
-            [poses[here, :2] - poses[here, :2].mean(0), turned - turned.mean()]
-        )
-    return [[float(v) for v in np.abs(part).max(0)] for part in np.array_split(off, tours)]
+        poses[here, 2] = np.unwrap(poses[here, 2])
+        means[here] = poses[here].mean(0)
+    return means, poses - means
 
 
 @dataclass(frozen=True)
@@ -296,16 +267,15 @@ def outcome(notch: float, scale: float) -> NotchOutcome:
     warnings.simplefilter("ignore", ImageWarning)
     # Scan at the poses that the robot drove to, with their offsets scaled.
     world = notched(notch)
-    means, offsets, truth = _driven(notch)
+    trace = _driven(notch)
+    truth = true_dstates(trace)
+    means, offsets = _means_and_offsets(trace, truth)
     rng, laser = np.random.default_rng(0), Laser()
     scans = [laser.scan(world, means + scale * offsets, rng) for _ in range(STILL)]
     ranges = np.median(scans, axis=0)
     images = ReciprocalTransformer().fit_transform(ranges)
     clusterer = ViewClusterer(k_max=10, n_init=4, random_state=0).fit(images)
-    actions = [world.route[i % len(world.route)] for i in range(len(means) - 1)]
-    solution = solve(
-        Trace.from_steps(clusterer.labels_.tolist(), actions), VIEWS_ALONE, time_limit=5
-    )
+    solution = solve(trace.with_views(clusterer.labels_.tolist()), VIEWS_ALONE, time_limit=5)
     is_only = solution.complete and solution.count == 1
     return NotchOutcome(
         notch=notch,
@@ -327,21 +297,27 @@ def notched(depth: float) -> World:
 
 
 @cache
-def _driven(notch: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
-    """Simulate all tours in the rectangle with this notch.
+def _driven(notch: float) -> Trace:
+    """Simulate all tours in the rectangle with this notch."""
+    return simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, 0)
 
-    Return three arrays with a row for each of n steps: the mean pose at its true dstate, of shape
-    (n, 3); the offset of its own pose from this mean, of shape (n, 3); and the name of the dstate.
-    """
-    trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, 0)
-    truth = true_dstates(trace)
-    poses = np.array([step.truth["pose"] for step in trace.steps])
-    means = np.empty_like(poses)
-    for name in set(truth):
-        here = truth == name
-        poses[here, 2] = np.unwrap(poses[here, 2])
-        means[here] = poses[here].mean(0)
-    return means, poses - means, truth
+
+# The claims about an experiment: what is claimed, the value in the paper, and whether the claim is
+# ours. Such a claim follows from the argument of the paper, or it is about this robot alone.
+CLAIMS = (
+    ("k chosen by M, {0.images} images", "{0.views}", False),
+    ("U at that k", "1", False),
+    ("{0.largest[0]}", "{0.largest[1]}", False),
+    ("dstates, places, paths, from the views alone", COUNTS, False),
+    ("the same, with the openings seen at each place", COUNTS, True),
+    ("labels from the views alone are the true dstates", "yes", False),
+    ("dstates that share a view are told apart", "yes", False),
+    ("nearest neighbour on abduced labels, all images", "100 %", False),
+    ("clustering alone, k = number of dstates: U < 1 or dstates share views", "yes", True),
+    ("images at even distances, same k: M and U drop", "yes", True),
+    ("recognition by clusters, by map, by truth: first below, the others equal", "yes", True),
+    ("errors do not add up: largest offset from a dstate, last tour against first", NONE, True),
+)
 
 
 class Claim(NamedTuple):
@@ -349,116 +325,51 @@ class Claim(NamedTuple):
 
     text: str  # the claim
     paper: str  # the value in the paper
+    ours: bool  # whether the claim is not in the paper
     here: str  # the value of the run
     holds: bool  # whether the claim holds in the run
-    # Whether the claim is not in the paper. Then it follows from the argument of the paper, or it
-    # is about this robot alone.
-    ours: bool = False
 
 
 def claims(name: str, run: SeedRun) -> list[Claim]:
     """List the claims of the paper about "notched-rectangle" or "taylor-hall", and our own."""
-    e, views, labels, without = EXPERIMENTS[name], run.clustering, run.labelling, run.contrast
-    quality, uncertainty = views.quality[views.k], views.uncertainty[views.k]
-    is_determined = uncertainty > 1 - 1e-9
-    counts = f"{e.dstates}, {e.places}, {e.paths}"
-    right = FoundMaps({"dstates": e.dstates, "places": e.places, "paths": e.paths}, maps=1)
-    if name == "notched-rectangle":
-        largest = "largest k with U = 1", "the same k"
-        is_largest = views.largest_k == views.k
-    else:
-        higher = "higher k would still have been free of variability: largest k with U = 1"
-        largest = higher, f"above {e.views}"
-        is_largest = views.largest_k > views.k
-    alone, even = without.alone_uncertainty, without.even_uncertainty
+    e, k = EXPERIMENTS[name], run.k
+    quality, uncertainty, counts = run.quality[k], run.uncertainty[k], COUNTS.format(e)
+    has_largest = run.largest_k == k if name == "notched-rectangle" else run.largest_k > k
+    alone, even = run.alone_uncertainty, run.even_uncertainty
     rates = [run.rates[kind] for kind in ("clustering alone", "map", "truth")]
-    first, last = (1000 * max(run.spread[tour][:2]) for tour in (0, -1))
-    return [
-        Claim(
-            f"k chosen by M, {'400' if e.views == 4 else '240'} images",
-            str(e.views),
-            str(views.k),
-            views.k == e.views,
+    largest = 1000 * np.array(run.spread)[:, :2].max(axis=1)
+    # The growth of the largest offset over a run, as a share of its mean, by a linear fit.
+    slope = np.polyfit(np.arange(len(largest)), largest, 1)[0]
+    growth = float(slope * len(largest) / largest.mean())
+    # For each claim, the value of the run, and whether the claim holds.
+    found = (
+        (f"{k}", k == e.views),
+        (f"{uncertainty:.3f}", uncertainty > SURE),
+        (f"{run.largest_k}", has_largest),
+        (run.by_views, run.by_views == counts),
+        (run.by_stars, run.by_stars == counts),
+        ("yes" if run.labels_right else "no", run.labels_right),
+        (f"{run.told_apart} of {run.aliased} pairs", run.told_apart == run.aliased > 0),
+        (f"{100 * run.curve.mean[-1]:.1f} %", run.curve.mean[-1] > 0.9999),
+        (
+            f"U {alone:.3f}, {run.alone_distinct} of {e.dstates} distinct; "
+            f"M {run.quality[e.dstates]:.1f} against {quality:.1f}",
+            alone < SURE or run.alone_distinct < e.dstates,
         ),
-        Claim("U at that k", "1", f"{uncertainty:.3f}", is_determined),
-        Claim(*largest, str(views.largest_k), is_largest),
-        Claim(
-            "dstates, places, paths, from the views alone",
-            counts,
-            _counts(run.by_views),
-            run.by_views == right,
+        (
+            f"M {quality:.1f} to {run.even_quality:.2f}, U to {even:.2f}",
+            run.even_quality < quality and even < uncertainty * SURE,
         ),
-        Claim(
-            "the same, with the openings seen at each place",
-            counts,
-            _counts(run.by_stars),
-            run.by_stars == right,
-            ours=True,
-        ),
-        Claim(
-            "labels from the views alone are the true dstates",
-            "yes",
-            "yes" if labels.right else "no",
-            labels.right,
-        ),
-        Claim(
-            "dstates that share a view are told apart",
-            "yes",
-            f"{labels.told_apart} of {labels.aliased} pairs",
-            labels.told_apart == labels.aliased > 0,
-        ),
-        Claim(
-            "nearest neighbour on abduced labels, all images",
-            "100 %",
-            f"{100 * run.curve.mean[-1]:.1f} %",
-            run.curve.mean[-1] > 0.9999,
-        ),
-        Claim(
-            "clustering alone, k = number of dstates: U < 1 or dstates share views",
-            "yes",
-            f"U {alone:.3f}, {without.alone_distinct} of {e.dstates} distinct; "
-            f"M {views.quality[e.dstates]:.1f} against {quality:.1f}",
-            alone < 1 - 1e-9 or without.alone_distinct < e.dstates,
-            ours=True,
-        ),
-        Claim(
-            "images at even distances, same k: M and U drop",
-            "yes",
-            f"M {quality:.1f} to {without.even_quality:.2f}, U to {even:.2f}",
-            without.even_quality < quality and even < uncertainty - 1e-9,
-            ours=True,
-        ),
-        Claim(
-            "recognition by clusters, by map, by truth: first below, the others equal",
-            "yes",
+        (
             ", ".join(f"{100 * rate:.1f}" for rate in rates) + " %",
             rates[0] < rates[1] - 0.02 and abs(rates[1] - rates[2]) < 0.01,
-            ours=True,
         ),
-        Claim(
-            "errors do not add up: largest offset from a dstate, last tour against first",
-            "no growth",
-            f"{last:.0f} mm against {first:.0f} mm",
-            _trend(run) < 0.5,
-            ours=True,
-        ),
+        (f"{largest[-1]:.0f} mm against {largest[0]:.0f} mm", growth < 0.5),
+    )
+    return [
+        Claim(text.format(e), paper.format(e), ours, here, bool(holds))
+        for (text, paper, ours), (here, holds) in zip(CLAIMS, found, strict=True)
     ]
-
-
-def _counts(found: FoundMaps) -> str:
-    """Write the numbers of dstates, places and paths, and the number of maps if it is not 1."""
-    cost = found.cost
-    if cost is None:
-        return "no map"
-    several = "" if found.maps == 1 else f" (#{found.maps})"
-    return f"{cost['dstates']}, {cost['places']}, {cost['paths']}{several}"
-
-
-def _trend(run: SeedRun) -> float:
-    """The growth of the largest offset over a run, as a share of its mean, by a linear fit."""
-    largest = np.array([max(row[:2]) for row in run.spread])
-    slope = np.polyfit(np.arange(len(largest)), largest, 1)[0]
-    return float(slope * len(largest) / largest.mean())
 
 
 def summary(name: str, runs: Sequence[SeedRun]) -> list[dict[str, Any]]:

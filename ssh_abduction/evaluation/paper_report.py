@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from html import escape
@@ -43,77 +44,23 @@ NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)
 # Factors for the spread of poses that the robot leaves.
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
-
-# How the experiments differ from the paper's. Only its text was at hand, not its pages.
-DIFFERENCES = {
-    "notched-rectangle": (
-        "The notch: the paper's room has its notch at a corner; here it is a recess in a wall, "
-        "1.2 m wide and 3 cm deep. Notches at a corner are in docs/measurements/reproduction.md.",
-        "The room: 4 m by 2 m, with the robot 0.6 m from the walls, is a choice of ours. In a room "
-        "a tenth longer and wider M chooses another k.",
-        "The images: each is the median of nine scans, beam by beam. With single scans, lost beams "
-        "among them, M chooses another k.",
-        "As in the paper: 50 circuits of 8 dstates, 400 images.",
-    ),
-    "taylor-hall": (
-        "The hallway: the paper draws its shape, and gives no lengths. Here a main street of four "
-        "places has three dead ends to one side; counts of dstates, places and paths are the "
-        "paper's.",
-        "The clutter, and all lengths, are choices of ours.",
-        "The images: each is the median of nine scans, beam by beam.",
-        "As in the paper: 10 tours of 24 images at 20 dstates, 240 images.",
-    ),
-}
-VIEWS = (
-    "views.png",
-    "Ours: the views. Images of each cluster on top of each other, the robot at the triangle, "
-    "facing up.",
-)
-SPREAD = (
-    "spread.png",
-    "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by tour.",
-)
+# The numbers of the paper's figures: of the world, of M and U, and of the learning curve.
+NUMBERS = {"notched-rectangle": ("2", "3", "4"), "taylor-hall": ("5", "6, left", "6, right")}
+# The figures of a page that are in its folder. Captions have the numbers in place of {0} to {2}.
 FIGURES = {
-    "notched-rectangle": [
-        (
-            "world.png",
-            "Figure 2: the notched rectangle. Walls, true dstates (arrows) and where images were "
-            "taken.",
-        ),
-        VIEWS,
-        ("quality.png", "Figure 3: M and U against the number of clusters."),
-        ("map.svg", "Ours: the minimal map, from the views alone."),
-        (
-            "learning.png",
-            "Figure 4: recognition rate on the map's labels, mean and range over ten folds.",
-        ),
-        SPREAD,
-        (
-            "outcomes.png",
-            "Ours: where the method works. Frames: all as in the paper (4 views, U = 1, right map, "
-            "full recognition). Cross: this robot.",
-        ),
-    ],
-    "taylor-hall": [
-        (
-            "world.png",
-            "Figure 5: the hallway. Walls, clutter (orange), true dstates (arrows) and where "
-            "images were taken.",
-        ),
-        VIEWS,
-        ("quality.png", "Figure 6, left: M and U against the number of clusters."),
-        ("map.svg", "Ours: the minimal map, from the views alone."),
-        (
-            "map-with-openings.svg",
-            "Ours: the minimal map when the openings that the robot saw at each place are used "
-            "too.",
-        ),
-        (
-            "learning.png",
-            "Figure 6, right: recognition rate on the map's labels, mean and range over ten folds.",
-        ),
-        SPREAD,
-    ],
+    "world.png": "Figure {0}: the world. Walls, clutter (orange), true dstates (arrows) and where "
+    "images were taken.",
+    "views.png": "Ours: the views. Images of each cluster on top of each other, the robot at the "
+    "triangle, facing up.",
+    "quality.png": "Figure {1}: M and U against the number of clusters.",
+    "map.svg": "Ours: the minimal map, from the views alone.",
+    "map-with-openings.svg": "Ours: the minimal map with the openings that the robot saw, too.",
+    "learning.png": "Figure {2}: recognition rate on the map's labels, mean and range over ten "
+    "folds.",
+    "spread.png": "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour "
+    "by tour.",
+    "outcomes.png": "Ours: where the method works. Frames: all as in the paper (4 views, U = 1, "
+    "right map, full recognition). Cross: this robot.",
 }
 
 
@@ -168,7 +115,7 @@ def reproduce(
     on_table(table)
     _draw(name, runs[0], folder, on_done)
     if found:
-        depth = -float(World.named(EXPERIMENTS[name].world).segments[:, 1::2].min())
+        depth = -float(World.named(name).segments[:, 1::2].min())
         figures.draw_outcomes(folder / "outcomes.png", found, (depth, 1.0))
     write_file(folder / "report.html", _page(name, runs, table, folder).encode())
     return table
@@ -193,15 +140,13 @@ def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:
 
 def _draw(name: str, run: SeedRun, folder: Path, on_done: Callable[[str], None]) -> None:
     """Draw the figures of one run, and write its trace."""
-    e = EXPERIMENTS[name]
-    world = World.named(e.world)
-    trace = simulate(world, e.tours, run.seed)
+    world = World.named(name)
+    trace = simulate(world, EXPERIMENTS[name].tours, run.seed)
     trace.save(folder / "run.jsonl")
     learner = BootstrapLearner(VIEWS_ALONE).fit(trace)
     figures.draw_world(folder / "world.png", world, [step.truth["pose"] for step in trace.steps])
     figures.draw_views(folder / "views.png", images_of(trace), learner.views_, true_dstates(trace))
-    found = run.clustering
-    figures.draw_quality(folder / "quality.png", found.quality, found.uncertainty, found.k)
+    figures.draw_quality(folder / "quality.png", run.quality, run.uncertainty, run.k)
     figures.draw_learning(folder / "learning.png", {"labels from the map": run.curve})
     figures.draw_spread(folder / "spread.png", run.spread)
     # The map from the views alone, and with the openings seen.
@@ -243,20 +188,17 @@ def _page(name: str, runs: Sequence[SeedRun], table: Sequence[dict[str, Any]], f
         for row in table
     )
     shown = "\n".join(
-        f'<figure><img src="{file}" alt="{escape(text)}">'
-        f"<figcaption>{escape(text)}</figcaption></figure>"
-        for file, text in FIGURES[name]
+        f'<figure><img src="{file}" alt="{(said := escape(text.format(*NUMBERS[name])))}">'
+        f"<figcaption>{said}</figcaption></figure>"
+        for file, text in FIGURES.items()
         if (folder / file).exists()
     )
-    differs = "\n".join(f"<li>{escape(text)}</li>" for text in DIFFERENCES[name])
-    title = World.named(EXPERIMENTS[name].world).name
     return filled(
         Path(__file__).parent / "paper_report.html",
-        title=escape(title),
+        title=escape(World.named(name).name),
         seeds=str(len(runs)),
         first=str(runs[0].seed),
         rows=rows,
-        differs=differs,
         shown=shown,
     )
 
@@ -268,10 +210,8 @@ def claimed(row: dict[str, Any]) -> str:
 
 def spread_of(row: dict[str, Any]) -> str:
     """Write the values of all seeds: one text if they agree, else the three most frequent ones."""
-    values = list(row["here"].values())
-    counted = sorted(set(values), key=values.count, reverse=True)
-    if len(counted) == 1:
-        return str(counted[0])
-    return "; ".join(f"{v} (x{values.count(v)})" for v in counted[:3]) + (
-        "; …" if len(counted) > 3 else ""
-    )
+    found = Counter(row["here"].values()).most_common()
+    if len(found) == 1:
+        return str(found[0][0])
+    said = "; ".join(f"{value} (x{seeds})" for value, seeds in found[:3])
+    return said + ("; …" if len(found) > 3 else "")
