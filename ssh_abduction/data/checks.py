@@ -283,14 +283,14 @@ def numbers_listed(value: Any, where: str) -> list[Any] | tuple[Any, ...]:
     raise TraceError(f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]")
 
 
-def frozen_image(value: Any) -> tuple[float, ...] | int:
+def frozen_image(value: Any, where: str) -> tuple[float, ...] | int:
     """Return an image as a tuple of numbers, or as an index into the sidecar file.
 
     Of a tuple, only the first number is checked: traces are copied often, and images are long.
     """
     if isinstance(value, tuple) and (not value or is_finite(value[0])):
         return value
-    return checked_image(value.tolist() if hasattr(value, "tolist") else value, "image")
+    return checked_image(value.tolist() if hasattr(value, "tolist") else value, where)
 
 
 def plain_number(x: float) -> float:

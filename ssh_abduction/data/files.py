@@ -88,6 +88,8 @@ def parse_json(data: bytes) -> Any:
         text = data.decode("utf-8")
         numbers = {"parse_int": _integer} if _LONG_NUMBER.search(text) else {}
         value = json.loads(text, object_pairs_hook=_object, parse_constant=constant, **numbers)  # type: ignore[arg-type]
+        if text.count("[") + text.count("{") > DEEPEST and _depth(value) > DEEPEST:
+            raise RecursionError
     except UnicodeDecodeError as error:
         byte = f"the byte 0x{data[error.start]:02x} at column {error.start + 1}"
         raise BadJson(byte, _BINARY, "text in UTF-8") from None
@@ -96,8 +98,6 @@ def parse_json(data: bytes) -> Any:
         raise BadJson(found, _BINARY if b"\0" in data else "", line=error.lineno) from None
     except RecursionError:
         raise BadJson("one nested too deeply", "flatten it") from None
-    if text.count("[") + text.count("{") > DEEPEST and _is_deep(value):
-        raise BadJson("one nested too deeply", "flatten it")
     if not_finite:
         mend = "replace it, or leave the field out"
         raise BadJson(not_finite[0], mend, "a finite number", _where_nan(value))
@@ -283,19 +283,10 @@ def _integer(text: str) -> int:
     return int(text)
 
 
-def _is_deep(value: Any) -> bool:
-    """Whether objects and lists are nested more than DEEPEST times."""
-    level = [value]
-    for _ in range(DEEPEST + 1):
-        inside = (
-            item.values() if isinstance(item, dict) else item
-            for item in level
-            if isinstance(item, dict | list)
-        )
-        level = [item for items in inside for item in items if isinstance(item, dict | list)]
-        if not level:
-            return False
-    return True
+def _depth(value: Any) -> int:
+    """Count how deep objects and lists are nested. May raise RecursionError."""
+    inside = value.values() if isinstance(value, dict) else value
+    return 1 + max(map(_depth, inside), default=0) if isinstance(value, dict | list) else 0
 
 
 def _where_nan(value: Any, path: str = "") -> str:

@@ -24,7 +24,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import DState, SSHMap
@@ -60,10 +60,6 @@ class Sight:
     # or neither.
     onward: tuple[int, ...] = ()
     drive: int = 0  # the number of the drive; 0 for all if gateways cannot change between drives
-
-    def __hash__(self) -> int:
-        """Hash few fields, to be fast. Few sights of a map are equal in these."""
-        return hash((self.step, self.dstate.id))
 
 
 Turns = Mapping[tuple[Sight, Sight], Collection[Action]]
@@ -208,19 +204,12 @@ def facing(
                 for towards in (0, 180)
                 if not changes and not any(leads(frame, towards) for frame in sight.star.frames)
             )
-        pairs = _opposite_sights(tuple(fitted))
-        found.opposite.extend((seen[i].dstate.id, seen[j].dstate.id) for i, j in pairs)
+        found.opposite.extend(
+            (one.dstate.id, other.dstate.id)
+            for (one, before), (other, after) in combinations(zip(seen, fitted, strict=True), 2)
+            if are_opposite(before, after)
+        )
     return found
-
-
-@lru_cache(maxsize=2**12)
-def _opposite_sights(fitted: tuple[Turned, ...]) -> tuple[tuple[int, int], ...]:
-    """List pairs of indices of fitted sights in which the robot surely faces opposite ways."""
-    if not fitted:
-        return ()
-    *earlier, last = fitted
-    pairs = ((i, len(earlier)) for i, seen in enumerate(earlier) if are_opposite(seen, last))
-    return (*_opposite_sights(tuple(earlier)), *pairs)
 
 
 def are_opposite(seen_a: Turned, seen_b: Turned) -> bool:
@@ -308,15 +297,6 @@ def _fitted(
                     return read
         return None
 
-    if len(sights) > 1:
-        # Extend the first answer for all sights but the last. If that fails, search anew.
-        earlier = tuple(turn for turn in made if sights[-1] not in turn[:2])
-        fewer = None if headings is None else headings[:-1]
-        known = _fitted(sights[:-1], fewer, earlier, axioms, most)
-        if known is None:
-            return None
-        closed = {s.drive: _closed(read) for s, read in zip(sights, known, strict=False)}
-        return extended([*known], closed if most else {}) or extended([], {})
     return extended([], {})
 
 

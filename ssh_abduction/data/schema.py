@@ -25,6 +25,16 @@ T = TypeVar("T")
 Shape: TypeAlias = Callable[[Any, str], T]
 
 
+def set_checked(value: Any, **checks: Callable[[Any, str], Any]) -> None:
+    """Replace fields of a frozen dataclass by their checked values. None stays.
+
+    Each check gets the value and the name of the field, and returns the value or raises an error.
+    """
+    for name, check in checks.items():
+        if (given := getattr(value, name)) is not None:
+            object.__setattr__(value, name, check(given, name))
+
+
 class PlainData:
     """The base class of dataclasses whose plain data for JSON is all of their fields."""
 

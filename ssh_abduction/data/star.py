@@ -17,7 +17,7 @@ ahead, right, back or left, a star is also four openings, which the fast engines
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations, combinations_with_replacement
 from typing import Any, TypeAlias
@@ -85,14 +85,6 @@ class Frame:
     spreads: tuple[float, ...]  # how many degrees each bearing may be off
     # For each slot, the slot where the same path goes on; None if the star gives none.
     opposite: tuple[int | None, ...]
-    # The hash of the bearings, stored because frames are often hashed.
-    hashed: int = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hashed", hash(self.bearings))
-
-    def __hash__(self) -> int:
-        return self.hashed
 
     @property
     def slots(self) -> int:
@@ -137,17 +129,9 @@ class Star:
 
     Attributes:
         gateways: The gateways.
-        hashed: The hash of their bearings, stored because stars are often hashed.
     """
 
     gateways: tuple[Gateway, ...]
-    hashed: int = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hashed", hash(tuple(g.bearing for g in self.gateways)))
-
-    def __hash__(self) -> int:
-        return self.hashed
 
     @classmethod
     def of(cls, entries: Sequence[Entry]) -> Star:

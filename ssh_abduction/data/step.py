@@ -23,6 +23,7 @@ from ssh_abduction.data.odometry import (
     checked_covariance,
     checked_displacement,
 )
+from ssh_abduction.data.schema import set_checked
 from ssh_abduction.data.star import Entry, Openings, Star, is_four, parse_star, star_to_json
 from ssh_abduction.data.words import counted, that_differ
 
@@ -64,30 +65,23 @@ class Step:
     gateways: Star | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        # Replace each field by its checked value. Python forbids `self.view = …`: Step is frozen.
-        if self.view is not None:
-            object.__setattr__(self, "view", checked_view(self.view, "view"))
-        if self.action is not None:
-            mend = 'make one with Action.of("travel")'
-            an_instance("action", self.action, Action, TraceError, mend=mend)
-        an_object("extra", self.extra, TraceError)
-        if self.image is not None:
-            object.__setattr__(self, "image", frozen_image(self.image))
-        if self.confidence is not None:
-            sure = checked_probability(self.confidence, "confidence")
-            object.__setattr__(self, "confidence", sure)
-        if self.star is not None:
-            object.__setattr__(self, "star", parse_star(self.star, "star"))
+        set_checked(
+            self,
+            view=checked_view,
+            action=_an_action,
+            extra=lambda extra, name: an_object(name, extra, TraceError),
+            image=frozen_image,
+            confidence=checked_probability,
+            star=parse_star,
+            displacement=lambda displacement, _: checked_displacement(displacement),
+            covariance=lambda covariance, _: checked_covariance(covariance),
+        )
         object.__setattr__(self, "gateways", None if self.star is None else Star.of(self.star))
-        if self.displacement is not None:
-            object.__setattr__(self, "displacement", checked_displacement(self.displacement))
-        if self.covariance is not None:
-            if self.displacement is None:
-                raise TraceError(
-                    "covariance: expected a displacement at the same step, got none; add the "
-                    "displacement, or leave the covariance out"
-                )
-            object.__setattr__(self, "covariance", checked_covariance(self.covariance))
+        if self.covariance is not None and self.displacement is None:
+            raise TraceError(
+                "covariance: expected a displacement at the same step, got none; add the "
+                "displacement, or leave the covariance out"
+            )
 
     def __repr__(self) -> str:
         texts = that_differ(self)
@@ -169,18 +163,19 @@ class Step:
         return {**unknown, **{k: v for k, v in known.items() if v is not None}, **self.extra}
 
 
-def of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[Any]:
-    """Return a list of one value for each step, from one value for each action, or from none.
+def _an_action(value: object, name: str) -> Action:
+    return an_instance(name, value, Action, TraceError, mend='make one with Action.of("travel")')
 
-    The value of an action goes to the step that it led to. The first step gets None.
-    """
-    found = [None] * actions if values is None else as_list(values, name)
-    if len(found) != actions:
+
+def one_each(values: Iterable[Any] | None, name: str, count: int, each: str = "step") -> list[Any]:
+    """Return a list of one value for each step or action; of None if no values are given."""
+    found = [None] * count if values is None else as_list(values, name)
+    if len(found) != count:
         raise TraceError(
-            f"trace: expected as many {name} as actions, got {len(found)} and {actions} actions; "
-            "give None where one is not known"
+            f"{name}: expected one per {each}, {count}, got {len(found)}; give None where one is "
+            "not known"
         )
-    return [None, *found]
+    return found
 
 
 def as_list(values: Any, name: str) -> list[Any]:

@@ -43,8 +43,9 @@ from ssh_abduction.data.odometry import (
     checked_closures,
     closures_among,
 )
+from ssh_abduction.data.schema import set_checked
 from ssh_abduction.data.star import Star
-from ssh_abduction.data.step import Step, as_list, of_actions
+from ssh_abduction.data.step import Step, as_list, one_each
 from ssh_abduction.data.trace_file import FORMAT, VERSION, read_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.lazy import card_of
@@ -96,16 +97,13 @@ class Trace:
                 f"{named(self.source or 'trace')}: expected at least one step, got none; "
                 f"add what the robot saw first"
             )
-        for name in ("name", "images", "source", "drive"):
-            if (text := getattr(self, name)) is not None:
-                text = a_text(name, text, TraceError, mend="give a text, or leave it out")
-                object.__setattr__(self, name, plain_text(text))
+        set_checked(self, name=_text, images=_text, source=_text, drive=_text)
         if self.odometry is not None:
             mend = "make one with Odometry.of, or leave it out"
             an_instance("odometry", self.odometry, Odometry, TraceError, mend=mend)
         an_object("extra", self.extra, TraceError)
-        object.__setattr__(
-            self, "closures", checked_closures(self.closures, len(self.steps), self.source)
+        set_checked(
+            self, closures=lambda some, _: checked_closures(some, len(self.steps), self.source)
         )
         self._check_actions()
 
@@ -309,14 +307,9 @@ class Trace:
                 f"{len(done)} actions; each action leads from one view to the next"
             )
         # A step has its star. The displacement of an action belongs to the step after the action.
-        openings = [None] * len(seen) if stars is None else as_list(stars, "stars")
-        if len(openings) != len(seen):
-            raise TraceError(
-                f"trace: expected one star per view, got {len(openings)} stars and {len(seen)} "
-                "views; give None where none was seen"
-            )
-        moved = of_actions(displacements, "displacements", len(done))
-        noise = of_actions(covariances, "covariances", len(done))
+        openings = one_each(stars, "stars", len(seen))
+        moved = [None, *one_each(displacements, "displacements", len(done), "action")]
+        noise = [None, *one_each(covariances, "covariances", len(done), "action")]
         steps = tuple(
             Step.of(view, star, f"step {i}", action, displacement, covariance)
             for i, (view, star, action, displacement, covariance) in enumerate(
@@ -364,12 +357,8 @@ class Trace:
         Raises:
             TraceError: If a value is wrong, or there is not one for each step.
         """
-        seen = as_list(views, "views")
-        sure = [None] * len(seen) if confidences is None else as_list(confidences, "confidences")
-        for name, values in (("views", seen), ("confidences", sure)):
-            if len(values) != len(self):
-                told = f"expected one per step, {len(self)}, got {len(values)}"
-                raise TraceError(f"{name}: {told}; add or leave out some")
+        seen = one_each(views, "views", len(self))
+        sure = one_each(confidences, "confidences", len(self))
         steps = []
         for i, (step, v, c) in enumerate(zip(self.steps, seen, sure, strict=True)):
             view = None if v is None else checked_view(v, f"views[{i}]")
@@ -432,6 +421,10 @@ class Trace:
         yield _dump({**{k: v for k, v in header.items() if v is not None}, **more, **self.extra})
         for step in self.steps:
             yield _dump(step.to_json())
+
+
+def _text(value: object, name: str) -> str:
+    return plain_text(a_text(name, value, TraceError, mend="give a text, or leave it out"))
 
 
 def _check_start(trace: Trace, i: int, name: str, known: Collection[str]) -> None:

@@ -13,7 +13,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from numpy.typing import NDArray
 from perception.errors import PerceptionError
 from perception.images import images_held
 from ssh_abduction.data.errors import MapError, TraceError, brief, is_finite, named
-from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Step, Trace
 
@@ -63,10 +61,10 @@ def replays(
     """
     first = maps[0]
     name = "the trace that was mapped"
-    if trace is None:
-        mapped = {"name": name, "steps": _steps_of_map(first)}
+    views = [str(first.dstates[label].shown) for label in first.dstate_at]
+    if trace is None:  # nothing but views is known
+        mapped = {"name": name, "steps": [{"view": view, "action": None} for view in views]}
     else:
-        views = [str(first.dstates[label].shown) for label in first.dstate_at]
         mapped = _replay(trace, name, views)
     if run is None:
         return [mapped]
@@ -103,22 +101,6 @@ def _step(step: Step, view: str) -> dict[str, Any]:
             [round(gateway.bearing, 1), gateway.open] for gateway in step.gateways.gateways
         ]
     return record
-
-
-def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
-    """Reconstruct views and actions of the trace from a map.
-
-    An action is None if several actions, or none, link its dstate to the next one.
-    """
-    actions = gathered(((s, x), action) for s, action, x in first.links)
-    done = [actions.get(pair, []) for pair in pairwise(first.dstate_at)]
-    names = [some[0] if len(some) == 1 else None for some in done]
-    views: list[Any] = [first.dstates[label].shown for label in first.dstate_at]
-    for fault in first.faults:
-        if fault.kind == "misread" and fault.seen is not None:
-            views[fault.step] = fault.seen
-    told = zip(views, [*names, None], strict=True)
-    return [{"view": str(view), "action": action} for view, action in told]
 
 
 def _beliefs(maps: Sequence[SSHMap], labelings: Sequence[int], run: Run) -> dict[str, Any]:
