@@ -273,7 +273,7 @@ def test_evaluate_judges_names_and_poses(
             "0 0'",
         ),
         ("# none\n\n1 2 x 0 0 0 0 0", "relations:3: expected the numbers"),
-        ("1 2 nan 0 0 0 0 0", "relations:1: expected finite numbers"),
+        ("1 2 nan 0 0 0 0 0", "relations:1: expected the numbers"),
         ("1 1 0.5 0 0 0 0 0", "relations:1: time2: expected another time than time1, got 1 twice"),
         ("# none", "relations: expected lines of time1 time2 x y z roll pitch yaw, got none"),
         ("\udcff", "relations: expected a text of relations, got another file"),

@@ -35,6 +35,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -42,11 +43,16 @@ from ssh_abduction.data.checks import a_number, numbers
 from ssh_abduction.data.errors import TraceError, brief, named
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.odometry import Displacement, Pose, displacement_between, moved
-from ssh_abduction.data.trace import Step, Trace
+from ssh_abduction.data.trace import Trace
 
 # The fields of a line of a trajectory, and of a file of relations.
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 RELATION = ("time1", "time2", "x", "y", "z", "roll", "pitch", "yaw")
+# What to do with lines of other numbers of fields.
+HINTS = {
+    12: "this looks like a file of KITTI, which has no times",
+    17: "this looks like a file of EuRoC: evo_traj converts it",
+}
 # Files of more bytes than this are rejected.
 LARGEST = 2**28
 # A step may be this many seconds from the nearest pose or related time, as robots that map
@@ -102,27 +108,31 @@ class Trajectory:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Trajectory:
-        """Read a trajectory in TUM format. Raises OSError, or TraceError, which names the line.
-
-        Numbers are separated by spaces, tabs, commas or semicolons. Names of columns before
-        the first pose are skipped.
-        """
+        """Read a trajectory in TUM format. Raises OSError, or TraceError, which names the line."""
         source = os.fspath(path)
-        mend = "give a text of lines: time x y z qx qy qz qw"
-        text = text_of(source, "a trajectory in TUM format", mend)
-        found: list[tuple[float, Pose]] = []
-        heights: list[float] = []
-        upright = 0
-        for number, line in enumerate(text.splitlines(), 1):
-            fields = re.split(r"[,;\s]+", line.partition("#")[0].strip(" \t,;"))
-            if fields == [""] or (not found and not any(map(_is_number, fields))):
-                continue  # an empty line, or the names of the columns
-            time, pose, height, lean = _pose(fields, f"{named(source)}:{number}")
-            found.append((time, pose))
-            heights.append(height)
-            upright += lean >= UPRIGHT
-        trajectory = Trajectory(found, source)
-        _warn_of_space(source, max(heights) - min(heights), len(found) - upright, len(found))
+        lines, table = _rows(source, FIELDS, "a trajectory in TUM format")
+        lengths = np.linalg.norm(table[:, 4:], axis=1)
+        for i in np.flatnonzero(np.abs(lengths - 1) > ROUNDED):
+            raise TraceError(
+                f"{named(source)}:{lines[i]}: qx qy qz qw: expected a quaternion of length 1, got "
+                f"one of {lengths[i]:.3g}; mend the line"
+            )
+        # The yaw is the heading. The z axis of the rotation matrix has the cosine of the lean.
+        qx, qy, qz, qw = (table[:, 4:] / lengths[:, None]).T
+        headings = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+        leaning = int((1 - 2 * (qx * qx + qy * qy) < UPRIGHT).sum())
+        poses = np.column_stack([table[:, 1:3], headings]).tolist()
+        trajectory = Trajectory(zip(table[:, 0].tolist(), map(tuple, poses), strict=True), source)
+        rise = float(np.ptp(table[:, 3]))
+        if rise > FLAT or 2 * leaning > len(table):
+            warnings.warn(
+                f"{named(source)}: expected a trajectory on a floor, x and y in metres, got one "
+                f"that rises by {rise:.1f} m, and {leaning} of {len(table)} poses that lean by "
+                "more than 30 degrees: tz and the lean are not read; give the poses of the robot, "
+                "not of a camera",
+                TrajectoryWarning,
+                stacklevel=2,
+            )
         return trajectory
 
     def at(self, time: float | None) -> Pose | None:
@@ -170,10 +180,11 @@ class Trajectory:
         # The pose of the dstate is given in the frame of the robot.
         steps = []
         for t, (step, robot) in enumerate(zip(trace.steps, robots, strict=True)):
-            pose = None
-            if robot is not None:
-                pose = moved(robot, checked_pose(step.extra.get("seen"), trace.at(t)))
-            steps.append(replace(step, truth=_truth(step, pose)))
+            truth = step.truth if isinstance(step.truth, Mapping) else {"dstate": step.truth}
+            pose = robot and moved(robot, checked_pose(step.extra.get("seen"), trace.at(t)))
+            told = {**truth, "pose": pose and list(pose)}
+            told = {name: value for name, value in told.items() if value is not None}
+            steps.append(replace(step, truth=told or None))
         return replace(trace, steps=tuple(steps))
 
     def _no_match(self, trace: Trace, times: Sequence[float]) -> str:
@@ -197,14 +208,47 @@ class Trajectory:
         )
 
 
-def text_of(path: str | os.PathLike[str], expected: str, mend: str) -> str:
-    """Read a text file. Raise TraceError, which says what was `expected`, for another file."""
+def _rows(source: str, names: Sequence[str], what: str) -> tuple[list[int], NDArray[np.float64]]:
+    """Read a text of lines of numbers, one for each name. Return line numbers, (n,), and numbers.
+
+    Numbers are separated by spaces, tabs, commas or semicolons. Names of columns before the first
+    numbers are skipped. Raises OSError, or TraceError, which names the line; `what` is expected.
+    """
     try:
-        return read_at_most(path, LARGEST).decode("utf-8-sig")
+        text = read_at_most(source, LARGEST).decode("utf-8-sig")
     except ValueError as error:  # also for bytes that are no text
         raise TraceError(
-            f"{named(path)}: expected {expected}, got another file ({error}); {mend}"
+            f"{named(source)}: expected {what}, got another file ({error}); give a text of "
+            f"lines: {' '.join(names)}"
         ) from None
+    lines: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        fields = re.split(r"[,;\s]+", line.partition("#")[0].strip(" \t,;"))
+        values = [_number(field) for field in fields]
+        if fields == [""] or (not rows and not np.isfinite(values).any()):
+            continue  # an empty line, or the names of the columns
+        if len(fields) != len(names) or not np.isfinite(values).all():
+            mend = HINTS.get(len(fields), "mend the line")
+            raise TraceError(
+                f"{named(source)}:{number}: expected the numbers {' '.join(names)}, got "
+                f"{brief(' '.join(fields))}; {mend}"
+            )
+        lines.append(number)
+        rows.append(values)
+    if not rows:
+        raise TraceError(
+            f"{named(source)}: expected lines of {' '.join(names)}, got none; give {what}"
+        )
+    return lines, np.array(rows)
+
+
+def _number(field: str) -> float:
+    """Convert a text to a number; NaN for anything else."""
+    try:
+        return float(field)
+    except ValueError:
+        return math.nan
 
 
 def indices_around(times: Sequence[float], time: float) -> list[int]:
@@ -223,26 +267,6 @@ def _interpolated(first: Pose, second: Pose, share: float) -> Pose:
     turned = share * math.remainder(other - heading, math.tau)
     heading = math.remainder(heading + turned, math.tau)
     return x + share * (u - x), y + share * (v - y), heading
-
-
-def is_trajectory(lines: Iterable[Sequence[str]]) -> bool:
-    """Tell whether lines of eight numbers are poses in TUM format, and not relations.
-
-    In TUM format the last four numbers of each line are a quaternion, which has length 1. In a file
-    of relations they are z, roll, pitch and yaw. On a floor all but the yaw are 0, so they also
-    have length 1 if each yaw is about 1 radian. So if all but the last number are 0 in all lines,
-    the last one must be exactly 1 or -1.
-    """
-    try:
-        tails = [[float(field) for field in fields[4:8]] for fields in lines]
-    except ValueError:
-        return False
-    unit = bool(tails) and all(
-        len(tail) == 4 and abs(math.hypot(*tail) - 1) <= ROUNDED for tail in tails
-    )
-    return unit and (
-        any(any(tail[:3]) for tail in tails) or all(abs(tail[3]) == 1 for tail in tails)
-    )
 
 
 def checked_time(value: Any, where: str) -> float | None:
@@ -268,61 +292,6 @@ def three_numbers(value: Any, where: str) -> Pose:
     what = "[x, y, heading] in metres and radians"
     x, y, heading = numbers(where, value, TraceError, 3, what, "mend it")
     return x, y, heading
-
-
-def _truth(step: Step, pose: Pose | None) -> Any:
-    """Return the truth of a step with its pose replaced; None if nothing is left."""
-    truth: dict[str, Any] = {}
-    if isinstance(step.truth, Mapping):
-        truth = {name: value for name, value in step.truth.items() if name != "pose"}
-    elif step.truth is not None:
-        truth = {"dstate": step.truth}
-    if pose is not None:
-        truth["pose"] = list(pose)
-    return truth or None
-
-
-def _is_number(field: str) -> bool:
-    try:
-        return math.isfinite(float(field))
-    except ValueError:
-        return False
-
-
-def _pose(fields: Sequence[str], where: str) -> tuple[float, Pose, float, float]:
-    """Read a line: seconds, pose on the floor, height in metres, and cosine of the robot's lean."""
-    if len(fields) != len(FIELDS) or not all(map(_is_number, fields)):
-        hint = {
-            12: "; this looks like a file of KITTI, which has no times",
-            17: "; this looks like a file of EuRoC: evo_traj converts it",
-        }
-        mend = hint.get(len(fields), "; mend the line")
-        raise TraceError(
-            f"{where}: expected the numbers {' '.join(FIELDS)}, got {brief(' '.join(fields))}{mend}"
-        )
-    time, x, y, z, *quaternion = map(float, fields)
-    length = math.hypot(*quaternion)
-    if abs(length - 1) > ROUNDED:
-        raise TraceError(
-            f"{where}: qx qy qz qw: expected a quaternion of length 1, got one of {length:.3g}; "
-            "mend the line"
-        )
-    # The yaw is the heading. The z axis of the rotation matrix has the cosine of the lean.
-    qx, qy, qz, qw = (number / length for number in quaternion)
-    heading = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
-    return time, (x, y, heading), z, 1 - 2 * (qx * qx + qy * qy)
-
-
-def _warn_of_space(source: str, rise: float, leaning: int, count: int) -> None:
-    """Warn if a trajectory is not on a floor, as its height changes (metres) or its poses lean."""
-    if rise > FLAT or 2 * leaning > count:
-        warnings.warn(
-            f"{named(source)}: expected a trajectory on a floor, x and y in metres, got one that "
-            f"rises by {rise:.1f} m, and {leaning} of {count} poses that lean by more than 30 "
-            "degrees: tz and the lean are not read; give the poses of the robot, not of a camera",
-            TrajectoryWarning,
-            stacklevel=3,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -382,23 +351,26 @@ class Relations:
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Relations:
         """Read a file of relations. Raises OSError, or TraceError, which names the line."""
-        text = text_of(path, "a text of relations", "give one of numbers")
-        lines = [
-            (number, fields)
-            for number, line in enumerate(text.splitlines(), 1)
-            if (fields := line.partition("#")[0].split())
-        ]
-        if is_trajectory(fields for _, fields in lines):
+        source = os.fspath(path)
+        lines, table = _rows(source, RELATION, "a text of relations")
+        # In a trajectory, the last four numbers are a quaternion of length 1. In relations on a
+        # floor, all but the last of them are 0, and each yaw may be about 1 radian. Then it is a
+        # trajectory only if it is exactly 1 or -1.
+        tails = table[:, 4:]
+        is_unit = (np.abs(np.linalg.norm(tails, axis=1) - 1) <= ROUNDED).all()
+        if is_unit and (tails[:, :3].any() or (np.abs(tails[:, 3]) == 1).all()):
             raise TraceError(
-                f"{named(path)}: expected relations, {' '.join(RELATION)}, got a trajectory: "
+                f"{named(source)}: expected relations, {' '.join(RELATION)}, got a trajectory: "
                 "each line ends in a quaternion; give it as the truth of the steps (--truth)"
             )
-        found = [_relation(fields, f"{named(path)}:{number}") for number, fields in lines]
-        if not found:
-            raise TraceError(
-                f"{named(path)}: expected lines of {' '.join(RELATION)}, got none; "
-                "give a file of relations"
-            )
+        found = []
+        for line, (first, second, x, y, _, _, _, yaw) in zip(lines, table.tolist(), strict=True):
+            if first == second:
+                raise TraceError(
+                    f"{named(source)}:{line}: time2: expected another time than time1, got "
+                    f"{first:.10g} twice; mend the line"
+                )
+            found.append(Relation(first, second, (x, y, yaw)))
         return Relations(found)
 
     def covers(self, time: float | None) -> bool:
@@ -458,24 +430,3 @@ class Relations:
             share = (time - self.times[node]) / (self.times[other] - self.times[node])
             return node, _interpolated((0.0, 0.0, 0.0), whole, share)
         return (node, (0.0, 0.0, 0.0)) if abs(self.times[node] - time) <= NEAREST else None
-
-
-def _relation(fields: Sequence[str], where: str) -> Relation:
-    """Read a relation from the fields of its line. Raise TraceError if it is malformed."""
-    try:
-        first, second, x, y, _, _, _, yaw = (float(field) for field in fields)
-    except ValueError:
-        raise TraceError(
-            f"{where}: expected the numbers {' '.join(RELATION)}, got {brief(' '.join(fields))}; "
-            "mend the line"
-        ) from None
-    if not all(math.isfinite(value) for value in (first, second, x, y, yaw)):
-        raise TraceError(
-            f"{where}: expected finite numbers, got {brief(' '.join(fields))}; mend the line"
-        )
-    if first == second:
-        raise TraceError(
-            f"{where}: time2: expected another time than time1, got {fields[1]} twice; "
-            "mend the line"
-        )
-    return Relation(first, second, (x, y, yaw))
