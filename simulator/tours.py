@@ -477,19 +477,13 @@ class DriveWatch:
         """The likely causes of an error since a pose, to end a message; empty if there are none."""
         world, body, noise = self.world, self.driver.robot.body, self.driver.laser.noise
         is_square, half = world.angles == "right", self._half_width(before)
-        is_other = world.own_reach is not None and world.own_reach != world.reach
         fits = (0.0 if is_square else 0.6 * half) <= world.reach <= 1.25 * half
         start = world.nearest(world.start)
         away = math.dist(start.pose[:2], world.start[:2]) if start else 0.0
         off = _off_axis(world)
         causes = (
             (
-                is_other,
-                f"reach is {world.reach:g} m, and the world's own is {world.own_reach or 0:g} m "
-                "(leave --set reach out)",
-            ),
-            (
-                not is_other and 0 < half < math.inf and not fits,
+                half < math.inf and not fits,
                 f"reach is {world.reach:g} m, and half the width of the street there is {half:.2f} "
                 "m (give that as reach)",
             ),

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.resources import files
@@ -38,6 +38,7 @@ from ssh_abduction.data.checks import (
 )
 from ssh_abduction.data.errors import brief, is_finite, named, printable
 from ssh_abduction.data.files import parse_json, read_file
+from ssh_abduction.data.odometry import radians_between
 from ssh_abduction.data.schema import FieldReader
 
 Array = NDArray[np.float64]
@@ -121,7 +122,6 @@ class World:
         via: Dict from a name to (x, y) in metres, for points that are no places but that a route of
             places may lead through.
         lifts: Lifts. Each lift is an action of a route.
-        own_reach: The reach of the world's file in metres, if `reach` replaces it; otherwise None.
     """
 
     name: str
@@ -135,16 +135,12 @@ class World:
     places: Mapping[str, Point] = field(default_factory=dict, repr=False)
     via: Mapping[str, Point] = field(default_factory=dict, repr=False)
     lifts: tuple[Lift, ...] = ()
-    own_reach: float | None = None
 
     def __post_init__(self) -> None:
         a_text("world.name", self.name, SimulatorError)
         checked_segments("world.segments", self.segments)
         object.__setattr__(self, "start", pose_of("world.start", self.start))
-        for name, reach in (("reach", self.reach), ("own_reach", self.own_reach)):
-            if reach is not None or name == "reach":
-                where = f"world.{name}"
-                a_number(where, reach, SimulatorError, NEAREST, FARTHEST, what="metres")
+        a_number("world.reach", self.reach, SimulatorError, NEAREST, FARTHEST, what="metres")
         one_of("world.angles", self.angles, get_args(Angles), SimulatorError)
         # The class is frozen; lists become tuples.
         for name, kind in (
@@ -224,13 +220,10 @@ class World:
         x, y, heading = pose_of("pose", pose)
         if not self.dstates:
             return None
-
-        def far(s: TrueDState) -> float:
-            return math.hypot(s.pose[0] - x, s.pose[1] - y) + abs(
-                math.remainder(s.pose[2] - heading, math.tau)
-            )
-
-        return min(self.dstates, key=far)
+        return min(
+            self.dstates,
+            key=lambda s: math.dist(s.pose[:2], (x, y)) + radians_between(s.pose[2], heading),
+        )
 
     def with_choices(
         self, start: str | None = None, route: str | None = None, reach: float | None = None
@@ -246,22 +239,20 @@ class World:
             SimulatorError: An argument is malformed.
         """
         reader = WorldReader(self.name)
+        changes: dict[str, Any] = {}
         # The reader names the argument in its errors.
-        world = self
         if start is not None:
             try:
                 pose = [float(x) for x in a_text("start", start, SimulatorError).split(",")]
             except ValueError:
                 raise reader.wrong("start", "x,y,degrees", start) from None
-            world = replace(world, start=reader.pose(pose, "start"))
+            changes["start"] = reader.pose(pose, "start")
         if route is not None:
-            if not isinstance(route, str):
-                raise reader.wrong("route", "actions with commas between", route)
-            world = replace(world, route=reader.route(route.split(","), world.stops, world.lifts))
+            listed = a_text("route", route, SimulatorError).split(",")
+            changes["route"] = reader.route(listed, self.stops, self.lifts)
         if reach is not None:
-            own = world.own_reach or world.reach
-            world = replace(world, reach=reader.reach(reach), own_reach=own)
-        return world
+            changes["reach"] = reader.reach(reach)
+        return replace(self, **changes)
 
     @classmethod
     def named(cls, name: str) -> World:
@@ -274,9 +265,8 @@ class World:
         Raises:
             SimulatorError: There is no such world, or the file is wrong.
         """
-        shipped = {
-            path.stem: path for path in (Path(str(files("simulator"))) / "worlds").glob("*.json")
-        }
+        folder = Path(str(files("simulator"))) / "worlds"
+        shipped = {path.stem: path for path in folder.glob("*.json")}
         if isinstance(name, str) and name in shipped:
             return cls.load(shipped[name])
         if not isinstance(name, str) or not Path(name).suffix:
@@ -284,9 +274,8 @@ class World:
                 f"world: expected one of {', '.join(sorted(shipped))}, or a file, got "
                 f"{brief(name)}; a file ends in .json or .yaml"
             )
-        return (
-            cls.from_occupancy(name) if Path(name).suffix in (".yaml", ".yml") else cls.load(name)
-        )
+        is_map = Path(name).suffix in (".yaml", ".yml")
+        return cls.from_occupancy(name) if is_map else cls.load(name)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> World:
@@ -437,27 +426,32 @@ class WorldReader(FieldReader):
             *each("arcs", self.arc),
         ]
         if "occupancy" in data:
-            walls.append(self.occupancy(data["occupancy"]))
+            walls.append(self.occupancy(data["occupancy"], "occupancy"))
         expected = "at least one wall in polygons, segments, arcs or occupancy"
         self.need(bool(walls), "polygons", expected, [])
         return np.vstack(walls)
 
-    def row(self, value: Any, count: int, name: str) -> Array:
-        """Read a list of `count` finite numbers: (count,)."""
+    def row(self, value: Any, count: int, name: str) -> tuple[float, ...]:
+        """Read a list of `count` finite numbers."""
         is_row = isinstance(value, list) and len(value) == count
         is_good = is_row and all(is_finite(x) and abs(x) <= FARTHEST for x in value)
         self.need(is_good, name, f"{count} finite numbers, of at most {FARTHEST:,.0f}", value)
-        return np.array(value, dtype=float)
+        return tuple(map(float, value))
+
+    def point(self, value: Any, name: str) -> Point:
+        """Read a point [x, y] in metres."""
+        x, y = self.row(value, 2, name)
+        return x, y
 
     def segment(self, value: Any, name: str) -> Array:
         """Read a wall: (1, 4), metres."""
-        return self.row(value, 4, name).reshape(1, 4)
+        return np.array([self.row(value, 4, name)])
 
     def loop(self, value: Any, name: str) -> Array:
         """Read a list of points, and make the sides of the closed polygon: (n, 4), metres."""
         is_loop = isinstance(value, list) and len(value) >= 3
         self.need(is_loop, name, "at least three points [x, y]", value)
-        points = np.array([self.row(p, 2, f"{name}[{i}]") for i, p in enumerate(value)])
+        points = np.array([self.point(p, f"{name}[{i}]") for i, p in enumerate(value)])
         return np.hstack([points, np.roll(points, -1, axis=0)])
 
     def arc(self, value: Any, name: str) -> Array:
@@ -473,9 +467,9 @@ class WorldReader(FieldReader):
         points = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
         return np.hstack([points[:-1], points[1:]])
 
-    def occupancy(self, value: Any) -> Array:
+    def occupancy(self, value: Any, name: str) -> Array:
         """Read the walls, (n, 4) metres, of an occupancy map in a file beside this one."""
-        self.need(isinstance(value, str), "occupancy", "the name of a YAML file", value)
+        self.need(isinstance(value, str), name, "the name of a YAML file", value)
         return read_occupancy(Path(self.where).parent / value)[1]
 
     def ragged(self, walls: Array, value: Any) -> Array:
@@ -492,10 +486,8 @@ class WorldReader(FieldReader):
         expected = f"walls of at most {LONGEST:,} m together, as uneven walls have many pieces"
         self.need(is_short, "ragged", expected, value)
         pieces = []
-        for x1, y1, x2, y2 in walls:
-            line = np.linspace(
-                (x1, y1), (x2, y2), 1 + math.ceil(math.hypot(x2 - x1, y2 - y1) / RAGGED)
-            )
+        for start, end in walls.reshape(-1, 2, 2):
+            line = np.linspace(start, end, 1 + math.ceil(math.dist(start, end) / RAGGED))
             pieces.append(np.hstack([line[:-1], line[1:]]))
         # Shift equal ends equally, so that walls that meet still meet.
         ends, which = np.unique(
@@ -509,10 +501,7 @@ class WorldReader(FieldReader):
         self.need(isinstance(value, Mapping), name, "an object of names and points [x, y]", value)
         clash = next((text for text in value if text in ACTIONS or "," in text), None)
         self.need(not clash, name, "names without commas that are no actions", clash)
-        found = {
-            text: self.row(point, 2, f"{name}.{text}").tolist() for text, point in value.items()
-        }
-        return {text: (x, y) for text, (x, y) in found.items()}
+        return {text: self.point(point, f"{name}.{text}") for text, point in value.items()}
 
     def lift(self, value: Any, name: str) -> Lift:
         """Read a lift: an object with name, from and to."""
@@ -521,22 +510,22 @@ class WorldReader(FieldReader):
         action = value["name"]
         is_new = action and action not in ACTIONS and "," not in action
         self.need(is_new, f"{name}.name", "a name without commas that is no action", action)
-        start, end = (self.row(value.get(k), 2, f"{name}.{k}") for k in ("from", "to"))
-        return Lift(action, (float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
+        return Lift(action, *(self.point(value.get(k), f"{name}.{k}") for k in ("from", "to")))
 
     def route(
         self, value: Sequence[Any], stops: Mapping[str, Point], lifts: Sequence[Lift] = ()
     ) -> tuple[str, ...]:
         """Check a route, which consists of actions only or of the names of `stops` only."""
         actions = [*ACTIONS, *dict.fromkeys(lift.name for lift in lifts)]
-        by_places = any(isinstance(stop, str) and stop in stops for stop in value)
+        if any(isinstance(stop, str) and stop in stops for stop in value):
+            allowed: Collection[str] = stops
+            expected = f"a place ({', '.join(stops)}), as there are others in the route"
+        else:
+            allowed = actions
+            expected = f"{', '.join(actions[:-1])} or {actions[-1]}"
+            expected += ", or the name of a place" if stops else ""
         for i, stop in enumerate(value):
-            if by_places:
-                is_good = isinstance(stop, str) and stop in stops
-                expected = f"a place ({', '.join(stops)}), as there are others in the route"
-            else:
-                is_good, expected = stop in actions, f"{', '.join(actions[:-1])} or {actions[-1]}"
-                expected += ", or the name of a place" if stops else ""
+            is_good = isinstance(stop, str) and stop in allowed
             self.need(is_good, f"route[{i}]", expected, stop)
         return tuple(value)
 
@@ -559,30 +548,25 @@ class WorldReader(FieldReader):
     def pose(self, value: Any, name: str) -> tuple[float, float, float]:
         """Read a pose. Its heading is in degrees in the file, and in radians in the result."""
         x, y, degrees = self.row(value, 3, name)
-        return float(x), float(y), math.radians(degrees)
+        return x, y, math.radians(degrees)
 
     def clutter(self, value: Any, name: str) -> Clutter:
         """Read a polygon that may move."""
         self.need(isinstance(value, Mapping), name, "an object with a polygon", value)
-        moves = self.row(value.get("moves", [0, 0]), 2, f"{name}.moves")
+        moves = self.point(value.get("moves", [0, 0]), f"{name}.moves")
         present = value.get("present", 1.0)
         is_share = is_finite(present) and 0 <= present <= 1
         self.need(is_share, f"{name}.present", "a probability", present)
-        return Clutter(
-            self.loop(value.get("polygon"), f"{name}.polygon"),
-            (float(moves[0]), float(moves[1])),
-            float(present),
-        )
+        return Clutter(self.loop(value.get("polygon"), f"{name}.polygon"), moves, float(present))
 
     def dstate(self, value: Any, name: str) -> TrueDState:
         """Read a true dstate."""
-        is_state = isinstance(value, Mapping) and value.get("direction") in (1, -1)
-        self.need(
-            is_state, name, "an object with name, place, path, direction 1 or -1, pose", value
+        texts = dict.fromkeys(("name", "place", "path"), self.text)
+        return self.record(
+            TrueDState, value, name, **texts, direction=self.direction, pose=self.pose
         )
-        texts = [value.get(key) for key in ("name", "place", "path")]
-        are_texts = all(isinstance(text, str) for text in texts)
-        self.need(are_texts, name, "texts for name, place and path", value)
-        label, place, path = map(str, texts)
-        pose = self.pose(value.get("pose"), f"{name}.pose")
-        return TrueDState(label, place, path, int(value["direction"]), pose)
+
+    def direction(self, value: Any, name: str) -> int:
+        """Read a direction along a path."""
+        self.need(value in (1, -1), name, "1 or -1", value)
+        return int(value)

@@ -188,7 +188,6 @@ RIGHT: dict[str, set[str]] = {
     "World.nearest.pose": {"array"},
     "World.start": {"array"},
     "World.reach": {"3.5"},
-    "World.own_reach": {"3.5"},
     "World.with_choices.reach": {"3.5"},
     "World.places": {"dict"},
     "World.via": {"dict"},

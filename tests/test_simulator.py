@@ -185,7 +185,7 @@ def test_occupancy_map_becomes_a_world(tmp_path: Path) -> None:
             {"lifts": [{"name": "left", "from": [0, 0], "to": [1, 1]}]},
             r"lifts\[0\].name: expected a name without commas that is no action",
         ),
-        ({"dstates": [{"name": "a"}]}, r"dstates\[0\]: expected an object"),
+        ({"dstates": [{"name": "a"}]}, r"dstates\[0\].place: expected a text"),
     ],
 )
 def test_malformed_world_is_refused_with_its_field(
