@@ -26,7 +26,6 @@ import json
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from itertools import combinations
 from math import comb
 from typing import Any
@@ -203,15 +202,13 @@ class _Truth:
                 'or {"pose": [x, y, heading]}'
             )
         # For each dstate, the first step there that names its place, path or course.
-        first: dict[tuple[Hashable, str], tuple[int, Hashable]] = {}
+        first: dict[tuple[Hashable, str], int] = {}
         for t, step in enumerate(names):
-            dstate = step.get("dstate")
             for sort in ("place", "path", "course"):
-                name = step.get(sort)
-                if dstate is None or name is None:
+                if step.get("dstate") is None or step.get(sort) is None:
                     continue
-                before, known = first.setdefault((dstate, sort), (t, name))
-                if known != name:
+                before = first.setdefault((step["dstate"], sort), t)
+                if names[before][sort] != step[sort]:
                     field = "direction" if sort == "course" else sort
                     expected, got = (brief(trace.steps[i].truth[field]) for i in (before, t))
                     raise TraceError(
@@ -299,58 +296,50 @@ class _Sort:
 
     def __init__(self, said: Sequence[Hashable], true: Sequence[Hashable]) -> None:
         self.said, self.true = said, true
-        # The number of steps that are at x in the map and truly at y. The pairs are in the order of
-        # the trace, so that results do not depend on names.
-        self.steps = Counter((x, y) for x, y in zip(said, true, strict=True) if y is not None)
-        self.of_map = list(dict.fromkeys(x for x, _ in self.steps if x is not None))
-        self.of_truth = list(dict.fromkeys(y for _, y in self.steps))
+        judged = [(x, y) for x, y in zip(said, true, strict=True) if y is not None]
+        # Things are numbered by their first step, so that results do not depend on names.
+        self.of_map = list(dict.fromkeys(x for x, _ in judged if x is not None))
+        self.of_truth = list(dict.fromkeys(y for _, y in judged))
+        # The number of steps that are at thing i of the map and truly at thing j. The last row
+        # has the steps at which the map has nothing.
+        rows = {name: i for i, name in enumerate([*self.of_map, None])}
+        columns = {name: j for j, name in enumerate(self.of_truth)}
+        self.table = np.zeros((len(rows), len(columns)), int)
+        for x, y in judged:
+            self.table[rows[x], columns[y]] += 1
+        self.best = linear_sum_assignment(self.table[:-1], maximize=True)
 
     @property
     def right(self) -> bool | None:
         """Whether map and truth distinguish the same steps; None if the map has no such thing."""
         if not self.of_map:
             return None
-        # A step for which the map has nothing adds a pair, so that the numbers differ.
-        return len(self.steps) == len(self.of_map) == len(self.of_truth)
+        cells = np.count_nonzero(self.table[:-1])
+        return bool(cells == len(self.of_map) == len(self.of_truth) and not self.table[-1].any())
 
     @property
     def count(self) -> int | None:
         """How many different things the map has at the judged steps; None if it has none."""
         return len(self.of_map) or None
 
-    @cached_property
-    def assignment(self) -> dict[Hashable, Hashable]:
-        """The one-to-one assignment of things to true things under which most steps are right."""
-        rows, columns = (
-            {name: i for i, name in enumerate(names)} for names in (self.of_map, self.of_truth)
-        )
-        table = np.zeros((len(rows), len(columns)))
-        for (x, y), steps in self.steps.items():
-            if x is not None:
-                table[rows[x], columns[y]] = steps
-        return {
-            self.of_map[i]: self.of_truth[j]
-            for i, j in zip(*linear_sum_assignment(table, maximize=True), strict=True)
-        }
-
     @property
     def accuracy(self) -> float | None:
-        """The share of steps that are right under the assignment; None if the map has no things."""
+        """The share of steps that are right under the assignment; None if the map has no things.
+
+        It is the one-to-one assignment of things to true things under which most steps are right.
+        """
         if not self.of_map:
             return None
-        return _share(sum(self.steps[pair] for pair in self.assignment.items()), self.steps.total())
+        return _share(int(self.table[self.best].sum()), int(self.table.sum()))
 
     def pairs(self) -> tuple[float | None, float | None]:
         """Compute the precision and recall of pairs of steps at the same thing."""
         if not self.of_map:
             return None, None
-        said, true = Counter[Hashable](), Counter[Hashable]()
-        for (x, y), steps in self.steps.items():
-            said[x] += steps
-            true[y] += steps
-        del said[None]
-        both = sum(comb(steps, 2) for (x, _), steps in self.steps.items() if x is not None)
-        of_map, of_truth = (sum(comb(n, 2) for n in found.values()) for found in (said, true))
+        known, true = self.table[:-1], self.table.sum(axis=0)
+        both, of_map, of_truth = (
+            int((n * (n - 1)).sum()) for n in (known, known.sum(axis=1), true)
+        )
         return _share(both, of_map), _share(both, of_truth)
 
     def edges(
@@ -363,14 +352,13 @@ class _Sort:
         """
         if not self.of_map:
             return None, None
+        meant = {self.of_map[i]: self.of_truth[j] for i, j in zip(*self.best, strict=True)}
         # from each edge of the map to the edge between the assigned true things
         said: dict[Hashable, Hashable] = {}
         true = set()
         for t in hops:
             here, there = self.said[t], self.said[t + 1]
-            said[edge(t, here, there)] = edge(
-                t, self.assignment.get(here), self.assignment.get(there)
-            )
+            said[edge(t, here, there)] = edge(t, meant.get(here), meant.get(there))
             true.add(edge(t, self.true[t], self.true[t + 1]))
         right = sum(assigned in true for assigned in said.values())
         return _share(right, len(said)), _share(right, len(true))
