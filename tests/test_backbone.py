@@ -165,8 +165,8 @@ def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
     [pytest.param(60.0, StepEngine, marks=pytest.mark.slow), (0.0, LabelsFirst)],
 )
 def test_each_engine_can_prove_the_backbone_from_one_map(frame_after: float, engine: type) -> None:
-    """32 maps that also differ in dstates. A prefix of the readable encodings finds them, or labels
-    that are settled before places and paths."""
+    """32 maps that also differ in dstates. Doubts about a prefix of the readable encodings find
+    some, and the engine that finds dstates first lists all."""
     trace, theory = walk(TWO_BLOCKS, "a1", 50, 1), Theory(boundary="none", prefer=("dstates",))
     with stepwise(frame_after):
         every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
@@ -178,7 +178,7 @@ def test_each_engine_can_prove_the_backbone_from_one_map(frame_after: float, eng
     assert every.backbone is not None
     assert len(every.backbone.dstates.always) == len(trace)
     assert every.backbone.dstates.differing
-    assert search._parts.rivals.sharing.maps < 16
+    assert engine is LabelsFirst or search._parts.rivals.sharing.maps < 16
     assert (first.effort.prefix < len(trace)) == (engine is StepEngine)
 
 

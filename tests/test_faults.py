@@ -27,8 +27,7 @@ from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.front import fault_front
-from ssh_abduction.solver.sources.exact import choosing, faulty, faulty_program
-from ssh_abduction.solver.sources.exact.blocks import Blocks
+from ssh_abduction.solver.sources.exact import choosing, faulty
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.symbolic.state_merging import Explainer
 from ssh_abduction.theory import Speedups
@@ -149,13 +148,12 @@ def test_few_names_and_short_prefixes_do_not_change_answers(data: st.DataObject)
         slipped=data.draw(st.sampled_from([0.3, 1.0])),
     )
     with (
-        patch.multiple(faulty, FEW=data.draw(st.sampled_from([2, 9])), AT_FIRST=2, PLACES=1),
         patch.multiple(
             faulty,
-            GUESSED=data.draw(st.sampled_from([3, 10])),
+            LONG=data.draw(st.sampled_from([2, 3, 10])),
             ASKED_FIRST=data.draw(st.sampled_from([0.0, 3.0])),
         ),
-        patch.multiple(faulty_program, AROUND=0, NAMES=1, MORE_NAMES=1),
+        patch.multiple(faulty, PLACES=1, AROUND=0, NAMES=1, MORE_NAMES=1),
         patch.object(choosing, "FEW_STEPS", 0),
     ):
         solution = solve(trace, theory, max_maps=None)
@@ -243,13 +241,13 @@ def test_bounds_by_blocks_do_not_exceed_the_minimum(data: st.DataObject) -> None
         data.draw(st.sampled_from([task.log.seen, range(len(trace))]))
     )
     known = Explainer(task.log.seen, task.log.actions, price).completed(machine)
-    faults = {"misread": known.misread, "slipped": known.slips}
-    blocks = Blocks(
-        task.log.seen, task.log.actions, price, faults, len(set(known.labels)), task.watch
+    dstates = len(set(known.labels))
+    blocks = faulty.Blocks(
+        task.log.seen, task.log.actions, price, sorted(known.faults), dstates, task.watch
     )
     cost, _ = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))
     assert cost is not None
-    assert blocks.bound() <= cost <= known.tenths == blocks.cost
+    assert blocks.bound(known.tenths) <= cost <= known.tenths
     assert all(
         blocks.least_faults(most) <= known.tenths for most in range(len(set(known.labels)), 8)
     )

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import cache
-from itertools import islice, product
+from itertools import islice, pairwise, product
 from pathlib import Path
 from unittest.mock import patch
 
@@ -27,11 +27,9 @@ from ssh_abduction.data import SolverError
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError
-from ssh_abduction.solver.sources.exact import choosing, labels_first, name_program, names
+from ssh_abduction.solver.sources.exact import choosing, labels_first, names
 from ssh_abduction.solver.sources.exact import names as named
-from ssh_abduction.solver.sources.symbolic import state_merging as robust
-from ssh_abduction.solver.sources.symbolic.merging import dstates_merged, merged
-from ssh_abduction.solver.sources.symbolic.state_merging import machine_labels
+from ssh_abduction.solver.sources.symbolic.merging import merged
 from ssh_abduction.solver.steps.apart import Continuations, clique
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
@@ -74,17 +72,13 @@ def test_any_speedups_give_the_maps_of_the_plain_encoding(
     expected = solve(trace, Theory.causal(), max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, 5, 32]), label="first prefixes")
     at_once = data.draw(st.sampled_from([4, 8000]), label="at once")
-    whole = data.draw(st.sampled_from([4, 8000]), label="whole")
     patience = data.draw(st.sampled_from([0, 1, 2000]), label="patience")
     held = data.draw(st.sampled_from([1, 100]), label="held back")
-    cores = data.draw(st.sampled_from([0, 1, 10_000]), label="cores")
     spares = data.draw(st.sampled_from([0, 1, 2]), label="spare names")
     with (
         patch.multiple(labels_first, FIRST_PREFIXES=first, AT_ONCE=at_once),
-        patch.multiple(named, AT_ONCE=at_once, WHOLE=whole, HELD_BACK=held, SPARES=spares),
-        patch.multiple(names, PATIENCE=patience, CORES=cores),
-        patch.object(name_program, "MORE_LINKS", 2),
-        patch.object(name_program, "AT_ONCE", at_once),
+        patch.multiple(named, AT_ONCE=at_once, HELD_BACK=held, SPARES=spares),
+        patch.multiple(names, PATIENCE=patience, MORE_LINKS=2),
         patch.object(choosing, "FEW_STEPS", 0),
     ):
         found = solve(trace, Theory.causal(), max_maps=None, speedups=Speedups.without(off))
@@ -132,7 +126,7 @@ def hurried() -> Iterator[None]:
     with (
         patch.object(choosing, "FEW_STEPS", 0),
         stepwise(-1.0),
-        patch.multiple(names, PATIENCE=0, CORES=0),
+        patch.object(names, "PATIENCE", 0),
     ):
         yield
 
@@ -149,8 +143,7 @@ def reads_of(case: str) -> list[str]:
 def test_each_speedup_is_used_in_some_case() -> None:
     """If no case used a speed-up, the tests below would not test it."""
     read = {name for case in CASES for name in reads_of(case)}
-    # tests/test_onto.py tests `digest`, and tests/test_nearby.py tests `guessed`.
-    assert read == set(NAMES) - {"digest", "guessed"}
+    assert read == set(NAMES) - {"digest"}  # tests/test_onto.py tests `digest`
 
 
 @pytest.mark.slow
@@ -253,7 +246,6 @@ def test_unknown_speedups_are_an_error() -> None:
 @settings(max_examples=8)
 @given(traces(max_steps=12))
 def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
-    """Merging also makes a map if it begins with one dstate for each step."""
     theory = settle(
         trace, Theory.causal().replace(joint=1, weigh="count")
     ).theory  # merging knows only pairs
@@ -261,30 +253,19 @@ def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     chart = Chart.of_steps(log, len(trace))
     fewest = solve(trace, theory).cost
     assert fewest
-    known = merged(chart, chart.continuations.clique())
-    for labels in known, dstates_merged(chart, range(len(trace))), dstates_merged(chart, known):
-        found = facts.causal_map(labels, trace)
-        assert check(trace, found, theory) == ()
-        assert fewest.dstates <= len(found.dstates) <= len(trace)
-        if labels is not known:
-            assert dstates_merged(chart, labels) == labels
-
-
-def test_dstates_merged_joins_equal_dstates() -> None:
-    """A machine of two states. Only odd and even visits differ."""
-    log = Log(trace := Trace.from_steps("ababababa", ["go"] * 8), Theory.causal())
-    chart = Chart.of_steps(log, len(trace))
-    assert dstates_merged(chart, [0, 1, 2, 3, 0, 1, 2, 3, 0]) == [0, 1, 0, 1, 0, 1, 0, 1, 0]
+    found = facts.causal_map(merged(chart, chart.continuations.clique()), trace)
+    assert check(trace, found, theory) == ()
+    assert fewest.dstates <= len(found.dstates) <= len(trace)
 
 
 def test_interrupted_search_returns_a_map_of_merged_steps() -> None:
-    """If clingo is slow and no map is guessed, the map is smaller than a greedy one."""
+    """If clingo is slow, the map is smaller than a greedy one."""
     walk = maze(5, 5, steps=1600, seed=0)
     with (
-        patch.multiple(names, PATIENCE=1, CORES=1),
-        patch.object(name_program.NameProgram, "more_links", side_effect=[[], KeyboardInterrupt]),
+        patch.object(names, "PATIENCE", 1),
+        patch.object(names.NameProgram, "more_links", side_effect=[[], KeyboardInterrupt]),
     ):
-        speedups = Speedups.without("prefixes,guessed")
+        speedups = Speedups.without("prefixes")
         solution = solve(walk.trace, Theory.causal(), speedups=speedups)
     assert solution.status is Status.FEASIBLE
     assert solution.cost
@@ -293,29 +274,6 @@ def test_interrupted_search_returns_a_map_of_merged_steps() -> None:
         < 2 * len(set(walk.truth))
         < len(set(Log(walk.trace, Theory.causal()).merged()))
     )
-    assert check(walk.trace, solution.maps[0], Theory.causal()) == ()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0])
-def test_interrupted_search_returns_the_small_map_of_a_guess(seed: int) -> None:
-    """A machine without turns."""
-    walk = moore(12, 2, steps=800, seed=seed)
-    more_links = name_program.NameProgram.more_links
-
-    def stop(program: name_program.NameProgram) -> list[tuple[int, int, int]]:
-        if program.has_all_links:
-            raise KeyboardInterrupt
-        return more_links(program)
-
-    with (
-        patch.multiple(names, PATIENCE=1, CORES=1),
-        patch.object(name_program.NameProgram, "more_links", stop),
-    ):
-        solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,clique"))
-    assert solution.status is Status.FEASIBLE
-    assert solution.cost
-    assert solution.cost.dstates <= 1.2 * len(set(walk.truth))
     assert check(walk.trace, solution.maps[0], Theory.causal()) == ()
 
 
@@ -338,13 +296,6 @@ def test_maps_found_before_a_limit_are_returned(off: str) -> None:
         assert check(walk.trace, ssh_map, Theory.causal()) == ()
 
 
-def test_guess_at_a_machine_that_needs_too_much_memory_is_skipped() -> None:
-    seen, actions = [0, 1] * 50, [0] * 99
-    assert len(next(machine_labels(seen, actions))) == 100
-    with patch.object(robust, "ENTRIES", 100):
-        assert list(machine_labels(seen, actions)) == []
-
-
 def test_program_of_names_is_not_loaded_if_time_is_short() -> None:
     """Clingo does not get the rules for names if the limit would end before it can be stopped.
 
@@ -352,8 +303,8 @@ def test_program_of_names_is_not_loaded_if_time_is_short() -> None:
     """
     walk = moore(8, 2, steps=100, seed=0)
     with (
-        patch.object(name_program, "SECONDS_A_CHARACTER", 1.0),
-        patch.object(name_program, "new_control", side_effect=AssertionError),
+        patch.object(names, "SECONDS_A_CHARACTER", 1.0),
+        patch.object(names, "new_control", side_effect=AssertionError),
     ):
         solution = solve(
             walk.trace, Theory.causal(), time_limit=30, speedups=Speedups.without("prefixes")
@@ -362,3 +313,29 @@ def test_program_of_names_is_not_loaded_if_time_is_short() -> None:
     assert solution.certificate
     assert solution.bound.dstates == len(solution.certificate.clique) > 2
     assert check(walk.trace, solution.maps[0], Theory.causal()) == ()
+
+
+@pytest.mark.slow
+def test_clingo_gets_links_of_a_long_trace_in_parts() -> None:
+    """The simplest links come first, and the search may end before clingo has all."""
+    walk = maze(3, 3, steps=500, seed=1, loops=0.3)
+    given: list[int] = []
+    add = names.NameProgram.add
+
+    def counted(self: names.NameProgram, links: list[tuple[int, int, int]]) -> None:
+        add(self, links)
+        given.append(len(self._links))
+
+    expected = solve(walk.trace, Theory.causal())
+    with (
+        patch.object(names, "AT_ONCE", 500),
+        patch.object(names, "PATIENCE", 10),
+        patch.object(names, "MORE_LINKS", 50),
+        patch.object(names.NameProgram, "add", counted),
+    ):
+        found = solve(walk.trace, Theory.causal())
+    assert found.status is expected.status is Status.OPTIMAL
+    assert found.cost == expected.cost
+    assert check(walk.trace, found.maps[0], Theory.causal()) == ()
+    assert given[0] < 100 <= max(given)
+    assert all(after - before <= 500 for before, after in pairwise(given))

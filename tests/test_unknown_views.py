@@ -176,7 +176,6 @@ def test_speedups_that_read_views_are_off() -> None:
         "sides",
         "lazy",
         "core_guided",
-        "guessed",
         "greedy",
         "digest",
     }

@@ -22,7 +22,7 @@ from ssh_abduction.solver import Search, Start, Status
 from ssh_abduction.solver.asp.facts import most_paths
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.board import Judging
-from ssh_abduction.solver.sources.exact import choosing, name_program, names
+from ssh_abduction.solver.sources.exact import choosing, names
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.fitting import Fitting
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
@@ -65,17 +65,14 @@ def test_frameless_maps_equal_those_of_the_plain_encoding(data: st.DataObject) -
     trace = data.draw(traces(max_steps=6), label="trace").without_stars().without_displacements()
     said = {kind: data.draw(step_pairs(len(trace)), label=kind) for kind in ("same", "same_place")}
     theory = data.draw(bare_theories(), label="theory").replace(**said)
-    contrary = data.draw(st.sampled_from([0, 1, name_program.CONTRARY]), label="contrary")
+    contrary = data.draw(st.sampled_from([0, 1, names.CONTRARY]), label="contrary")
     spares = data.draw(st.sampled_from([0, 2]), label="spare names")
     patience = data.draw(st.sampled_from([0, names.PATIENCE]), label="patience")
-    cores = data.draw(st.sampled_from([0, names.CORES]), label="cores")
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     if not expected.cost:
         return  # the engine is asked only where some map is known
     with (
-        patch.object(names, "SPARES", spares),
-        patch.multiple(names, PATIENCE=patience, CORES=cores),
-        patch.object(name_program, "CONTRARY", contrary),
+        patch.multiple(names, SPARES=spares, PATIENCE=patience, CONTRARY=contrary),
     ):
         known = data.draw(st.sampled_from([None, expected.maps[0].labels]), label="known")
         engine = LabelsFirst(Task.of(Problem.of(trace, theory)), known or ())
@@ -292,13 +289,13 @@ def test_known_map_with_refused_places_is_not_returned(
     named, plain = LabelsFirst(task, (0, 1, 2, 3, 4, 5, 0, 1, 2)), StepEngine(task, 9)
     named.grow(len(trace))
     assert [*named.improving_maps()][-1].cost[0] == 6
-    searched, calls = names.NameSearch._cheapest, [0]
+    searched, calls = names.NamedLabels._cheapest, [0]
 
-    def late(self: names.NameSearch, conflicts: int) -> tuple[dict[int, int] | None, bool]:
+    def late(self: names.NamedLabels, conflicts: int) -> tuple[dict[int, int] | None, bool]:
         calls[0] += 1
         return (None, False) if calls[0] == 1 else searched(self, conflicts)
 
-    monkeypatch.setattr(names.NameSearch, "_cheapest", late)
+    monkeypatch.setattr(names.NamedLabels, "_cheapest", late)
     plain.grow(len(trace))
     for engine in (named, plain):
         engine.forbid([Equality(3, 8, "place")])

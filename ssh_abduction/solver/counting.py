@@ -15,9 +15,13 @@ from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.parts import Parts, Priced
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.sources.exact import prefixes
-from ssh_abduction.solver.sources.exact.choosing import READABLE, may_name, takes_all
-from ssh_abduction.solver.sources.exact.engine import LabellingEngine
-from ssh_abduction.solver.sources.exact.near import NearMinimal, counted_first
+from ssh_abduction.solver.sources.exact.choosing import (
+    READABLE,
+    NearMinimal,
+    counted_first,
+    may_name,
+    takes_all,
+)
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.solver.values import Found, Status
 from ssh_abduction.theory.speedups import row
@@ -62,7 +66,7 @@ class Counting:
         # 2. An earlier search may have proved a map minimal.
         if parts.known.status is Status.OPTIMAL:
             if not engine.size:
-                lists = isinstance(engine, LabellingEngine) and engine.lists_labels
+                lists = task.theory.level == "topological" and not isinstance(engine, StepEngine)
                 engine.grow(steps if lists else min(steps, prefixes.FIRST_PREFIX))
             return
         # 3. Go on by prefixes for a short time, then with the dstates of some map.

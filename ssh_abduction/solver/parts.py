@@ -21,9 +21,8 @@ from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.sources.exact import prefixes
 from ssh_abduction.solver.sources.exact.backbone import Rivals
-from ssh_abduction.solver.sources.exact.choosing import may_name, new_engine
+from ssh_abduction.solver.sources.exact.choosing import NearMinimal, may_name, new_engine
 from ssh_abduction.solver.sources.exact.engine import Engine, GrowingEngine, Task
-from ssh_abduction.solver.sources.exact.near import NearMinimal
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.solver.steps.certificate import Basis

@@ -42,7 +42,6 @@ class Speedups:
     lazy: bool = True
     core_guided: bool = True
     sides: bool = True
-    guessed: bool = True
     framing: bool = True
     ways: bool = True
     greedy: bool = True
@@ -354,11 +353,6 @@ TABLE = (
         "core_guided",
         "core_guided",
         "Raise the lower bound by unsat cores, instead of improving a map step by step.",
-    ),
-    Speedup(
-        "guessed",
-        "guessed",
-        "If clingo takes long, search for a map near a guess. The checker judges this map.",
     ),
     Speedup(
         "greedy",

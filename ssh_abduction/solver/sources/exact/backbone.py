@@ -16,15 +16,13 @@ classes replay like a map. Suppose that they replay to the end. Then in every mi
 step is one dstate with a class of the prefix. So no doubt about later steps is left. Otherwise the
 prefix grows.
 
-*Labels.* An engine that finds dstates before places and paths can list the labels (the dstate of
-each step) of all minimal maps. Even thousands of maps have few different labellings. So all
-labellings are listed, and there are no doubts about dstates. Doubts about places and paths are
-resolved for each labelling.
+*Labels.* An engine that finds dstates before places and paths lists all minimal maps. Then there
+are no doubts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
@@ -32,12 +30,12 @@ from itertools import combinations
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
-from ssh_abduction.solver.board import Judging
+from ssh_abduction.solver.board import Judging, Known
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
-from ssh_abduction.solver.sources.exact.engine import Doubt, Engine, LabellingEngine, Settled, Task
-from ssh_abduction.solver.sources.exact.readable import StepEngine, paths_needed
+from ssh_abduction.solver.sources.exact.engine import Engine, Task
+from ssh_abduction.solver.sources.exact.prefixes import Prefixes
+from ssh_abduction.solver.sources.exact.readable import Doubt, StepEngine, paths_needed
 from ssh_abduction.solver.steps.log import Outcome, Replay
-from ssh_abduction.theory.evidence import Equality
 
 _log = log_of(__name__)
 
@@ -110,9 +108,13 @@ def prove_backbone(
     """
     if SHOWN_ONCE & task.theory.given_up:
         return False
-    reasoning = _Reasoning(task, judging, cost, sharing)
-    if engine is None or not reasoning.settle_labels(engine):
-        reasoning.settle_steps()
+    if engine is None or isinstance(engine, StepEngine) or task.theory.level == "causal":
+        _Reasoning(task, judging, cost, sharing).settle_steps()
+        return True
+    known = Known(task.theory)
+    known.cost = cost
+    for ssh_map in Prefixes(task, known, judging, engine, 0, lambda: None).minimal_maps():
+        sharing.absorb(ssh_map)
     return True
 
 
@@ -123,50 +125,6 @@ class _Reasoning:
         self, task: Task, judging: Judging, cost: tuple[int, ...], sharing: Sharing
     ) -> None:
         self._task, self._judging, self._cost, self._sharing = task, judging, cost, sharing
-
-    def settle_labels(self, engine: Engine) -> bool:
-        """Resolve the doubts of each labelling (dstates of steps). Return whether none is left."""
-        forbidden = set[frozenset[Equality]]()
-        while isinstance(engine, LabellingEngine) and engine.lists_labels:
-            failed, refused = 0, None
-            for settled in engine.labellings(self._cost):
-                found = settled.any_map()
-                while found is not None:
-                    replayed = self._replay(found)
-                    if replayed.outcome is not Outcome.PREDICTED:
-                        failed = len(replayed.labels)
-                        break
-                    if refused := self._judging.why_refused(
-                        replace(found, dstate_at=replayed.labels)
-                    ):
-                        break
-                    self._sharing.absorb(replace(found, dstate_at=replayed.labels))
-                    found = self._differing_map(settled, replayed.labels)
-                if failed or refused:
-                    break
-            # Evidence refuses the map: forbid it. Or it fails at a later step: give further steps.
-            if refused:
-                of_prefix = all(
-                    max(equality.first, equality.second) < engine.size for equality in refused
-                )
-                if refused in forbidden or not of_prefix or not engine.forbid(refused):
-                    return False
-                forbidden.add(refused)
-            elif failed:
-                engine.grow(engine.next_size(failed))
-            else:
-                return True
-        return False
-
-    def _differing_map(self, settled: Settled, labels: Sequence[int]) -> SSHMap | None:
-        """Find a map with these labels in which a doubt about places or paths holds, or None."""
-        return settled.map_with(
-            [
-                (sort, labels[i], labels[j], one)
-                for sort, i, j, one in self._doubts_of_classes(len(labels))
-                if sort != "dstates"
-            ]
-        )
 
     def settle_steps(self) -> None:
         """Resolve all doubts with the readable encodings (`encodings/*.lp`)."""

@@ -1,27 +1,14 @@
-"""The protocol of all engines, and the values that go in (`Task`) and come out (`Found`).
-
-A *doubt* is something on which all known maps agree, but perhaps not all maps. Two steps may share
-a dstate, place, path or course (a path in one direction) in all known maps, but not in some unknown
-map, or the other way round. Clingo is asked for an answer in which at least one doubt of a set
-holds.
-"""
+"""The protocol of all engines, and the values that go in (`Task`) and come out (`Found`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator
-from contextlib import closing
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-import clingo
-
-from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.control import Asker, Control, mapped
+from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.solution.sharing import Sort
-from ssh_abduction.solver.sources.exact.path_reader import PathReader
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.evidence import Equality
@@ -128,115 +115,6 @@ class GrowingEngine(Protocol):
         ...
 
 
-@runtime_checkable
-class LabellingEngine(Protocol):
-    """The protocol of an engine that finds dstates first. It lists maps with the fewest dstates.
-
-    Attributes:
-        lists_labels: Whether `labellings` lists maps in its theory.
-    """
-
-    lists_labels: bool
-
-    def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
-        """Yield the maps of this cost, grouped by their labelling.
-
-        A labelling is the dstate of each step of the prefix. Each item stands for the best maps
-        with one labelling.
-        """
-        ...
-
-
 def in_fixed_order(equalities: Iterable[Equality]) -> list[Equality]:
     """Sort equalities, as the order of a set depends on the hashes of texts."""
     return sorted(equalities, key=lambda one: (one.first, one.second, one.of, one.holds))
-
-
-def maps_of_labels(
-    asker: Asker, reader: PathReader, theory: Theory, mode: str, conflicts: int = -1
-) -> Generator[Found, None, bool]:
-    """Yield maps with given dstates, and return whether clingo ended before the limit of conflicts.
-
-    The reader reads the places and paths that fit the dstates. The theory says what a map costs.
-    `mode` is clingo's opt-mode; "ignore" for a single map. -1 conflicts mean no limit.
-    """
-    answers = asker.answers(
-        reader.read,
-        mode,
-        int(mode == "ignore"),
-        control=reader.control,
-        conflicts=conflicts,
-        ahead=True,
-    )
-    return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), theory), answers))
-
-
-Answer = TypeVar("Answer")
-# A sort of thing (such as "places"), two steps or dstates, and a claim: they share a thing of this
-# sort (True), or they do not (False).
-Doubt: TypeAlias = tuple[Sort, int, int, bool]
-
-
-class Doubts:
-    """Asks one control of clingo whether a map contradicts what all known maps share."""
-
-    def __init__(
-        self, asker: Asker, control: Control, condition: Callable[[Sort, int, int], str | None]
-    ) -> None:
-        """Begin without any doubt.
-
-        `condition` takes a sort (such as dstate or place) and two steps or dstates. It returns the
-        body of a rule that is true if both are at one thing of this sort; None if they never are.
-        """
-        self._asker, self._control, self._condition = asker, control, condition
-        # The number of each pair of things that clingo has, and the number of questions so far.
-        self._number_of: dict[tuple[Sort, int, int], int] = {}
-        self._questions = 0
-
-    def answer(
-        self, doubts: Collection[Doubt], read: Callable[[clingo.Model], Answer], mode: str
-    ) -> Answer | None:
-        """Return what `read` makes of an answer that confirms a doubt; None if none does."""
-        if not doubts:
-            return None
-        rules: list[str] = []
-        for sort, i, j, _ in doubts:
-            if (sort, i, j) not in self._number_of:
-                number = self._number_of[sort, i, j] = len(self._number_of)
-                rules.append(facts.one_in_doubt(number, self._condition(sort, i, j)))
-        numbers = [(self._number_of[sort, i, j], one) for sort, i, j, one in doubts]
-        rules.append(facts.some_doubt(self._questions, numbers))
-        asked = facts.asked(self._questions)
-        self._questions += 1
-        with self._asker.grounding_timed():
-            self._control.tell("\n".join(rules))
-        self._control.assign_external(asked, True)
-        try:
-            with closing(self._asker.answers(read, mode, 1, control=self._control)) as answers:
-                return next(answers, None)
-        finally:
-            self._control.release_external(asked)
-
-
-class Settled:
-    """Answers questions about the best maps with given dstates, after the dstates are found."""
-
-    def __init__(self, asker: Asker, reader: PathReader, mode: str) -> None:
-        """Prepare the questions for a reader of places and paths. `mode` is clingo's opt-mode."""
-        self._asker, self._reader, self._mode = asker, reader, mode
-        self._doubts = Doubts(asker, reader.control, reader.condition)
-        self._any: SSHMap | None = None
-
-    def any_map(self) -> SSHMap | None:
-        """Return some map, always the same one; None if there is none."""
-        if self._any is None:
-            reader = self._reader
-            answers = self._asker.answers(reader.read, self._mode, 1, control=reader.control)
-            with closing(answers):
-                self._any = next(map(reader.map_of, answers), None)
-        return self._any
-
-    def map_with(self, doubts: Collection[Doubt]) -> SSHMap | None:
-        """Find a map in which at least one of these doubts about dstates holds; else None."""
-        answer = self._doubts.answer(doubts, self._reader.read, self._mode)
-        return None if answer is None else self._reader.map_of(answer)

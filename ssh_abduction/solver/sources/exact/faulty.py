@@ -1,60 +1,78 @@
 """The engine for the causal theory with faults: it finds all maps of least cost.
 
 A view may be misread, and an action may slip. The cost of a map is the cost of its dstates and
-faults. Clingo gets only some steps of the trace, the *given* steps (`faulty_program.py`). Fewer
-steps are fewer constraints. So the least cost for the given steps is a lower bound for the whole
-trace. A minimal map of the given steps is then followed through all other steps. If it predicts all
-their views, it is a minimal map of the whole trace. If not, clingo gets more steps.
+faults. Clingo assigns a name, which stands for a dstate, to each step that it gets (faulty.lp). Of
+a long trace it gets only some steps, the *given* steps. Fewer steps are fewer constraints. So the
+least cost for the given steps is a lower bound for the whole trace. If a map of the whole trace
+costs as much, it is minimal. If not, clingo gets more steps.
 
-A Viterbi pass chooses the further steps (Viterbi 1967). It explains the whole trace by the links
-that clingo found, with the cheapest faults. Clingo gets the steps at fault and those around them.
-The explanation is also a map of the whole trace, so it may be the new incumbent.
+*Names.* Each view has some names and a *rest*. The rest is one name for all other dstates of the
+view. A rest costs one dstate, and no axiom constrains the steps that have this name. So a minimal
+answer without rests would also be minimal if there were more names. If an answer uses a rest, its
+view gets more names. At first a misread step is *lost*: it has no dstate, so no link leads to or
+from it. If a minimal answer loses a step, the step becomes *full*: it may be at any dstate.
 
-The first maps of a long trace are guessed (`sources/symbolic/state_merging.py`), and clingo is only
-asked for cheaper ones. The lower bound of a long trace comes from its blocks (`blocks.py`). For a
-short trace clingo is asked first, and maps are guessed if it does not end soon.
+*Maps.* A Viterbi pass (Viterbi 1967) explains the whole trace by the links of an answer, with the
+cheapest faults. The explanation is a map of the whole trace, so it may be the new incumbent. Clingo
+gets the steps at fault and those around them. The first maps of a long trace are guessed
+(`sources/symbolic/state_merging.py`), and clingo is only asked for cheaper ones. For a short trace
+clingo is asked first, and maps are guessed if it does not end soon.
+
+*Blocks.* The lower bound of a long trace comes from disjoint blocks of its steps. Take a map of the
+whole trace with N dstates. Restricted to a block of steps, it is a map of that block with at most N
+dstates. So its faults in the block cost at least as much as the cheapest faults of any map of the
+block with at most N dstates. Blocks that share no step add up:
+
+    cost  >=  least over N of  (10 N + sum over blocks of the least faults with N dstates)
+
+The blocks may differ for each N. A block needs a fault if it would otherwise contain a clique of
+more than N steps. A clique is a set of steps that are pairwise different dstates
+(`steps/apart.py`).
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import chain
+from dataclasses import dataclass
+from itertools import chain, groupby, pairwise
+from operator import itemgetter
+
+import clingo
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.control import Asker
-from ssh_abduction.solver.asp.limits import StageTimeError
-from ssh_abduction.solver.sources.exact.blocks import Blocks
+from ssh_abduction.solver.asp.control import Asker, new_control
+from ssh_abduction.solver.asp.facts import number_symbols, read_atom
+from ssh_abduction.solver.asp.limits import StageTimeError, Watch
 from ssh_abduction.solver.sources.exact.engine import Task, in_fixed_order
-from ssh_abduction.solver.sources.exact.faulty_program import (
-    LONG,
-    FaultyAnswer,
-    FaultyControl,
-    faulty_names,
-)
 from ssh_abduction.solver.sources.symbolic.state_merging import (
     Explained,
     Explainer,
     PartialMachine,
     robust_maps,
 )
+from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.evidence import Equality
 
-FEW = 80  # make no guess for a trace of at most this many steps, as clingo is fast
-GUESSED = 1000  # guess maps of a trace with at least this many steps before clingo is asked
+# From this many steps on, maps are guessed, and blocks give a bound, before clingo is asked. Clingo
+# gets at most so many steps at once.
+LONG = 1000
 # Guess maps of a shorter trace if clingo has not ended after this many seconds, or after this share
 # of the time left.
 ASKED_FIRST = 3.0
 ASKED_FIRST_SHARE = 0.2
-AT_FIRST = 1000  # clingo gets this many first steps at the beginning
-PLACES = 12  # after a Viterbi pass, clingo gets the steps around at most this many faults
-SPARE = 3  # names of each view beyond those of the best guess; with 1, answers use the rests
 # Begin no start of EM after this many seconds, or after this share of the time left.
 GUESSING = 5.0
 GUESSING_SHARE = 0.1
+PLACES = 12  # after a Viterbi pass, clingo gets the steps around at most this many faults
+AROUND = 8  # clingo gets this many steps before and after a step that a map does not predict
+NAMES = 3  # names of each view at first
+MORE_NAMES = 2  # names added to a view whose rest is used
+SPARE = 3  # names of each view beyond those of the best guess; with 1, answers use the rests
 
 
 class FaultyEngine:
@@ -86,7 +104,7 @@ class FaultyEngine:
         """Take the whole trace as the prefix. Clingo gets only its first steps for now."""
         if size != self.size:
             self.size = size
-            self._control.given = set(range(min(size, AT_FIRST)))
+            self._control.given = set(range(min(size, LONG)))
             for t, others in self._task.log.pairs.one.items():
                 self._control.given |= {t, *others}
                 self._control.full |= {t, *others}  # these equalities hold even for misread steps
@@ -101,14 +119,10 @@ class FaultyEngine:
                 if best <= (self.bound or 0):
                     return
 
-    def _guesses(self) -> bool:
-        """Whether to guess maps. Clingo solves the shortest traces at once."""
-        return self.size > FEW and not self._task.log.pairs.one and bool(self._price)
-
     def _asked_first(self) -> Iterator[Found]:
         """Yield maps of a short trace that clingo finds soon, before maps are guessed."""
         watch = self._task.watch
-        if self.size >= GUESSED or not self._guesses():
+        if self.size >= LONG:
             return
         ends = watch.elapsed() + min(ASKED_FIRST, ASKED_FIRST_SHARE * watch.left())
         with suppress(StageTimeError), watch.stage(ends):
@@ -123,7 +137,8 @@ class FaultyEngine:
         There are none if the best map is proven minimal. Clingo gets the steps around the faults
         of the best guess, and as many names as this guess has dstates.
         """
-        if not self._guesses() or (self._best is not None and self._best <= (self.bound or 0)):
+        is_proven = self._best is not None and self._best <= (self.bound or 0)
+        if is_proven or self._task.log.pairs.one or not self._price:
             return
         watch = self._task.watch
         began, may_take = watch.elapsed(), min(GUESSING, GUESSING_SHARE * watch.left())
@@ -138,42 +153,37 @@ class FaultyEngine:
             if watch.elapsed() - began > may_take:
                 return
 
-    def _bound_by_blocks(self) -> None:
-        """Raise the lower bound of a long trace by its short parts (`blocks.py`)."""
-        if self.size >= LONG and self._known is not None and self._most_faults is None:
-            faults = {
-                kind: [fault.step for fault in self._known.faults if fault.kind == kind]
-                for kind in self._price
-            }
-            blocks = Blocks(
-                self._seen,
-                self._actions,
-                self._price,
-                faults,
-                len(self._known.dstates),
-                self._task.watch,
-            )
-            self._raise_bound([blocks.bound()])
-
     def _asked(self) -> Iterator[Found]:
         """Yield maps made from clingo's answers. At the end, the cheapest map known is minimal."""
-        self._bound_by_blocks()
+        if self.size >= LONG and self._known is not None and self._most_faults is None:
+            known = self._known
+            places = sorted(fault.step for fault in known.faults if fault.kind in self._price)
+            cost = self._best or 0
+            blocks = Blocks(
+                self._seen, self._actions, self._price, places, len(known.dstates), self.asker.watch
+            )
+            self._raise_bound([blocks.bound(cost)])
         while self._best is None or self._best > (self.bound or 0):
-            answer = None
+            # 1. Explain the whole trace by each answer for the given steps.
+            answer, doubted = None, list[int]()
             for answer in self._control.answers(f"opt,{self._best - 1}" if self._best else "opt"):
                 explained, doubted = self._explained(answer)
                 if explained is not None:
                     yield explained
             if answer is None:
-                self.bound = max(self.bound or 0, self._best or 0)
+                self._raise_bound([self._best or 0], free=True)
                 return
-            self.bound = max(self.bound or 0, answer.cost)
-            labels, failed = (None, -1) if answer.is_open else self._followed(answer)
-            if labels is not None:
-                yield self._found(labels, answer.slips, self._machine(answer)[1].shows)
+            self._raise_bound([answer.cost], free=True)
+            # 2. An answer for all steps is a minimal map. Otherwise clingo gets more steps.
+            has_all = self._control.has_all
+            if has_all and not answer.is_open:
+                yield self._found_in(answer)
                 return
             self._control.learn_from(answer)
-            self._control.give_around([failed, *doubted] if failed >= 0 else doubted)
+            if doubted:
+                self._control.give_around(doubted)
+            elif not answer.is_open:
+                self._control.give_all()
 
     def _cost_of(self, found: Found) -> int:
         """Return the cost of a map as clingo counts it, in tenths of dstates."""
@@ -184,19 +194,17 @@ class FaultyEngine:
         if self._known is not None and self._best == cost[0]:
             given.add(self._known)
             yield Found.of(self._known, self._task.theory)
+        self._control.give_all()
         while True:
             found: list[Found] = []
             for answer in self._control.answers_of_cost(cost[0], enough):
-                labels, failed = (None, -1) if answer.is_open else self._followed(answer)
-                if labels is None:
+                if answer.is_open:
+                    self._control.learn_from(answer)
                     break
-                found.append(self._found(labels, answer.slips, self._machine(answer)[1].shows))
+                found.append(self._found_in(answer))
             else:
                 yield from (one for one in found if one.map not in given)
                 return
-            self._control.learn_from(answer)
-            if failed >= 0:
-                self._control.give_around([failed])
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._control.forbidden.append(in_fixed_order(equalities))
@@ -205,9 +213,12 @@ class FaultyEngine:
         )
         return True
 
-    def _raise_bound(self, bound: Sequence[int]) -> None:
-        """Take over a bound that clingo proved. A bound for the given steps holds for all steps."""
-        if bound and self._most_faults is None:
+    def _raise_bound(self, bound: Sequence[int], *, free: bool = False) -> None:
+        """Take over a bound that clingo proved. A bound for the given steps holds for all steps.
+
+        If some faults cost nothing, bounds count only at the end of a question (`free`).
+        """
+        if bound and (free or self._most_faults is None):
             self.bound = max(self.bound or 0, bound[0])
 
     def _machine(self, answer: FaultyAnswer) -> tuple[dict[int, int], PartialMachine]:
@@ -226,36 +237,6 @@ class FaultyEngine:
         }
         return number, PartialMachine([view_of[name] for name in number], goes)
 
-    def _followed(self, answer: FaultyAnswer) -> tuple[list[int] | None, int]:
-        """Follow the links of an answer through the steps that clingo was not given.
-
-        Returns two values: the dstates of all steps, and -1 for "no step". If the links do not
-        explain a step, or evidence contradicts its dstate, they are None and the step to give to
-        clingo next.
-        """
-        number, machine = self._machine(answer)
-        labels: list[int] = []
-        for t in range(self.size):
-            here = answer.where.get(t)
-            # At least one end of this action was not given, so clingo has not checked its link.
-            if t and (t - 1 not in answer.where or here is None):
-                there = machine.goes.get((labels[-1], self._actions[t - 1]))
-                known = there is not None and (
-                    machine.shows[there] == self._seen[t] if here is None else there == number[here]
-                )
-                if not known and t - 1 not in answer.slips:
-                    return None, t if here is None else t - 1
-                if here is None:
-                    if there is None:
-                        return None, t
-                    labels.append(there)
-                    continue
-            labels.append(number[here] if here is not None else 0)
-        if wrong := self._task.log.pairs.broken_by(labels):
-            new = [step for pair in wrong for step in pair if step not in self._control.given]
-            return None, new[0]
-        return labels, -1
-
     def _explained(self, answer: FaultyAnswer) -> tuple[Found | None, list[int]]:
         """Explain the whole trace by the dstates and links of an answer, with the cheapest faults.
 
@@ -266,11 +247,7 @@ class FaultyEngine:
         if not machine.shows:  # all given steps are lost
             return None, []
         explained = self._explainer.explained(machine)
-        doubted = [
-            t
-            for t in sorted({*explained.unknown, *explained.faults})
-            if t not in self._control.given
-        ]
+        doubted = sorted({*explained.unknown, *explained.faults} - self._control.given)
         return self._map_of(self._explainer.completed(machine)), doubted[:PLACES]
 
     def _map_of(self, explained: Explained) -> Found | None:
@@ -280,41 +257,310 @@ class FaultyEngine:
         map contradicts evidence about pairs of steps or has a forbidden set of equalities.
         """
         labels, shows = explained.labels, explained.machine.shows
-        if (explained.misread and "misread" not in self._price) or (
-            explained.slips and "slipped" not in self._price
-        ):
-            return None
-        if set(labels) - {
-            s for t, s in enumerate(labels) if shows[s] == self._seen[t]
-        }:  # the view of some dstate is misread each time
-            return None
-        if any(
-            all(labels[one.first] == labels[one.second] for one in together)
-            for together in self._control.forbidden
-        ):
-            return None
-        if self._task.log.pairs.broken_by(labels) or (
-            self._most_faults is not None and len(explained.faults) > self._most_faults
+        kinds = {"misread": explained.misread, "slipped": explained.slips}
+        shown = {s for t, s in enumerate(labels) if shows[s] == self._seen[t]}
+        if (
+            any(steps and kind not in self._price for kind, steps in kinds.items())
+            or (self._most_faults is not None and len(explained.faults) > self._most_faults)
+            or set(labels) - shown
+            or any(
+                all(labels[one.first] == labels[one.second] for one in together)
+                for together in self._control.forbidden
+            )
+            or self._task.log.pairs.broken_by(labels)
         ):
             return None
         return self._found(labels, explained.slips, shows)
 
+    def _found_in(self, answer: FaultyAnswer) -> Found:
+        """Make a map from an answer for all steps."""
+        number, machine = self._machine(answer)
+        labels = [number[answer.where[t]] for t in range(self.size)]
+        return self._found(labels, answer.slips, machine.shows)
+
     def _found(self, labels: Sequence[int], slips: Collection[int], shows: Sequence[int]) -> Found:
         """Make a map of the whole trace, with its cost. `shows` has the view of each dstate."""
-        shown = self._views_of_dstates(labels, shows)
+        shown = list(shows)
+        # If all steps at a dstate are misread, its view is their usual one.
+        for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:
+            at = Counter(self._seen[t] for t, label in enumerate(labels) if label == s)
+            shown[s] = at.most_common(1)[0][0]
         misread = [t for t in range(self.size) if shown[labels[t]] != self._seen[t]]
         faults = [*((t, "misread") for t in misread), *((t, "slipped") for t in slips)]
         trace, theory = self._task.trace, self._task.theory
         return Found.of(facts.causal_map(labels, trace, faults, theory), theory)
 
-    def _views_of_dstates(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
-        """Return the view of each dstate. If all steps there are misread, it is their usual view.
 
-        `shown` has the view of each dstate in clingo's answer.
+@dataclass(frozen=True)
+class FaultyAnswer:
+    """An answer of clingo for the given steps.
+
+    Attributes:
+        cost: The cost of dstates and faults, in tenths of dstates.
+        where: The name of the dstate of each given step that is not lost.
+        slips: The given steps whose action slipped.
+        lost: The given steps that are misread and at no dstate.
+        rests: The views, as integers, whose rest (dstates without a name) is used.
+    """
+
+    cost: int
+    where: Mapping[int, int]
+    slips: frozenset[int]
+    lost: frozenset[int]
+    rests: frozenset[int]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the answer is not a map yet: some dstate has no name, or some step no dstate."""
+        return bool(self.rests or self.lost)
+
+
+class FaultyControl:
+    """Asks clingo for answers for the given steps.
+
+    Changes of the attributes take effect with the next question.
+
+    Attributes:
+        names: The number of names of each view, not counting its rest.
+        given: The steps that clingo gets.
+        full: The steps that may be at any dstate, even if their view is misread.
+        forbidden: Sets of equalities of steps. In no answer do all equalities of one set hold.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        asker: Asker,
+        price: Mapping[str, Sequence[int]],
+        most_faults: int | None,
+        on_bound: Callable[[Sequence[int]], None],
+    ) -> None:
+        """Begin without any given step.
+
+        `price` has, for each kind of fault, its cost at each step in tenths of dstates. If
+        `most_faults` is given, a map may have up to this many faults, and they cost nothing.
+        `on_bound` is called with each bound that clingo proves.
         """
-        views = list(shown)
-        for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:
-            views[s] = Counter(
-                self._seen[t] for t, label in enumerate(labels) if label == s
-            ).most_common(1)[0][0]
-        return views
+        self.names = dict.fromkeys(range(max(task.log.seen) + 1), NAMES)
+        self.given: set[int] = set()
+        self.full: set[int] = set()
+        self.forbidden: list[Collection[Equality]] = []
+        self._asker, self._log = asker, task.log
+        self._most_faults, self._on_bound = most_faults, on_bound
+        free = most_faults is not None
+        self._price = {kind: [0] * len(some) if free else some for kind, some in price.items()}
+        self.forget()
+
+    @property
+    def has_all(self) -> bool:
+        """Whether clingo gets all steps."""
+        return len(self.given) == len(self._log.seen)
+
+    def give_around(self, steps: Collection[int]) -> None:
+        """Add these steps, and `AROUND` steps before and after each, to the given ones."""
+        size = len(self._log.seen)
+        for step in steps:
+            self.given |= set(range(max(step - AROUND, 0), min(step + AROUND + 1, size)))
+
+    def give_all(self) -> None:
+        """Give clingo all steps."""
+        self.given = set(range(len(self._log.seen)))
+
+    def learn_from(self, answer: FaultyAnswer) -> None:
+        """Add names for views whose rest an answer uses. Its misread steps may have any name."""
+        if answer.rests:
+            names = set(answer.where.values())
+            used = Counter(view for name, view in faulty_names(self.names) if name in names)
+            # A view whose names are all used gets one more, as it may soon need it.
+            for view in self.names:
+                self.names[view] += (
+                    MORE_NAMES if view in answer.rests else used[view] == self.names[view]
+                )
+        self.full |= answer.lost
+
+    def forget(self) -> None:
+        """Use a new control for the next question. Clingo was stopped, and may lack rules."""
+        # What the present control was given: names and full steps, steps in their order, batches,
+        # and the number of forbidden sets.
+        self._began: tuple[dict[int, int], set[int]] = {}, set()
+        self._steps: list[int] = []
+        self._batches = self._ruled_out = 0
+
+    def _prepare(self) -> None:
+        """Bring the control up to date. Make a new one if names or full steps have changed."""
+        with self._asker.grounding_timed():
+            if self._began != (self.names, self.full):
+                self.forget()
+                self._began = dict(self.names), set(self.full)
+                check = self._asker.watch.check
+                self._asker.control = new_control(
+                    "faulty", self._base(), ("--opt-strategy=usc,stratify",), check
+                )
+            control, new = self._asker.control, sorted(self.given.difference(self._steps))
+            for start in range(0, len(new), LONG):
+                self._asker.watch.check()
+                self._give(new[start : start + LONG])
+            for equalities in self.forbidden[self._ruled_out :]:
+                one = (f"is({e.first},S{k}), is({e.second},S{k})" for k, e in enumerate(equalities))
+                control.tell(f":- {', '.join(one)}.")
+            self._ruled_out = len(self.forbidden)
+
+    def _base(self) -> str:
+        """Return the facts for the names of each view, the actions and the kinds of faults."""
+        found = [f"action({action})." for action in sorted(set(self._log.actions))]
+        found += [f"allowed({kind})." for kind in self._price]
+        for view, some in groupby(faulty_names(self.names), key=itemgetter(1)):
+            of_view = [name for name, _ in some]
+            found += [f"view({name},{view})." for name in of_view]
+            found += [f"after({before},{name})." for before, name in pairwise(of_view)]
+            found.append(f"rest({of_view[-1]}).")
+        return "\n".join(found)
+
+    def _give(self, new: list[int]) -> None:
+        """Ground the rules for new steps, as one batch."""
+        control, batch, log = self._asker.control, self._batches, self._log
+        given, added = {*self._steps, *new}, set(new)
+        found = [f"node({batch},{t},{log.seen[t]})." for t in new]
+        found += [f"full({t})." for t in new if t in self.full]
+        found += [f"next({batch},{t},{u})." for t, u in pairwise([*self._steps[-1:], *new])]
+        links = sorted(t for t in {t - d for t in new for d in (0, 1)} if given >= {t, t + 1})
+        found += [f"link({batch},{t},{log.actions[t]},{t + 1})." for t in links]
+        for kind, tenths in self._price.items():
+            steps = new if kind == "misread" else links
+            found += [f"price({kind},{t},{tenths[t]})." for t in steps]
+        for name, pairs in (("excluded", log.pairs.apart), ("one", log.pairs.one)):
+            found += [
+                f"{name}({batch},{i},{t})."
+                for t in given
+                for i in pairs.get(t, ())
+                if i in given and (i in added or t in added)
+            ]
+        control.add(f"batch_{batch}", [], "\n".join(found))
+        control.ground([(f"batch_{batch}", []), ("more", number_symbols(batch))])
+        if self._most_faults is not None:
+            faults = "T,misread : misreads(T); T,slipped : slips(T)"
+            control.tell(f":- #count {{ {faults} }} > {self._most_faults}.")
+        self._steps += new
+        self._batches += 1
+
+    def answers(self, mode: str) -> Iterator[FaultyAnswer]:
+        """Yield answers, each cheaper than the one before. The last one is minimal."""
+        self._prepare()
+        yield from self._asker.answers(self._read, mode, 0, on_bound=self._on_bound)
+
+    def answers_of_cost(self, cost: int, enough: int) -> Iterator[FaultyAnswer]:
+        """Yield answers of the least cost, in tenths of dstates; at most `enough`, or all if 0."""
+        self._prepare()
+        seen: set[tuple[frozenset[tuple[int, int]], frozenset[int]]] = set()
+        # The bound of a long trace comes from blocks. Clingo may not be able to prove it.
+        mode = f"optN,{cost}" if len(self._log.seen) < LONG else f"enum,{cost}"
+        for answer in self._asker.answers(self._read, mode, 0):
+            key = frozenset(answer.where.items()), answer.slips
+            if answer.cost == cost and key not in seen:
+                seen.add(key)
+                yield answer
+                if len(seen) == enough:
+                    return
+
+    def _read(self, model: clingo.Model) -> FaultyAnswer:
+        """Read an answer of clingo."""
+        where: dict[int, int] = {}
+        steps: dict[str, set[int]] = {"slips": set(), "lost": set()}
+        for name, args in map(read_atom, model.symbols(shown=True)):
+            if name == "is":
+                where[args[0]] = args[1]
+            else:
+                steps[name].add(args[0])
+        rest_of = {view: name for name, view in faulty_names(self.names)}  # the last name
+        used = set(where.values())
+        rests = frozenset(view for view, rest in rest_of.items() if rest in used)
+        slips, lost = (frozenset(steps[name]) for name in ("slips", "lost"))
+        return FaultyAnswer(model.cost[0] if model.cost else 0, where, slips, lost, rests)
+
+
+def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
+    """Yield all names, each with its view. The last name of each view is its rest: it stands for
+    all further dstates with that view.
+
+    `names` has, for each view, the number of its names without the rest.
+    """
+    first = 0
+    for view, count in names.items():
+        yield from ((name, view) for name in range(first, first + count + 1))
+        first += count + 1
+
+
+@dataclass
+class Blocks:
+    """Lower bounds on the cost of a trace, found with the help of a known map.
+
+    Attributes:
+        seen: The observation at each step, as an integer.
+        actions: The action after each step but the last, as an integer.
+        price: For each kind of fault that is allowed, its cost at each step in tenths of dstates.
+        faults: The steps at which the known map has a fault, in order.
+        dstates: The number of dstates of the known map.
+    """
+
+    seen: Sequence[int]
+    actions: Sequence[int]
+    price: Mapping[str, Sequence[int]]
+    faults: Sequence[int]
+    dstates: int
+    watch: Watch
+
+    def bound(self, cost: int) -> int:
+        """Return a lower bound on the cost of all maps, in tenths; at most `cost`."""
+        bound = cost
+        most = -(-bound // 10) - 1  # the dstates of a larger map alone cost this bound
+        while most > 0:
+            least = self.least_faults(most)
+            bound = min(bound, 10 * most + least)
+            # With fewer dstates faults cost at least as much. So skip all numbers of dstates that,
+            # with the cost of these faults, already reach the bound.
+            most = min(most, -(-(bound - least) // 10)) - 1
+        return bound
+
+    def least_faults(self, most: int) -> int:
+        """Return a lower bound, in tenths, on the faults of maps with at most `most` dstates.
+
+        The trace is divided into blocks from its first step on. Each block ends as soon as it needs
+        a fault. The least costs of the faults of all blocks are added up.
+        """
+        total = begin = reach = 0  # a block ended `reach` steps after its first fault
+        while True:
+            first = begin
+            if most >= self.dstates:  # then a block in which the known map has no fault needs none
+                number = bisect_left(self.faults, begin)
+                if number == len(self.faults):
+                    return total
+                first = self.faults[number]
+            end = self._shortest(begin, first, reach, most)
+            if end is None:
+                return total
+            total += min(
+                min(price[begin : end - (kind == "slipped")]) for kind, price in self.price.items()
+            )
+            begin, reach = end, end - first
+
+    def _shortest(self, begin: int, fault: int, reach: int, most: int) -> int | None:
+        """Return the end of the shortest block from `begin` on that includes `fault` and needs one.
+
+        The end is the step after the block. The search starts at the expected end, `reach` steps
+        after `fault`. Returns None if even the block to the end of the trace needs no fault.
+        """
+
+        def takes_fault(end: int) -> bool:
+            """Whether more than `most` of the steps of a block differ pairwise."""
+            self.watch.check()
+            seen, actions = self.seen[begin:end], self.actions[begin : end - 1]
+            return end - begin > most and len(Continuations(seen, actions).clique()) > most
+
+        steps = len(self.seen)
+        low, stride = max(fault, begin + most), 1
+        high = min(max(fault + reach, low + 1), steps)
+        while not takes_fault(high):
+            if high == steps:
+                return None
+            low, high, stride = high, min(high + stride, steps), 2 * stride
+        return low + 1 + bisect_left(range(low + 1, high), True, key=takes_fault)

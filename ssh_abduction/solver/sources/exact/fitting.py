@@ -5,6 +5,10 @@ places and paths that fit the labels. If none fit, then mostly some single path 
 axioms. Otherwise there is a *clash*: a minimal set of links and evidence that no places and paths
 fit.
 
+Travels and turns around join dstates to *segments*, which are parts of paths. Several segments may
+be one path. In the same way turns connect dstates to small places, and several of these may be one
+place of the map.
+
 *Pairwise distinct segments and places.* To find the fewest paths, pairwise distinct segments get
 paths of their own. Then other segments are assigned to these paths, or to new ones. The same is
 done with places. As an example, take a corridor of forty landmarks, driven there and back. The
@@ -17,23 +21,28 @@ from __future__ import annotations
 
 from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import TypeAlias
 
 import numpy as np
-from clingo import Function
+from clingo import Function, Model
 from numpy.typing import NDArray
 
 from ssh_abduction.data.drives import stretches_of
-from ssh_abduction.data.groups import gathered, minimal_part
+from ssh_abduction.data.groups import first_index_of, gathered, minimal_part, numbered
+from ssh_abduction.data.maps import DState, MapPath, SSHMap
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.control import Asker, Control
-from ssh_abduction.solver.sources.exact.engine import Settled, Task, maps_of_labels
-from ssh_abduction.solver.sources.exact.path_reader import PathReader
+from ssh_abduction.solver.asp.control import Asker, Control, mapped
+from ssh_abduction.solver.asp.facts import number_symbols, places_in_order, read_atom
+from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.steps.apart import pairwise_distinct
 from ssh_abduction.solver.steps.chart import Chart, FramedChart, Link
+from ssh_abduction.solver.steps.faults import links_of, view_at
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.theory import Theory
 
 # After this many conflicts, stop improving paths one by one; raise the bound from below instead.
 BETTERING = 20_000
@@ -55,6 +64,8 @@ SEGMENTS = ("base", "again", "segments")
 PLACES = ("least", "paths")
 EACH = (*PLACES, "each")
 
+# A path and two of its places, the earlier one first.
+_Ahead: TypeAlias = tuple[int, int, int]
 # The labels of all nodes, the options of clasp, and the parts of the program.
 _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]
 
@@ -119,17 +130,19 @@ class Fitting:
         options: tuple[str, ...] = (),
         parts: tuple[str, ...] = EACH,
     ) -> Generator[Found, None, bool]:
-        """Yield maps with these dstates, as `maps_of_labels` does.
+        """Yield maps with these dstates. Return whether clingo ended before the limit of conflicts.
 
+        `mode` is clingo's opt-mode; "ignore" for a single map. -1 conflicts mean no limit.
         `options` are those of clasp. With the `parts` PLACES, there is one map for each choice of
         places.
         """
         reader = self._reader(labels, options, parts)
-        return (yield from maps_of_labels(self._asker, reader, self.task.theory, mode, conflicts))
-
-    def settled(self, labels: Sequence[int], mode: str) -> Settled:
-        """Prepare questions about the best maps with these dstates. `mode` is clingo's opt-mode."""
-        return Settled(self._asker, self._reader(labels, (), EACH), mode)
+        most, control = int(mode == "ignore"), reader.control
+        answers = self._asker.answers(
+            reader.read, mode, most, control=control, conflicts=conflicts, ahead=True
+        )
+        theory = self.task.theory
+        return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), theory), answers))
 
     def _reader(
         self, labels: Sequence[int], options: tuple[str, ...], parts: tuple[str, ...]
@@ -312,7 +325,7 @@ def _distinct(control: Control) -> list[str]:
     atoms = control.symbolic_atoms
 
     def found(name: str, arity: int) -> list[tuple[int, ...]]:
-        return [facts.read_atom(atom.symbol)[1] for atom in atoms.by_signature(name, arity)]
+        return [read_atom(atom.symbol)[1] for atom in atoms.by_signature(name, arity)]
 
     segments, places = (sorted(x for (x,) in found(name, 1)) for name in ("segment", "visited"))
     different = set(found("distinct", 3))
@@ -392,3 +405,152 @@ def _may_follow(pairs: list[tuple[int, int]], columns: list[int]) -> NDArray[np.
     follows = ~np.eye(len(columns), dtype=bool)
     follows[np.ix_(here, here)] &= after[np.ix_(rows, rows)].T == 0
     return follows
+
+
+@dataclass(frozen=True, slots=True)
+class PathAnswer:
+    """The places and paths in an answer of paths.lp.
+
+    Attributes:
+        at: For each group of dstates connected by turns: its place in the map, and the rotation
+            from the frame of this place to the frame of the group, in quarters clockwise.
+        part: For each segment, its path, and its direction on the path (1 or -1).
+        order: For each path, its places in order.
+    """
+
+    at: dict[int, tuple[int, int]]
+    part: dict[int, tuple[int, int]]
+    order: dict[int, list[int]]
+
+
+class PathReader:
+    """Reads maps from answers of paths.lp, for fixed labels.
+
+    It asks clingo whether single atoms are in an answer, beginning with the atoms of the last
+    answer. That takes a third of the time of reading all atoms. Values that follow from the labels
+    are computed once.
+
+    Attributes:
+        control: The control whose answers are the places and paths.
+    """
+
+    def __init__(
+        self, control: Control, trace: Trace, theory: Theory, chart: Chart, labels: Sequence[int]
+    ) -> None:
+        self.control = control
+        stands, runs = (
+            {a: (b, c) for a, b, c in _literals(control, name)} for name in ("stands", "runs")
+        )
+        where = [labels[node] for node in chart.node_of]
+        first = first_index_of(where)  # for each label, the first step at its dstate
+        self._labels = tuple(numbered(where))
+        self._links = links_of(self._labels, trace)
+        self._dstates = [(view_at(trace, t), *stands[label]) for label, t in first.items()]
+        # For each segment, the dstates on it, and whether they face its direction (1) or not (-1).
+        on_paths = [(i, *runs[label]) for i, label in enumerate(first) if label in runs]
+        self._runs = gathered((segment, (i, direction)) for i, segment, direction in on_paths)
+        self._passes = {
+            (segment, self._dstates[i][1]): None
+            for segment, members in self._runs.items()
+            for i, _ in members
+        }
+        self._at, self._part = _Options(control, "at"), _Options(control, "course")
+        self._total, self._framed = theory.path_order == "total", theory.star == "frame"
+        # The literals of atoms of `before`; 0 if an atom is never true.
+        self._before: dict[_Ahead, int] = {}
+        # For each path, its places in order in the answer that was read last.
+        self._order: dict[int, list[int]] = {}
+
+    def read(self, model: Model) -> PathAnswer:
+        """Read everything that `map_of` needs from an answer. Then clingo may change the answer."""
+        at, part = self._at.made_in(model), self._part.made_in(model)
+        on: dict[int, dict[int, None]] = {}  # for each path, the places on it
+        for segment, component in self._passes:
+            on.setdefault(part[segment][0], {})[at[component][0]] = None
+        return PathAnswer(
+            at, part, {path: self._ordered(model, path, places) for path, places in on.items()}
+        )
+
+    def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
+        """Sort the places of a path. Their order in the last answer saves questions to clingo."""
+        order = list(
+            dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places])
+        )
+        if self._total:
+            # Insertion sort compares few pairs if the places are nearly in order.
+            for i, place in enumerate(order):
+                to = i
+                while to and not self._is_before(model, (path, order[to - 1], place)):
+                    to -= 1
+                order.insert(to, order.pop(i))
+        else:
+            order = places_in_order(
+                places,
+                (pair for pair in permutations(places, 2) if self._is_before(model, (path, *pair))),
+            )
+        self._order[path] = order
+        return order
+
+    def _is_before(self, model: Model, ahead: _Ahead) -> bool:
+        """Return whether an answer has the first of two places of a path before the second."""
+        literal = self._before.get(ahead)
+        if literal is None:
+            atom = model.context.symbolic_atoms[Function("before", number_symbols(*ahead))]
+            literal = self._before[ahead] = atom.literal if atom else 0
+        return literal != 0 and model.is_true(literal)
+
+    def map_of(self, answer: PathAnswer) -> SSHMap:
+        """Make the map that an answer describes."""
+        # For each path, its number in the map, and the direction that its first dstate faces.
+        faced: dict[int, tuple[int, int]] = {}
+        course: dict[int, tuple[int, int]] = {}
+        for segment, members in self._runs.items():
+            h, ahead = answer.part[segment]
+            path, first = faced.setdefault(h, (len(faced), ahead * members[0][1]))
+            course |= {i: (path, ahead * first * direction) for i, direction in members}
+        # For each place, its number in the map, and the slot that its first dstate faces.
+        arrived: dict[int, tuple[int, int]] = {}
+        dstates: list[DState] = []
+        for i, (view, component, slot) in enumerate(self._dstates):
+            p, turned = answer.at[component]
+            place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
+            path_of, direction = course.get(i, (None, None))
+            heading = (slot + turned - facing) % 4 if self._framed else None
+            dstates.append(DState(i, view, place, path_of, direction, heading))
+        paths = tuple(
+            MapPath(path, tuple(arrived[p][0] for p in answer.order[h][::first]))
+            for h, (path, first) in faced.items()
+        )
+        return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(arrived))), paths)
+
+
+class _Options:
+    """Reads the atoms of a predicate that chooses, for each first argument, the other two.
+
+    In each answer there is exactly one atom for each first argument.
+    """
+
+    def __init__(self, control: Control, name: str) -> None:
+        # For each first argument, the literals of its atoms, and their other arguments.
+        literals = _literals(control, name).items()
+        self._among = gathered((a, (literal, (b, c))) for (a, b, c), literal in literals)
+
+    def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
+        """Return a dict from the first argument to the other two that an answer chooses for it."""
+        made = {}
+        # Ask first about the atoms that the last answer had.
+        for a, among in self._among.items():
+            if len(among) > 1 and not model.is_true(among[0][0]):
+                taken = next(i for i, (literal, _) in enumerate(among) if model.is_true(literal))
+                among.insert(0, among.pop(taken))
+            made[a] = among[0][1]
+        return made
+
+
+def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
+    """Return a dict from the three arguments of each atom of a predicate to its literal."""
+    found = {}
+    for atom in control.symbolic_atoms.by_signature(name, 3):
+        a, b, c = read_atom(atom.symbol)[1]
+        found[a, b, c] = atom.literal
+    return found

@@ -10,11 +10,11 @@ exploring. But these axioms are about dstates: the place of a dstate, and the pa
 So labels are found first: the dstate of each step.
 
 *Without frames*, dstates get names (`names.py`). *With frames*, it is enough to know which visits
-are at one place, and how their frames are turned (`visits.py`). Both search with the causal axioms.
-If no places and paths fit the labels (`fitting.py`), clingo gets the axioms of order and sides for
-some paths that the labels contradict (sides_frameless.lp, sides_framed.lp). Mostly a dozen paths
-are enough. If no single path is contradicted, clingo gets a rule against each *clash*, a minimal
-set of links that no places and paths fit.
+are at one place, and how their frames are turned (`visit_labels.py`). Both search with the causal
+axioms. If no places and paths fit the labels (`fitting.py`), clingo gets the axioms of order and
+sides for some paths that the labels contradict (sides_frameless.lp, sides_framed.lp). Mostly a
+dozen paths are enough. If no single path is contradicted, clingo gets a rule against each *clash*,
+a minimal set of links that no places and paths fit.
 
 *Claim.* Each map of the topological theory is an answer of the search for labels, with the number
 of dstates as its cost.
@@ -44,7 +44,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Settled, Task, in_fixed_order
+from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Task, in_fixed_order
 from ssh_abduction.solver.sources.exact.fitting import PLACES, Fitting
 from ssh_abduction.solver.sources.exact.names import NamedLabels
 from ssh_abduction.solver.sources.exact.visit_labels import VisitLabels
@@ -68,12 +68,11 @@ class LabelsFirst:
         """Begin with an empty prefix. `known` has each step's dstate in a small map, or nothing."""
         self.asker = Asker(task.watch)
         self.grows = task.theory.star == "frame"
-        self.lists_labels = task.theory.level == "topological"
         self._task = task
         self._labels = (
             VisitLabels(task, self.asker) if self.grows else NamedLabels(task, self.asker, known)
         )
-        self._fitting = Fitting(task, self.asker) if self.lists_labels else None
+        self._fitting = Fitting(task, self.asker) if task.theory.level == "topological" else None
         self._contradicted = 0  # the size of a prefix whose visits fit no frames
         # The minimal cost, and all labels of maps with this cost.
         self._best: tuple[tuple[int, ...], list[list[int]]] | None = None
@@ -97,12 +96,8 @@ class LabelsFirst:
     def next_size(self, failed: int) -> int:
         steps = len(self._task.trace)
         if self.size < FIRST_PREFIXES:
-            size = min(steps, max(failed + 1, FIRST_PREFIXES))
-        elif steps <= AT_ONCE:
-            size = steps
-        else:
-            size = min(steps, max(failed + 1, 2 * self.size, AT_ONCE))
-        return self._labels.large_enough(size)
+            return min(steps, max(failed + 1, FIRST_PREFIXES))
+        return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * self.size, AT_ONCE))
 
     def grow(self, size: int) -> None:
         if size == self.size:
@@ -177,13 +172,6 @@ class LabelsFirst:
             for found in fitting.maps(labels, mode)
             if found.map not in first
         )
-
-    def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
-        """Yield the maps of this cost, grouped by their labels."""
-        if self._contradicted or self._fitting is None:
-            return
-        for labels in self._labels_of(cost):
-            yield self._fitting.settled(labels, _listing(cost))
 
     def _labels_of(self, cost: tuple[int, ...]) -> Iterable[list[int]]:
         """Return the known labels of maps of this cost; if none are known, search for all."""

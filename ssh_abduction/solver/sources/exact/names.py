@@ -3,13 +3,13 @@
 A label is the number of the dstate of a step. This module finds labels of the first steps with the
 fewest dstates, proves that none have fewer, and lists all labels with that number of dstates.
 
-The search works with names. Clingo assigns a name, which is a dstate, to each step. Pairwise
-distinct steps, a clique (`steps/apart.py`), are *pinned*: each gets a name of its own. Their number
-is a lower bound on the dstates. Pinning leaves only one way to name these dstates. Any other step
-may have the name of a pinned step that it can share a dstate with, or a *spare* name of its view. A
-spare name costs one dstate. Each view also has a *rest*, one name that all its other dstates share.
-If there are several largest cliques, pin the one with which the other steps have the fewest names
-to choose from.
+The search works with names. Clingo assigns a name, which is a dstate, to each step (names.lp).
+Pairwise distinct steps, a clique (`steps/apart.py`), are *pinned*: each gets a name of its own.
+Their number is a lower bound on the dstates. Pinning leaves only one way to name these dstates. Any
+other step may have the name of a pinned step that it can share a dstate with, or a *spare* name of
+its view. A spare name costs one dstate. Each view also has a *rest*, one name that all its other
+dstates share. If there are several largest cliques, pin the one with which the other steps have the
+fewest names to choose from.
 
 *Claim.* An answer of minimal cost that uses no rest is a minimal map.
 *Proof.* Name the dstates of any map. The pinned steps have their names. The other dstates get spare
@@ -19,16 +19,15 @@ names than the map has dstates beyond the clique. So the minimal cost of answers
 the cost of maps. An answer without a rest is a map of the trace with its cost. ∎
 If a minimal answer uses a rest, its view gets one more spare name, and clingo is asked again.
 
-Not every step is needed. Clingo starts with the links of the pinned steps. Each answer is followed
-along the trace, and the links that it does not explain are added, until it explains all links
-(`name_program.py`). If clingo does not answer soon, it gets all links, or some at a time if the
-trace is long. A very long trace is charted only up to a step at which the clique is as large as the
-clique of all steps.
+Not every step is needed. Clingo starts with the links of the pinned steps. Fewer links are a
+relaxation, so a proven bound also holds for the whole trace. Each answer is followed along the
+trace, and the links that it does not explain are added, until it explains all links. If clingo does
+not answer soon, it gets all links, or some at a time if the trace is long.
 
 Clasp raises the lower bound by one for each core. A core is a set of spare names, and at least one
 of them is needed. Cores are small at first, as views share no names. If that takes long in the
-causal theory, small maps are also looked for in other ways: first steps are merged, later dstates
-are guessed. The search ends as soon as some map has as few dstates as the bound.
+causal theory, steps are also merged by evidence. The search ends as soon as some map has as few
+dstates as the bound.
 
 While a map is made from one answer, clingo searches for the next.
 """
@@ -37,23 +36,25 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
-from itertools import islice
+from functools import lru_cache
+from itertools import pairwise
+from typing import TypeAlias
+
+import clingo
+import numpy as np
+from clingo import Function, Model, Symbol
 
 from ssh_abduction.data.groups import numbered
-from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.runtime.clock import now
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.control import Asker, new_control
+from ssh_abduction.solver.asp.facts import number_symbols
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Task
 from ssh_abduction.solver.sources.exact.fitting import Member
-from ssh_abduction.solver.sources.exact.name_program import (
-    NameProgram,
-    Pinned,
-    forbidden_links,
-    read_names,
-)
-from ssh_abduction.solver.sources.symbolic.merging import dstates_merged, merged
-from ssh_abduction.solver.sources.symbolic.state_merging import machine_labels
-from ssh_abduction.solver.steps.apart import Continuations
+from ssh_abduction.solver.sources.symbolic.merging import merged
 from ssh_abduction.solver.steps.chart import Chart, Link
+from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.pairs import pairs_in
 
@@ -63,45 +64,51 @@ from ssh_abduction.theory.pairs import pairs_in
 HELD_BACK = 100
 # A view has this many spare names at first: one to use, and one to show that no more are needed.
 SPARES = 2
-# Of a long trace whose clique grows, take at most this many steps at once. The clique of more steps
-# would take minutes.
-WHOLE = 100_000
-# Stop after this many guesses, even if none of them is a map. Guesses are slow, and later ones are
-# rarely better.
-GUESSES = 10
+# If clingo has not ended after this many conflicts, give it more links. If it lacks links that
+# matter, this mostly shows sooner.
+PATIENCE = 2000
+# Clingo cannot be stopped while it prepares to solve. That takes about this share of the time that
+# grounding took.
+PREPARING = 0.6
+# Give clingo this many links at once. It cannot be stopped while it grounds them.
+AT_A_TIME = 100
+# Clingo cannot be stopped while it reads and grounds the facts about names. That takes at most
+# about this many seconds for each character of the facts.
+SECONDS_A_CHARACTER = 1e-6
+# Give clingo this many more links of a long trace at a time. Of a shorter trace it gets all links
+# that are left.
+MORE_LINKS = 1000
+# Give clingo the axioms of this many paths at once. With fewer, clingo would be asked more often.
+# With more, most would not be needed.
+CONTRARY = 8
+
+# A linked list of the links that were followed since the last node that clingo named. The latest
+# link comes first.
+_Trail: TypeAlias = "tuple[Link, _Trail] | None"
+# A pinned node, as (-1, its number), or a spare name, as (its view, its number). These keys stay
+# the same when names are added.
+_Key: TypeAlias = tuple[int, int]
 
 
 class NamedLabels:
-    """Finds labels (dstates of steps) with the fewest dstates, for the first `size` steps."""
+    """Finds labels (dstates of steps) with the fewest dstates, for the first `size` steps.
 
-    def __init__(
-        self,
-        task: Task,
-        asker: Asker,
-        given_map: Sequence[int] = (),
-    ) -> None:
+    Attributes:
+        bound: A proven lower bound on the number of dstates; None if none is known.
+    """
+
+    def __init__(self, task: Task, asker: Asker, given_map: Sequence[int] = ()) -> None:
         """Begin without any steps.
 
         `given_map` has the dstate of each step in a map with few dstates; empty if none is known.
         """
         self.size = 0
+        self.bound: int | None = None
         self.task, self._asker, self._given_map = task, asker, given_map
-        self._incumbent = Incumbent()
+        self._known: list[int] | None = None  # the best known labels of all steps
         # Sets of pairs of steps. A map must not have the steps of each pair of a set at one dstate.
         self._forbidden: list[list[tuple[int, int]]] = []
-        self._pinned: Pinned | None = None
         self._program: NameProgram | None = None
-        self._search: NameSearch | None = None
-
-    @property
-    def bound(self) -> int | None:
-        """A proven lower bound on the number of dstates; None if none is known."""
-        return self._incumbent.bound
-
-    @property
-    def clique(self) -> Sequence[int]:
-        """The pinned steps, which are pairwise distinct; empty before `grow`."""
-        return self._pinned.clique if self._pinned else []
 
     @property
     def program(self) -> NameProgram:
@@ -114,83 +121,107 @@ class NamedLabels:
         """The first steps and the links between them."""
         return self.program.chart
 
-    def large_enough(self, size: int) -> int:
-        """Return how many steps of the trace to take: at least `size`.
-
-        In a long trace this is enough for a clique as large as the clique of the whole trace.
-        """
-        most = min(len(self.task.trace), WHOLE)
-        if AT_ONCE <= size < most and self.task.speedups.clique:
-            largest = self._clique_size(most)
-            while size < most and self._clique_size(size) < largest:
-                size = min(2 * size, most)
-        return size
-
-    def _clique_size(self, steps: int) -> int:
-        """Return the size of a largest clique of the first steps."""
-        log = self.task.log
-        return len(Continuations(log.seen[:steps], log.actions[: steps - 1]).clique())
-
     def grow(self, size: int) -> bool:
-        """Make the first `size` steps the prefix. Return True, as there are always labels."""
-        try:
-            self._take(size)
-        except BaseException:
-            self.size = 0  # an error may have left this prefix incomplete
-            raise
+        """Make the first `size` steps the prefix. Return True, as there are always labels.
+
+        Chart the steps, pin a clique of them, and make a new control.
+        """
+        self.size = 0  # an error may leave this prefix incomplete
+        self._known = numbered(self._given_map[:size]) or None
+        program = self._program = NameProgram(self.task, self._asker, size, self._forbidden)
+        self._raise_bound(len(program.clique))
+        program.begin(self._given_map)
+        self.size = size
         return True
 
-    def _take(self, size: int) -> None:
-        """Chart the first steps, pin a clique of them, and make a new control."""
-        self.size = size
-        speedups, known = self.task.speedups, self._incumbent
-        with self._asker.grounding_timed():
-            pinned = Pinned.of_steps(self.task.log, size, largest=speedups.clique)
-        self._pinned = pinned
-        known.labels = numbered(self._given_map[:size]) or None
-        known.raise_bound(len(pinned.clique))
-        self._asker.watch.check()
-        self._program = NameProgram(
-            self.task,
-            self._asker,
-            pinned,
-            self._first_spares(pinned),
-            self._forbidden,
-        )
-        self._search = NameSearch(self.task, self._asker, self._program, known)
-        links: Iterable[Link] = pinned.chart.links
-        if speedups.lazy:
-            # Only links that begin at the first step or at a pinned one, and those at steps that
-            # the user says are one dstate.
-            first = {0, *pinned.clique}
-            said = {t for pair in pairs_in(self.task.log.pairs.one) for t in pair}
-            links = [link for link in links if link[0] in first or not said.isdisjoint(link[::2])]
-        self._program.give_links(links)
+    def _raise_bound(self, bound: int) -> None:
+        """Take over a lower bound if it is higher."""
+        self.bound = max(self.bound or 0, bound)
 
-    def _first_spares(self, pinned: Pinned) -> dict[int, int]:
-        """Return the numbers of spare names: SPARES, or one more than the given map needs."""
-        seen = pinned.chart.seen
-        found = Counter(dict(zip(self._given_map, seen, strict=False)).values())
-        taken = Counter(seen[node] for node in pinned.clique)
-        return {
-            view: max(SPARES, found[view] - taken[view] + 1) if self._given_map else SPARES
-            for view in dict.fromkeys(seen)
-        }
+    def _is_settled(self) -> bool:
+        """Whether the known labels have as few dstates as the lower bound."""
+        return self._known is not None and len(set(self._known)) <= (self.bound or 0)
 
     def improving(self) -> Iterator[list[int]]:
         """Yield labels of the first steps, with ever fewer dstates. The last have the fewest."""
-        assert self._search is not None  # `grow` comes first
-        return self._search.improving()
+        if not self.chart.links:
+            yield [0]
+            return
+        try:
+            for labels in self._searched():
+                if self.program.is_allowed(labels):
+                    self._known = labels
+                    yield labels
+        except (LimitError, KeyboardInterrupt) as end:
+            if self._known:
+                yield self._known
+            if isinstance(end, KeyboardInterrupt) or not self._is_settled():
+                raise
+
+    def _searched(self) -> Iterator[list[int]]:
+        """Yield labels as `improving` does. End early if a known map has the fewest dstates.
+
+        An answer that is no map shows what clingo lacks: names, or links.
+        """
+        program, pinned = self.program, len(self.program.clique)
+        may_merge = (
+            self.task.theory.level == "causal"
+            and self.task.speedups.greedy
+            and len(self.chart.seen) <= AT_ONCE
+        )
+        while True:
+            # 1. Find the cheapest answer. If that takes long, merge steps, and give clingo more
+            # links. There is no answer if what the user says contradicts the trace.
+            names, proven = self._cheapest(-1 if program.has_all_links else PATIENCE)
+            if not proven and may_merge:
+                may_merge = False
+                yield merged(self.chart, program.clique)
+            if (names is None and proven) or (not proven and self._is_settled()):
+                if self._known:
+                    yield self._known
+                return
+            if names is None or not proven:
+                program.add(program.more_links())
+                continue
+            # 2. Give clingo more names if the answer uses a rest.
+            if views := program.rests(names):
+                program.name_more(views)
+                continue
+            # 3. Give clingo the links that the answer does not explain.
+            spares = sum(name >= pinned for name in set(names.values()))
+            self._raise_bound(pinned + spares)
+            labels, failed = program.follow(names)
+            if not failed:
+                yield labels
+                return
+            program.add(failed)
+
+    def _cheapest(self, conflicts: int) -> tuple[dict[int, int] | None, bool]:
+        """Find the best answer within a number of conflicts, and whether it is proven the best."""
+        pinned = len(self.program.clique)
+        answer = None
+        answers = self._asker.answers(
+            read_names,
+            "opt",
+            0,
+            conflicts=conflicts,
+            on_bound=lambda costs: self._raise_bound(pinned + costs[0]),
+            until=self._is_settled,
+        )
+        while True:
+            try:
+                answer = next(answers)
+            except StopIteration as end:
+                return answer, bool(end.value)
 
     def take_back(self, labels: Sequence[int]) -> bool:
         """Forget labels that turned out to have no map. Return whether they came from clingo.
 
         Evidence about places may refuse the places of a given map.
         """
-        known = self._incumbent
         given, self._given_map = numbered(self._given_map[: self.size]), ()
-        if known.labels == list(labels):
-            known.labels = None
+        if self._known == list(labels):
+            self._known = None
         return list(labels) != given
 
     def give_sides(
@@ -203,11 +234,12 @@ class NamedLabels:
         """Exclude all labels with the links of some clash, and with these labels of its steps."""
         for clash in clashes:
             placed = {step for member in clash if not member.link for step in member.steps}
-            links = [member.link for member in clash if member.link]
             self.program.add_links_at(placed)
-            self._asker.control.tell(
-                forbidden_links(links, [(step, labels[step]) for step in sorted(placed)])
-            )
+            body = [
+                *("goes({},{},{})".format(*member.link) for member in clash if member.link),
+                *(f"is({step},{labels[step]})" for step in sorted(placed)),
+            ]
+            self._asker.control.tell(f":- {', '.join(body)}.")
 
     def forbid_together(self, equalities: Collection[Equality]) -> None:
         """Exclude labels in which both steps of each of these equalities are at one dstate.
@@ -215,9 +247,8 @@ class NamedLabels:
         Steps at one dstate are also at one place.
         """
         self._forbidden.append([(one.first, one.second) for one in equalities])
-        known = self._incumbent
-        if known.labels and not self.program.is_allowed(known.labels):
-            known.labels = None
+        if self._known and not self.program.is_allowed(self._known):
+            self._known = None
         self.program.give_forbidden(len(self._forbidden) - 1)
 
     def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
@@ -226,9 +257,7 @@ class NamedLabels:
         Clingo is asked for at most `enough` labellings; 0 for all. It is not asked if `enough` is 1
         and a labelling is known.
         """
-        known = self._incumbent.labels
-        if known and len(set(known)) != dstates:
-            known = None
+        known = self._known if self._known and len(set(self._known)) == dstates else None
         if known:
             yield known
         if not known or enough != 1:
@@ -239,7 +268,7 @@ class NamedLabels:
 
     def _listed(self, dstates: int, enough: int) -> Iterator[list[int]]:
         """Yield labels with this many dstates, in the order in which clingo lists them."""
-        program, spares = self.program, dstates - len(self.clique)
+        program, spares = self.program, dstates - len(self.program.clique)
         if spares < 0:
             return
         if not program.chart.links:
@@ -278,13 +307,9 @@ class NamedLabels:
 
     def _needs_rest(self, spares: int) -> bool:
         """Look for an answer of this cost that uses a rest. If found, add names to its views."""
-        answers = self._asker.answers(
-            read_names,
-            f"enum,{spares},{spares}",
-            1,
-            assumptions=[self.program.resting(True)],
-        )
-        answer = next(answers, None)
+        assumptions = [self.program.resting(True)]
+        mode = f"enum,{spares},{spares}"
+        answer = next(self._asker.answers(read_names, mode, 1, assumptions=assumptions), None)
         views = self.program.rests(answer) if answer else set()
         if views:
             self.program.name_more(views)
@@ -296,189 +321,325 @@ class NamedLabels:
         return self._asker.answers(read_names, mode, 0, assumptions=[resting], ahead=True)
 
 
-# If clingo has not ended after this many conflicts, give it more links. If it lacks links that
-# matter, this mostly shows sooner.
-PATIENCE = 2000
-# After this many conflicts with all links, guess a map. Then clingo continues without a limit.
-CORES = 10_000
+class NameProgram:
+    """The control that assigns names of dstates to nodes, and a record of what it was given.
 
-
-class Incumbent:
-    """The best known labels of all steps, and a lower bound on the number of dstates.
-
-    Both are None while unknown.
+    Attributes:
+        chart: The first steps, as nodes, and their links.
+        clique: The pinned nodes, which are pairwise distinct. They have the names 0, 1, ….
     """
-
-    def __init__(self) -> None:
-        """Begin with no known labels (dstates of steps) and no bound."""
-        self.bound: int | None = None
-        self.labels: list[int] | None = None
-
-    def raise_bound(self, bound: int) -> None:
-        """Take over a bound if it is higher than the known one."""
-        self.bound = max(self.bound or 0, bound)
-
-    def is_settled(self) -> bool:
-        """Whether the known labels have as few dstates as the lower bound."""
-        return self.labels is not None and len(set(self.labels)) <= (self.bound or 0)
-
-
-class NameSearch:
-    """The search for labels of the nodes of one chart with the fewest dstates."""
 
     def __init__(
-        self,
-        task: Task,
-        asker: Asker,
-        program: NameProgram,
-        incumbent: Incumbent,
+        self, task: Task, asker: Asker, size: int, forbidden: list[list[tuple[int, int]]]
     ) -> None:
-        """Prepare a search that improves the incumbent."""
-        self._task, self._asker, self._program = task, asker, program
-        self._incumbent = incumbent
-        self._hard = False  # whether clingo once did not end after few conflicts
-        self._had_all_help = False  # whether maps near a guess were sought already
+        """Chart the first `size` steps, and pin a largest clique, or else only the first step.
 
-    def improving(self) -> Iterator[list[int]]:
-        """Yield labels of all steps, with ever fewer dstates. The last have the fewest."""
-        known = self._incumbent
-        if not self._program.chart.links:
-            yield [0]
-            return
-        try:
-            for labels in self._searched():
-                if self._program.is_allowed(labels):
-                    known.labels = labels
-                    yield labels
-        except (LimitError, KeyboardInterrupt) as end:
-            if known.labels:
-                yield known.labels
-            if isinstance(end, KeyboardInterrupt) or not known.is_settled():
-                raise
-
-    def _searched(self) -> Iterator[list[int]]:
-        """Yield labels as `improving` does. End early if a known map has the fewest dstates."""
-        labels = None
-        while labels is None and (names := (yield from self._cheapest_answer())) is not None:
-            labels = self._labels_by(names)
-        if best := labels or self._incumbent.labels:
-            yield best
-
-    def _cheapest_answer(self) -> Generator[list[int], None, dict[int, int] | None]:
-        """Find the cheapest answer for the links that clingo has; None if a known map is as good.
-
-        If the search takes long, labels that were found in other ways are yielded.
+        `forbidden` has sets of pairs of nodes. A map must not have the nodes of each pair of a set
+        at one dstate.
         """
-        while True:
-            names, proven = self._cheapest(self._patience)
-            if proven:
-                return names  # None if what the user says contradicts the trace
-            yield from self._helped()
-            if self._incumbent.is_settled():
-                return None
-            self._program.add(self._program.more_links())
-
-    def _cheapest(self, conflicts: int) -> tuple[dict[int, int] | None, bool]:
-        """Find the best answer within a number of conflicts, and whether it is proven the best."""
-        pinned = len(self._program.pinned.clique)
-        answer = None
-        answers = self._asker.answers(
-            read_names,
-            "opt",
-            0,
-            conflicts=conflicts,
-            on_bound=lambda costs: self._incumbent.raise_bound(pinned + costs[0]),
-            until=self._incumbent.is_settled,
-        )
-        while True:
-            try:
-                answer = next(answers)
-            except StopIteration as end:
-                return answer, bool(end.value)
-
-    def _labels_by(self, names: dict[int, int]) -> list[int] | None:
-        """Return labels from an answer. If they are no map, give clingo the missing links."""
-        program = self._program
-        if views := program.rests(names):
-            program.name_more(views)
-            return None
-        pinned = len(program.pinned.clique)
-        spares = sum(name >= pinned for name in set(names.values()))
-        self._incumbent.raise_bound(pinned + spares)
-        labels, failed = program.follow(names)
-        if failed:
-            program.add(failed)
-            return None
-        return labels
+        self._task, self._asker, self._forbidden = task, asker, forbidden
+        with asker.grounding_timed():
+            self.chart = Chart.of_steps(task.log, size)
+            continuations = self.chart.continuations
+            self.clique = continuations.clique() if task.speedups.clique else [0]
+            apart = np.stack([continuations.apart_from(step) for step in self.clique], axis=1)
+            # For each node, the clique nodes with which it may share a dstate.
+            self._may_be = [(~row).nonzero()[0].tolist() for row in apart]
+        asker.watch.check()
+        self._one = pairs_in(task.log.pairs.one)
+        self._spares: dict[int, int] = {}  # the number of spare names of each view, without rest
+        # Dstates for whose paths clingo has the axioms of order and sides.
+        self._sides: dict[_Key, None] = {}
+        # What the present control was given: links and nodes; for each view the last node that may
+        # have several names; and whether clingo has a node and has to choose its name.
+        self._links: dict[Link, None] = {}
+        self._nodes: set[int] = set()
+        self._last: dict[int, int] = {}
+        self._is_open = np.zeros(size, dtype=bool)
+        self._batches = 0
 
     @property
-    def _patience(self) -> int:
-        """The number of conflicts after which to interrupt clingo; -1 for never."""
-        if not self._program.has_all_links:
-            return PATIENCE
-        return -1 if self._had_all_help or not self._may_help else CORES
+    def has_all_links(self) -> bool:
+        """Whether clingo has all links between the nodes of the chart."""
+        return len(self._links) == len(self.chart.links)
 
-    @property
-    def _may_help(self) -> bool:
-        """Whether to look for small maps in other ways. These obey the causal axioms only."""
-        speedups = self._task.speedups
-        return self._task.theory.level == "causal" and (speedups.greedy or speedups.guessed)
+    def begin(self, given_map: Sequence[int]) -> None:
+        """Make a control with the first links.
 
-    def _helped(self) -> Iterator[list[int]]:
-        """Look for small maps in other ways, as clingo takes long. Yield the dstates of steps."""
-        pinned, greedy = self._program.pinned, self._task.speedups.greedy
-        if self._may_help and greedy and not self._hard and not pinned.is_long:
-            yield merged(pinned.chart, pinned.clique)
-        self._hard = True
-        # It takes long until clingo has all links of a long trace, so guess before.
-        is_time = self._program.has_all_links or pinned.is_long
-        if is_time and self._may_help and not self._had_all_help:
-            self._had_all_help = True
-            yield from self._near_a_guess()
-
-    def _near_a_guess(self) -> Iterator[list[int]]:
-        """Guess dstates. Yield the labels of a map near each guess, with ever fewer dstates.
-
-        The first guess that is itself a map is the last one. There is no guess if that takes too
-        much memory, of a long trace, and where a robot travels and turns: there merging does as
-        well in less time.
+        A view has SPARES spare names, or one more than the map needs that is given.
         """
-        steps, known = self._program.chart, self._incumbent.labels
-        drives = all(action.kind for action in self._task.trace.actions)
-        if not self._task.speedups.guessed or drives or self._program.pinned.is_long:
-            return
-        actions = [action for _, action, _ in steps.links]
-        for guessed in islice(machine_labels(steps.seen, actions), GUESSES):
-            guess = mended(guessed, steps)
-            labels = dstates_merged(steps, merged(steps, guess=guess))
-            if known is None or len(set(labels)) < len(set(known)):
-                known = labels
-                yield labels
-            if self._incumbent.is_settled() or steps.is_map(guess):
-                return
+        seen = self.chart.seen
+        found = Counter(dict(zip(given_map, seen, strict=False)).values())
+        taken = Counter(seen[node] for node in self.clique)
+        self._spares = {
+            view: max(SPARES, found[view] - taken[view] + 1) if given_map else SPARES
+            for view in dict.fromkeys(seen)
+        }
+        links: Iterable[Link] = self.chart.links
+        if self._task.speedups.lazy:
+            # Only links that begin at the first step or at a pinned one, and those at steps that
+            # the user says are one dstate.
+            first, said = {0, *self.clique}, {t for pair in self._one for t in pair}
+            links = [link for link in links if link[0] in first or not said.isdisjoint(link[::2])]
+        self._make_control(links)
+
+    def name_more(self, views: Collection[int]) -> None:
+        """Add a name for dstates to each of these views, in a new control with the same links."""
+        for view in views:
+            self._spares[view] += 1
+        self._asker.watch.check()
+        self._make_control(self._links)
+
+    def _make_control(self, links: Iterable[Link]) -> None:
+        """Make a control with the present names, some links, and the rules that exclude labels."""
+        with self._asker.grounding_timed():
+            seen, number = self.chart.seen, len(self.clique)
+            # The spare names of each view. The last one is the rest.
+            self._spare: dict[int, list[int]] = {}
+            for view, count in self._spares.items():
+                self._spare[view] = list(range(number, number + count + 1))
+                number += count + 1
+            # A node of the clique has one name. Other nodes may also have any spare name.
+            self._choices = [
+                options
+                if len(options) == 1 and t == self.clique[options[0]]
+                else [*options, *self._spare[seen[t]]]
+                for t, options in enumerate(self._may_be)
+            ]
+            cores = ["--opt-strategy=usc"] if self._task.speedups.core_guided else []
+            base = self._name_facts()
+            self._asker.watch.check(SECONDS_A_CHARACTER * len(base))
+            self._asker.control = new_control("names", base, ["--eq=1", *cores])
+        self._links, self._nodes, self._last, self._batches = {}, set(), {}, 0
+        self._is_open = np.zeros(len(seen), dtype=bool)
+        self.add(links)
+        for given in range(len(self._forbidden)):
+            self.give_forbidden(given)
+        sides, self._sides = self._sides, {}
+        if sides:
+            self._ground_sides([key for key in self._names() if key in sides])
+
+    def _name_facts(self) -> str:
+        """Return the facts about names, and about where actions may lead."""
+        seen, choices, spares = self.chart.seen, self._choices, self._spare.values()
+        view_of = {name: seen[node] for name, node in enumerate(self.clique)}
+        view_of |= {name: view for view, spare in self._spare.items() for name in spare}
+        rests = {spare[-1] for spare in spares}
+        leads = {
+            (s, action, x)
+            for t, action, u in self.chart.links
+            for s in choices[t]
+            if s not in rests
+            for x in choices[u]
+        }
+        found = [f"view({name},{view})." for name, view in view_of.items()]
+        for spare in spares:
+            found += [f"spare({name})." for name in spare]
+            found += [f"after({r},{s})." for r, s in pairwise(spare)]
+            found.append(f"rest({spare[-1]}).")
+        found += [f"leads({s},{action},{x})." for s, action, x in leads]
+        shows = {(s, action, view_of[x]) for s, action, x in leads}
+        found += [f"shows({s},{action},{view})." for s, action, view in shows]
+        return "\n".join(found)
+
+    def add(self, links: Iterable[Link]) -> None:
+        """Give clingo more links and the nodes at their ends, in batches. Check limits between."""
+        added, began = list(links), now()
+        for start in range(0, len(added), AT_A_TIME):
+            self._asker.watch.check()
+            with self._asker.grounding_timed():
+                self._give(added[start : start + AT_A_TIME])
+        self._asker.watch.check(PREPARING * (now() - began))
+
+    def add_links_at(self, nodes: Collection[int]) -> None:
+        """Give clingo all links to and from these nodes that it lacks."""
+        self.add(link for link in self._missing() if not {link[0], link[2]}.isdisjoint(nodes))
+
+    def more_links(self) -> list[Link]:
+        """List links that clingo lacks: all of them, or `MORE_LINKS` if the trace is long.
+
+        In a long trace, links whose ends have the fewest possible names come first.
+        """
+        left, choices = self._missing(), self._choices
+        if len(self.chart.seen) <= AT_ONCE:
+            return left
+        return sorted(left, key=lambda link: len(choices[link[0]]) * len(choices[link[2]]))[
+            :MORE_LINKS
+        ]
+
+    def _missing(self) -> list[Link]:
+        """List the links that clingo lacks."""
+        return [link for link in self.chart.links if link not in self._links]
+
+    def _give(self, links: Iterable[Link]) -> None:
+        """Ground one batch (portion) of links, with the steps at their ends."""
+        batch, before = self._batches, set(self._nodes)
+        added = [link for link in links if link not in self._links]
+        found: list[str] = []
+        for t in (end for s, _, x in added for end in (s, x)):
+            if t in self._nodes:
+                continue
+            self._nodes.add(t)
+            view, choices = self.chart.seen[t], self._choices[t]
+            found.append(f"node({batch},{t},{view}).")
+            found += [f"may_be({t},{name})." for name in choices]
+            if len(choices) == 1:
+                continue
+            if view in self._last:
+                found.append(f"follows({self._last[view]},{t}).")
+            self._last[view] = t
+            # Pairs that evidence excludes are given if the names of both steps are open.
+            if self.chart.excluded:
+                excluded = self.chart.continuations.excluded_from(t) & self._is_open
+                found += [f"apart({batch},{t},{u})." for u in np.flatnonzero(excluded).tolist()]
+            self._is_open[t] = True
+        self._links.update(dict.fromkeys(added))
+        found += [f"link({batch},{t},{action},{u})." for t, action, u in added]
+        found += [
+            f"one({batch},{t},{u})."
+            for t, u in self._one
+            if self._nodes.issuperset((t, u)) > before.issuperset((t, u))
+        ]
+        self._asker.control.tell("\n".join(found))
+        self._asker.control.ground([("more", number_symbols(batch))])
+        self._batches += 1
+
+    def give_forbidden(self, number: int) -> None:
+        """Give clingo the rule against a forbidden set of pairs, and the nodes of this set.
+
+        It is against answers with each pair at one dstate that is not a rest.
+        """
+        pairs = self._forbidden[number]
+        self.add_links_at({step for pair in pairs for step in pair})
+        together = [f"together({number},{k})" for k in range(len(pairs))]
+        rules = [
+            f"{atom} :- is({i},S), is({j},S), not rest(S)."
+            for atom, (i, j) in zip(together, pairs, strict=True)
+        ]
+        self._asker.control.tell("\n".join([*rules, f":- {', '.join(together)}."]))
+
+    def give_sides(self, contrary: Sequence[int]) -> bool:
+        """Give clingo the axioms of order and sides for the paths of some of these dstates.
+
+        Returns whether any of them are new. The dstates are given by their names.
+        """
+        key_of = {name: key for key, name in self._names().items()}
+        keys = [key_of[name] for name in contrary if name in key_of]
+        new = [key for key in keys if key not in self._sides][:CONTRARY]
+        if new:
+            self._ground_sides(new)
+        return bool(new)
+
+    def _ground_sides(self, keys: Sequence[_Key]) -> None:
+        """Ground the axioms of order and sides for dstates."""
+        control, names, task = self._asker.control, self._names(), self._task
+        with self._asker.grounding_timed():
+            parts: list[tuple[str, list[clingo.Symbol]]] = []
+            if not self._sides:
+                control.load(encodings.path("sides_frameless"))
+                actions = dict(zip(task.log.actions, task.trace.actions, strict=True))
+                kinds = [
+                    f"turns({a},{action.turn})." if action.turn else f"travels({a})."
+                    for a, action in actions.items()
+                    if action.kind in ("travel", "turn")
+                ]
+                control.add("sides", [], "\n".join([*kinds, *facts.sides(task.theory)]))
+                parts.append(("sides", []))
+            # One call for all parts halves the time to ground and to search.
+            control.ground(parts + [("path", number_symbols(names[key])) for key in keys])
+        self._sides.update(dict.fromkeys(keys))
+
+    def is_allowed(self, labels: Sequence[int]) -> bool:
+        """Whether the dstates of a map agree with what is known about pairs of steps."""
+        if any(all(labels[i] == labels[j] for i, j in pairs) for pairs in self._forbidden):
+            return False
+        if any(labels[i] != labels[t] for i, t in self._one if t < len(labels)):
+            return False
+        return not self.chart.excluded or self.chart.is_map(labels)
+
+    def _names(self) -> dict[_Key, int]:
+        """Return the names of dstates, without the rests."""
+        pinned = {(-1, name): name for name in range(len(self.clique))}
+        return pinned | {
+            (view, i): name
+            for view, spare in self._spare.items()
+            for i, name in enumerate(spare[:-1])
+        }
+
+    def rests(self, answer: dict[int, int]) -> set[int]:
+        """Return the views whose rest an answer uses. The answer has the name of each node."""
+        used = set(answer.values())
+        return {view for view, spare in self._spare.items() if spare[-1] in used}
+
+    def resting(self, value: bool) -> tuple[Symbol, bool]:
+        """Return the assumption that some node has a rest as its name (True), or none (False)."""
+        return Function("resting", number_symbols(self._batches - 1)), value
+
+    def follow(self, answer: dict[int, int]) -> tuple[list[int], list[Link]]:
+        """Follow the links of an answer through all nodes of the chart.
+
+        Returns the name of each node, -1 if it is unknown; and links that clingo lacks and should
+        get next, as the answer contradicts or does not explain them. If there are none, the names
+        make a map.
+        """
+        if self.has_all_links and not self.rests(answer):
+            return [answer[node] for node in range(len(answer))], []
+        goes: dict[tuple[int, int], int] = {
+            (answer[t], action): answer[u] for t, action, u in self._links
+        }
+        labels = [-1] * len(self.chart.seen)  # -1 if the name is unknown
+        followed: list[_Trail] = [None] * len(labels)
+        failed: dict[Link, None] = {}
+        asked: set[tuple[int, int]] = set()  # ask for one link of each name and action
+        labels[0] = answer[0]
+        for link in self.chart.links:
+            t, action, u = link
+            here, key = labels[t], (labels[t], action)
+            there = None
+            if t < u and labels[u] < 0:
+                if here >= 0 and key not in asked:
+                    trail = (link, followed[t])
+                    if key not in goes:
+                        failed[link] = None
+                        asked.add(key)
+                    elif goes[key] not in self._choices[u] or answer.get(u, goes[key]) != goes[key]:
+                        failed.update(self._not_given(trail))
+                    else:
+                        there = goes[key]
+                        followed[u] = None if u in answer else trail
+                labels[u] = answer.get(u, -1) if there is None else there
+            elif here >= 0 and labels[u] >= 0 and goes.setdefault(key, labels[u]) != labels[u]:
+                # The action leads to two names. So any link on the two trails that lead here may be
+                # wrong.
+                failed.update(self._not_given((link, followed[t])))
+                failed.update(self._not_given(followed[u]))
+        # Clingo should also get the links at steps that share a dstate against the evidence.
+        excluded = {
+            node
+            for pair in self.chart.excluded
+            if labels[pair[0]] == labels[pair[1]] >= 0
+            for node in pair
+        }
+        if excluded:
+            at = (link for link in self._missing() if not excluded.isdisjoint(link[::2]))
+            failed.update(dict.fromkeys(at))
+        return labels, list(failed)
+
+    def _not_given(self, trail: _Trail) -> Iterator[tuple[Link, None]]:
+        """Yield the links of a trail (connected links) that clingo lacks, as keys of a dict."""
+        while trail is not None:
+            link, trail = trail
+            if link not in self._links:
+                yield link, None
 
 
-def mended(guess: Sequence[int], chart: Chart) -> list[int]:
-    """Correct a guess: let each action at a dstate lead to the dstate that it mostly leads to.
+def read_names(model: Model) -> dict[int, int]:
+    """Read an answer: a dict from the steps that clingo was given to their names."""
+    return dict(map(_named, model.symbols(shown=True)))
 
-    Take the dstate of a node in the guess, and the action after the node. The next node gets the
-    dstate to which this action mostly leads from there, unless its view contradicts this. If only a
-    few dstates were wrong, all dstates after a right one become right. In the guess, -1 is an
-    unknown dstate.
-    """
-    keys = [
-        None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)
-    ]
-    leads: dict[tuple[tuple[int, int], int], Counter[tuple[int, int]]] = {}
-    for t, action, u in chart.links:
-        if (here := keys[t]) is not None and (there := keys[u]) is not None:
-            leads.setdefault((here, action), Counter())[there] += 1
-    most = {key: counts.most_common(1)[0][0] for key, counts in leads.items()}
-    for t, action, u in chart.links:
-        if (
-            (here := keys[t]) is not None
-            and (likely := most.get((here, action))) is not None
-            and likely[0] == chart.seen[u]
-        ):
-            keys[u] = likely
-    return [-1 if key is None else key[1] for key in keys]
+
+@lru_cache(maxsize=2**16)
+def _named(symbol: Symbol) -> tuple[int, int]:
+    """Read a step and its name from an atom. This is cached, as answers share most atoms."""
+    step, name = symbol.arguments
+    return step.number, name.number

@@ -17,9 +17,6 @@ only one known dstate, with much evidence, are merged first. Then come steps wit
 Steps that fit several known dstates are merged if the evidence for one of these is clearly the
 greatest. A step that fits no known dstate becomes one.
 
-A guess is completed in the same way. First, nodes with one label in the guess are merged if they
-can be one dstate. They become known dstates.
-
 A map is thinned in the same way. The dstates with the fewest nodes are merged first, each with the
 dstate for which there is most evidence, while the result is still a map.
 
@@ -93,52 +90,30 @@ DSTATE = 10  # cost of a dstate, in tenths
 _Turned = tuple[int, int]
 
 
-def merged(chart: Chart, clique: Iterable[int] = (), guess: Sequence[int] = ()) -> list[int]:
+def merged(chart: Chart, clique: Iterable[int] = ()) -> list[int]:
     """Return the dstate of each node of a chart in a small map of the causal theory.
 
-    The nodes of the clique are pairwise distinct. The map is near the guess, if one is given: a
-    label for each node, or -1. A label is ignored if the node cannot be one dstate with earlier
-    nodes of that label. All other nodes are merged by evidence. Dstates are numbered in the order
-    of their first nodes.
+    The nodes of the clique are pairwise distinct. All other nodes are merged by evidence. Dstates
+    are numbered in the order of their first nodes.
     """
     classes = Classes(chart.apart(), chart.links)
     classes.known[list(clique)] = True
-    classes.take(guess)
     classes.settle_all()
     return numbered(classes.root.tolist())
-
-
-def dstates_merged(chart: Chart, labels: Sequence[int]) -> list[int]:
-    """Merge dstates of a map of a chart until no two can be one.
-
-    Dstates with the fewest nodes are merged first, each with the dstate for which there is most
-    evidence.
-    """
-    dstates = numbered(labels)
-    first = np.unique(dstates, return_index=True)[1]
-    links = list(dict.fromkeys((dstates[t], action, dstates[u]) for t, action, u in chart.links))
-    excluded = [(dstates[i], dstates[j]) for i, j in chart.excluded]
-    root = np.array(
-        thinned_map(
-            np.asarray(chart.seen)[first].tolist(), links, np.bincount(dstates).tolist(), excluded
-        )
-    )
-    return numbered(root[dstates].tolist())
 
 
 def thinned_map(
     shows: Sequence[int],
     links: Sequence[Link],
     visits: Sequence[int],
-    excluded: Sequence[tuple[int, int]] = (),
 ) -> list[int]:
     """Merge dstates of a map until no two can be one, and return which dstate represents each.
 
-    This merges as `dstates_merged` does, but needs no chart. `shows` has the view of each dstate,
-    and `visits` the number of its nodes. Links are triples (dstate, action, dstate). `excluded`
-    pairs must not be merged. A dstate that was not merged represents itself.
+    Dstates with the fewest nodes are merged first, each with the dstate for which there is most
+    evidence. `shows` has the view of each dstate, and `visits` the number of its nodes. Links are
+    triples (dstate, action, dstate). A dstate that was not merged represents itself.
     """
-    apart = _apart_in_map(np.asarray(shows), links, excluded)
+    apart = _apart_in_map(np.asarray(shows), links)
     classes = Classes(apart, links, np.asarray(visits))
     classes.known[:] = True
     classes.thin_all()
@@ -146,20 +121,16 @@ def thinned_map(
     return root
 
 
-def _apart_in_map(
-    seen: NDArray[np.int_], links: Sequence[Link], excluded: Sequence[tuple[int, int]]
-) -> Matrix:
+def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link]) -> Matrix:
     """Find the pairs of dstates of a map that are apart, as a matrix of dstates x dstates.
 
-    Two dstates are apart if they show different views, if they are excluded, or if the same action
-    leads from them to dstates that are apart.
+    Two dstates are apart if they show different views, or if the same action leads from them to
+    dstates that are apart.
     """
     leads: dict[int, NDArray[np.int_]] = {}
     for dstate, action, leads_to in links:
         leads.setdefault(action, np.full(len(seen), -1))[dstate] = leads_to
     apart: Matrix = seen[:, None] != seen
-    for s, x in excluded:
-        apart[s, x] = apart[x, s] = True
     while True:
         look_at_clock()
         before = apart.copy()
@@ -206,18 +177,6 @@ class Classes:
         self._undo: list[
             tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]
         ] = []
-
-    def take(self, guess: Sequence[int]) -> None:
-        """Merge the steps that share a label in a guess, if they can be one dstate.
-
-        Their classes become known dstates. The label is -1 where it is unknown.
-        """
-        first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
-        self.known[list(first.values())] = True
-        for node, label in enumerate(guess):
-            look_at_clock()
-            if label >= 0:
-                self.merge(first[label], node)
 
     def settle_all(self) -> None:
         """Merge classes with known dstates, or make them known, until every class is known."""

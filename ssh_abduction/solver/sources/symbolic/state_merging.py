@@ -1,4 +1,4 @@
-"""Guess small maps of the causal theory, with or without faults, without a search or a proof.
+"""Guess small maps of the causal theory with faults, without a search or a proof.
 
 A hidden Markov model is trained on the trace by EM (Baum, Petrie, Soules, Weiss 1970). Each state
 shows one view, and several states show the same view (cloned hidden Markov models: George et al.
@@ -43,10 +43,6 @@ MISREAD, SLIPPED = 0.01, 0.01  # probabilities of faults in the model
 # While a map is refined, a fault that is forbidden costs this many times as much as an allowed one.
 # The last pass can replace a few of them by allowed faults.
 DEARER = 4 / 3
-# A guess without faults has SPARES states of each view, and one more for each VISITS steps with it.
-SPARES, VISITS = 6, 40
-# There is no such guess if the model has more entries of 8 bytes than this: 80 MB.
-ENTRIES = 10_000_000
 NEVER = 1_000_000  # the cost of a forbidden fault in the final Viterbi pass
 UNKNOWN = 0.5  # the cost of an unknown link, in tenths of dstates: less than any fault
 
@@ -254,19 +250,6 @@ def robust_maps(explainer: Explainer) -> Iterator[Explained | None]:
             return
 
 
-def machine_labels(seen: Sequence[int], actions: Sequence[int]) -> Iterator[list[int]]:
-    """Yield guesses at the dstates of a trace without faults: one for each start of EM, no end.
-
-    Yield none if the model would take too much memory. Arguments are as for `Explainer`.
-    """
-    explainer, rng = Explainer(seen, actions, {}), np.random.default_rng(0)
-    views = max(seen) + 1
-    clones = SPARES + len(seen) // (VISITS * views)
-    states = views * clones
-    while (max(actions, default=0) + 1) * states**2 + 4 * len(seen) * states <= ENTRIES:
-        yield _Model(explainer, clones, rng).labels()
-
-
 class _Model:
     """A cloned hidden Markov model of a trace. Its arrays are (actions, states, next states)."""
 
@@ -274,12 +257,10 @@ class _Model:
         self._explainer = explainer
         seen, views = np.array(explainer.seen), max(explainer.seen) + 1
         self._shows = np.repeat(np.arange(views), clones)
-        misread = MISREAD if "misread" in explainer.price else 0.0
         self._sees = np.where(
-            self._shows == np.arange(views)[:, None], 1 - misread, misread / max(views - 1, 1)
+            self._shows == np.arange(views)[:, None], 1 - MISREAD, MISREAD / max(views - 1, 1)
         )[seen]
         self._actions = np.array(explainer.actions, dtype=int)
-        self._slip = SLIPPED if "slipped" in explainer.price else 0.0
         self._chances = self._normal(
             rng.random((self._actions.max(initial=0) + 1, len(self._shows), len(self._shows)))
         )
@@ -339,7 +320,7 @@ class _Model:
     def _normal(self, counts: Floats) -> Floats:
         """Turn counts into transition probabilities. Slips lead to each state equally often."""
         chances: Floats = counts / counts.sum(axis=2, keepdims=True)
-        slipping: Floats = (1 - self._slip) * chances + self._slip / counts.shape[2]
+        slipping: Floats = (1 - SLIPPED) * chances + SLIPPED / counts.shape[2]
         return slipping
 
 
