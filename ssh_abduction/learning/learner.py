@@ -360,27 +360,19 @@ def _followed(
     than half of the steps with a known dstate.
     """
     leads = {(here, action): there for here, action, there in ssh_map.links}
-    ways = []
-    for start in range(len(ssh_map.dstates)):
-        way: list[int] = []
-        at: int | None = start
-        for step, view in enumerate(views):
-            if at is not None and view not in (NOISE, ssh_map.dstates[at].view):
-                break
-            way.append(-1 if at is None else at)
-            if step < len(trace.actions):
-                at = None if at is None else leads.get((at, trace.actions[step].name))
-        else:
-            ways.append(np.array(way, np.intp))
+    ways = [[start] for start in range(len(ssh_map.dstates))]
+    for way in ways:
+        for action in trace.actions:
+            way.append(leads.get((way[-1], action.name), -1))
+    at, seen = np.array(ways), np.array(views, object)
+    expected = np.array([*(s.view for s in ssh_map.dstates), None], object)[at]
+    contradicted = (at >= 0) & (seen != NOISE) & (expected != seen)
+    fits = np.where(contradicted.any(axis=1), 0, (at == looks).sum(axis=1))
     # Take the way that fits most images, unless there is a tie.
-    ways.sort(key=lambda way: -np.count_nonzero(way == looks))
-    fits = [np.count_nonzero(way == looks) for way in ways[:2]]
-    sure = (
-        fits
-        and fits[0] >= np.count_nonzero(ways[0] >= 0) / 2
-        and fits[0] > max(fits[1:], default=0)
-    )
-    return ways[0] if sure else np.full(len(views), -1, np.intp)
+    best = int(fits.argmax())
+    others = np.delete(fits, best)
+    sure = fits[best] >= (at[best] >= 0).sum() / 2 and fits[best] > others.max(initial=0)
+    return at[best] if sure else np.full(len(views), -1, np.intp)
 
 
 def _first_steps(ssh_map: SSHMap) -> NDArray[np.intp]:
