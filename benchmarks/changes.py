@@ -38,8 +38,7 @@ from instances import HEADINGS, doors_of, maze
 from together import joined
 from truth import NOISE, Known, is_true, with_truth
 
-from simulator.plan_tours import Floor, Stand
-from simulator.plans import Plan
+from simulator.plans import Floor, Plan, Stand
 from simulator.robot import reported
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.data import Action, Odometry, Step

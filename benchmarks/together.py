@@ -36,8 +36,7 @@ from truth import (
     worlds,
 )
 
-from simulator.plan_tours import tour
-from simulator.plans import Plan
+from simulator.plans import Plan, tour
 from ssh_abduction import SSHMap, Theory
 from ssh_abduction.data import Odometry, together
 from ssh_abduction.solver.sources.metric.beam import Beam

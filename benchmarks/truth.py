@@ -31,8 +31,7 @@ from pathlib import Path
 from arguments import add_number
 from instances import displaced, maze
 
-from simulator.plan_tours import tour
-from simulator.plans import Plan
+from simulator.plans import Plan, tour
 from simulator.robot import Body
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry

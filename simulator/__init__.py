@@ -2,7 +2,7 @@
 
 - `world`: worlds with walls, clutter, places and a route, and their files.
 - `plans`, `occupancy`: worlds from floor plans and from occupancy maps of ROS.
-- `tours`, `plan_tours`, `rounds`: drive through a world, and log what the robot sees.
+- `tours`, `rounds`: drive through a world, and log what the robot sees.
 - `driver`, `junctions`: the control laws of the robot. They see laser images, and no true pose.
 
 Import from the modules. The package itself exports nothing, so that no command loads what it does

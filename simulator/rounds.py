@@ -298,7 +298,7 @@ def _judged(
 
 
 def _name(room: int) -> str:
-    """The name of a room in the truth, the same as in `plan_tours.tour`."""
+    """The name of a room in the truth, the same as in `plans.tour`."""
     return f"room {room}"
 
 

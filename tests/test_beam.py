@@ -17,7 +17,7 @@ from strategies import theories, traces
 from test_plans import plan_of, xml
 from turns import guessed
 
-from simulator.plan_tours import tour
+from simulator.plans import tour
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry

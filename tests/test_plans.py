@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from simulator.errors import SimulatorError
-from simulator.plan_tours import tour
-from simulator.plans import APART, STRAIGHT, Plan
+from simulator.plans import APART, STRAIGHT, Plan, tour
 from ssh_abduction import Theory, Trace, evaluate, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry

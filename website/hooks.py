@@ -98,7 +98,7 @@ THEMES: dict[str, tuple[str, ...]] = {
         "simulator.panorama.Camera",
         "simulator.panorama.Paint",
         "simulator.plans.Plan",
-        "simulator.plan_tours.tour",
+        "simulator.plans.tour",
         "perception.errors.PerceptionError",
         "simulator.errors.SimulatorError",
     ),
