@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from worlds import rectangle
 
 from ssh_abduction import SSHMap, Trace, solve
-from ssh_abduction.cli import jobs, main, verbosity
+from ssh_abduction.cli import jobs, main, outcome
 
 # Hypothesis has no deadlines, because clingo takes a hundred times as long for some random traces
 # as for others. Examples are the same in each run, unless NEW_EXAMPLES is set.
@@ -30,7 +30,7 @@ settings.register_profile(
 settings.load_profile("the same everywhere")
 
 # Commands print no progress by default. Tests of progress set the interval.
-verbosity.EVERY = math.inf
+outcome.EVERY = math.inf
 
 # Background processes and their children ignore Ctrl-C. Restore the handler for tests.
 with contextlib.suppress(ValueError):

@@ -35,7 +35,6 @@ SAID_BY = {
     "ssh_abduction/data/checks.py": WITH_MAPS,
     "ssh_abduction/cli/batch.py": ("solve",),
     "ssh_abduction/cli/jobs.py": ("solve", "map"),
-    "ssh_abduction/cli/run_folders.py": ("map",),
     "ssh_abduction/explain/question.py": ("explain",),
     "ssh_abduction/cli/import_log.py": ("import", "map"),
     "ssh_abduction/cli/solve.py": ("solve",),
@@ -60,12 +59,11 @@ SAID_BY = {
 SEVERAL = {
     "ssh_abduction/cli/options.py": SAID_BY["ssh_abduction/cli/options.py"],
     "ssh_abduction/cli/about.py": ("theory", "facts", "completion"),
-    "ssh_abduction/cli/compare.py": ("compare", "next"),
-    "ssh_abduction/cli/correct.py": ("correct", "name"),
-    "ssh_abduction/cli/evaluate.py": ("evaluate", "ladder"),
+    "ssh_abduction/cli/compare.py": ("compare", "next", "evaluate", "ladder"),
+    "ssh_abduction/cli/correct.py": ("correct", "name", "solve"),
+    "ssh_abduction/cli/judge.py": ("check", "explain"),
     "ssh_abduction/cli/learn.py": ("cluster", "train", "learning-curve", "tell-apart", "recognise"),
-    "ssh_abduction/cli/localise.py": ("localise", "route"),
-    "ssh_abduction/cli/show.py": ("show", "export"),
+    "ssh_abduction/cli/use.py": ("localise", "route", "show", "export", "view"),
     "ssh_abduction/cli/simulate.py": ("simulate", "reproduce", "examples"),
 }
 OPTION = re.compile(r"(?:(?<![\w-])(\w[\w-]*) (?:with )?)?(?<![\w-])(--set [a-z_]+|--[a-z][a-z-]*)")
@@ -171,7 +169,7 @@ def test_an_error_without_advice_is_found() -> None:
         ("ssh_abduction/data/maps.py", "list fewer (map --within)", ["--within"]),
         ("ssh_abduction/data/maps.py", "list fewer (--maps)", ["--maps"]),
         (
-            "ssh_abduction/cli/localise.py",
+            "ssh_abduction/cli/use.py",
             "solve with --theory topological, or take --by metres",
             [],
         ),

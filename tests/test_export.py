@@ -17,7 +17,7 @@ from worlds import rectangle
 
 from ssh_abduction import SSHMap, Theory, Trace, export_map, solve
 from ssh_abduction.cli import main
-from ssh_abduction.cli import show as verb
+from ssh_abduction.cli import use as verb
 from ssh_abduction.data import MapError
 from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import DState

@@ -12,11 +12,18 @@ from pathlib import Path
 
 import pytest
 
-from ssh_abduction.cli import jobs, main, run_folders
-from ssh_abduction.cli.import_log import named_after
+from ssh_abduction.cli import import_log, jobs, main
+from ssh_abduction.cli.import_log import (
+    FILES,
+    digest,
+    folders_of,
+    is_done,
+    named_after,
+    write_run,
+)
 from ssh_abduction.cli.jobs import FileAnswer
 from ssh_abduction.cli.mapping import MapQuestion
-from ssh_abduction.cli.run_folders import FILES, RUN, digest, folders_of, is_done, write_run
+from ssh_abduction.cli.parsing import RUN
 
 QUESTION = MapQuestion(None, {}, (None, None, None), 0.5, None, 300, False)
 LONG = "n" * 251
@@ -182,7 +189,7 @@ def test_run_that_cannot_be_written_is_not_done(
             raise OSError(errno.ENOSPC, "No space left on device")
         path.write_bytes(data)
 
-    monkeypatch.setattr(run_folders, "write_file", write)
+    monkeypatch.setattr(import_log, "write_file", write)
     with pytest.raises(OSError, match="No space left on device") as error:
         write_run(tmp_path, files)
     assert error.value.filename == str(written[-1])
@@ -213,7 +220,7 @@ def test_run_that_cannot_be_written_does_not_stop_other_logs(
         path.write_bytes(data)
 
     monkeypatch.setattr(jobs, "answers_here", here)
-    monkeypatch.setattr(run_folders, "write_file", write)
+    monkeypatch.setattr(import_log, "write_file", write)
     monkeypatch.setattr(tempfile, "mkdtemp", lambda prefix: str(tmp_path / prefix))
     assert main(["map", *logs, "-o", str(tmp_path / "runs")]) == 1
     assert (tmp_path / "ssh-abduction-" / "maps.json").read_bytes() == b"maps"

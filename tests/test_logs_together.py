@@ -27,7 +27,7 @@ from perception.readers.writers import write_carmen
 from simulator.tours import record
 from simulator.world import World
 from ssh_abduction.cli import main
-from ssh_abduction.cli.run_folders import digest, distinct
+from ssh_abduction.cli.import_log import digest, distinct
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data import Closure, SSHMap, Trace, drives_of, together
 from ssh_abduction.data.drives import starts_of

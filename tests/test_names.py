@@ -12,8 +12,8 @@ from modules import parsed
 ROOT = Path(__file__).parent.parent
 
 
-# Modules of one kind have these: verbs of the shell, readers of logs, and workers.
-IN_EACH = {"add_parser", "run", "read", "serve"}
+# Modules of one kind have these: processes, readers of logs, and workers.
+IN_EACH = {"run", "read", "serve"}
 
 
 def names(kind: type[ast.ClassDef | ast.FunctionDef]) -> list[str]:

@@ -24,7 +24,7 @@ from in_processes import until
 
 from ssh_abduction import Localiser, Solution, SSHMap, Theory, Trace, solve, view_page
 from ssh_abduction.cli import main
-from ssh_abduction.cli.options import add_theory, flags_of, theory_of
+from ssh_abduction.cli.options import flags_of, theory_of, theory_rows
 from ssh_abduction.cli.parsing import Parser
 from ssh_abduction.data import Action, DState, MapError, Step, TraceError, together
 from ssh_abduction.data.map_parts import Name
@@ -229,7 +229,7 @@ def cielab(rgb: Any) -> Any:
 
 def test_flags_shown_on_the_page_reproduce_the_theory() -> None:
     parser = Parser()
-    add_theory(parser)
+    parser.add_rows(theory_rows())
     for theory in (
         Theory.topological(),
         Theory.causal(),

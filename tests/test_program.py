@@ -105,14 +105,14 @@ def test_current_folder_moves_to_the_end_of_the_module_path(
 DEAF = """
 import sys, clingo
 from ssh_abduction import __main__
-from ssh_abduction.cli import about, guard
+from ssh_abduction.cli import guard, parser
 guard.DEAF = 0.2
 def run(options):
     print("ready", flush=True)
     control = clingo.Control()
     control.add("p(0). p(X+1) :- p(X), X < 1000000000.")
     control.ground()
-about.run_facts = run
+parser().verbs["facts"].set_defaults(act=run)
 __main__.run()
 """
 

@@ -39,7 +39,7 @@ SOON = 60  # seconds, enough on a slow and busy machine
 PROGRAM = """
 import sys, time
 from ssh_abduction import __main__
-from ssh_abduction.cli import batch, explain, guard, jobs, solve
+from ssh_abduction.cli import batch, guard, jobs, judge, solve
 guard.DEAF = 0.2
 exec(sys.argv.pop(1))
 __main__.run()

@@ -20,7 +20,7 @@ import pytest
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.cli import main, parser, verbosity
+from ssh_abduction.cli import main, outcome, parser
 from ssh_abduction.cli.about import SHELLS
 
 ACES = str(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
@@ -147,12 +147,12 @@ def test_progress_lines_come_at_intervals(
     assert lines(capsys, "solve", tee)[1] == []
     seconds = itertools.count()
     monkeypatch.setattr(
-        verbosity, "time", Mock(monotonic=lambda: next(seconds))
+        outcome, "time", Mock(monotonic=lambda: next(seconds))
     )  # a second passes at each look
-    monkeypatch.setattr(verbosity, "EVERY", 4.0)
+    monkeypatch.setattr(outcome, "EVERY", 4.0)
     some = lines(capsys, "solve", tee)[1]
     assert some
-    monkeypatch.setattr(verbosity, "EVERY", 0.0)
+    monkeypatch.setattr(outcome, "EVERY", 0.0)
     for verb in ("solve", "ladder"):
         _, told = lines(capsys, verb, tee)
         assert len(told) > len(some)
@@ -167,7 +167,7 @@ def test_progress_lines_come_at_intervals(
 
 
 EAGER = (
-    "import sys; from ssh_abduction.cli import main, verbosity; verbosity.EVERY = 0.0; "
+    "import sys; from ssh_abduction.cli import main, outcome; outcome.EVERY = 0.0; "
     "sys.exit(main(sys.argv[1:]))"
 )
 

@@ -20,71 +20,71 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from typing import Any
 
 from ssh_abduction.cli import (
     about,
-    check,
     compare,
     correct,
-    evaluate,
-    explain,
     import_log,
+    judge,
     learn,
-    localise,
     mapping,
-    show,
     simulate,
     solve,
-    view,
+    use,
 )
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import check_inputs_are_kept
-from ssh_abduction.cli.outcome import EXIT_ERROR, unwritten, warn
-from ssh_abduction.cli.parsing import Parser, Verbs
-from ssh_abduction.cli.verbosity import add_verbosity, telling
+from ssh_abduction.cli.outcome import EXIT_ERROR, add_verbosity, telling, unwritten, warn
+from ssh_abduction.cli.parsing import Parser, Verb
 from ssh_abduction.data.errors import AbductionError, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.runtime import program
 
-# The functions that add the verbs, grouped by purpose as the help lists them.
-VERBS: Mapping[str, tuple[Callable[[Verbs], None], ...]] = {
+# The verbs, grouped by purpose as the help lists them.
+VERBS: Mapping[str, tuple[Verb, ...]] = {
     "map: find the maps of a trace or a log": (
-        solve.add_parser,
-        mapping.add_parser,
-        import_log.add_parser,
-        learn.add_cluster,
+        solve.run_solve,
+        mapping.run_map,
+        import_log.run_import,
+        learn.run_cluster,
     ),
     "ask: judge, compare and explain maps": (
-        check.add_parser,
-        compare.add_compare,
-        explain.add_parser,
-        evaluate.add_evaluate,
-        evaluate.add_ladder,
-        compare.add_next,
+        judge.run_check,
+        compare.run_compare,
+        judge.run_explain,
+        compare.run_evaluate,
+        compare.run_ladder,
+        compare.run_next,
     ),
     "use: drive and localise by a map": (
-        localise.add_localise,
-        localise.add_route,
-        show.add_show,
-        show.add_export,
-        view.add_parser,
-        correct.add_name,
-        correct.add_correct,
+        use.run_localise,
+        use.run_route,
+        use.run_show,
+        use.run_export,
+        use.run_view,
+        correct.run_name,
+        correct.run_correct,
     ),
-    "learn: recognise places from images": (learn.add_train,),
+    "learn: recognise places from images": (
+        learn.run_train,
+        learn.run_learning_curve,
+        learn.run_tell_apart,
+        learn.run_recognise,
+    ),
     "make: simulated robots and the paper's experiments": (
-        simulate.add_simulate,
-        simulate.add_reproduce,
-        simulate.add_examples,
+        simulate.run_simulate,
+        simulate.run_reproduce,
+        simulate.run_examples,
     ),
     "about: the axioms, their input, and your shell": (
-        about.add_axioms,
-        about.add_facts,
-        about.add_completion,
+        about.run_theory,
+        about.run_facts,
+        about.run_completion,
     ),
 }
 WORDS = (
@@ -97,8 +97,6 @@ WORDS = (
     "explains all words."
 )
 SEE_WORDS = "Words such as dstate are explained by: ssh-abduction --help"
-# Options whose output is for other programs. It is always UTF-8.
-FOR_PROGRAMS = ("json", "facts", "dot", "graphml", "svg")
 
 
 @cache
@@ -114,17 +112,17 @@ def parser() -> Parser:
         ),
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
-    verbs = top.add_subparsers(action=Verbs, metavar="VERB", dest="verb", required=True)
-    assert isinstance(verbs, Verbs)
-    for title, adders in VERBS.items():
-        known = set(verbs.choices)
-        for add in adders:
-            add(verbs)
-        top.groups[title] = tuple(set(verbs.choices) - known)
-    for each in (top, *verbs.choices.values()):
-        add_verbosity(each)
-    for each in verbs.choices.values():
-        each.epilog = "\n\n".join(filter(None, (each.epilog, SEE_WORDS)))
+    verbs = top.add_subparsers(metavar="VERB", dest="verb", required=True)
+    for title, members in VERBS.items():
+        top.groups[title] = tuple(verb.name for verb in members)
+        for verb in members:
+            added = verbs.add_parser(
+                verb.name, help=verb.summary, description=verb.help, epilog=SEE_WORDS
+            )
+            added.set_defaults(act=verb.run)
+            added.add_rows(verb.rows)
+            add_verbosity(added)
+    add_verbosity(top)
     return top
 
 
@@ -163,8 +161,10 @@ def _main(arguments: Sequence[str] | None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without "→" shows "?"
+    # Other programs read this output, so it is always UTF-8.
     for_programs = (
-        any(getattr(options, form, False) for form in FOR_PROGRAMS)
+        options.verb == "facts"
+        or getattr(options, "json", False)
         or getattr(options, "output", None) == "-"
     )
     if isinstance(sys.stdout, io.TextIOWrapper) and for_programs:
@@ -182,7 +182,7 @@ def _main(arguments: Sequence[str] | None) -> int:
                 check_inputs_are_kept(options)
                 guard = Guard(lambda: None)
                 with contextlib.redirect_stdout(output), guard:
-                    code = int(options.run(options))
+                    code = int(options.act(options))
             finally:
                 warn(dict.fromkeys(printable(str(warning.message)) for warning in caught))
         sys.stdout.flush()

@@ -6,8 +6,8 @@ import argparse
 import re
 import sys
 
-from ssh_abduction.cli.options import add_theory, theory_of, trace_path
-from ssh_abduction.cli.parsing import Verbs
+from ssh_abduction.cli.options import TRACE_SAID, theory_of, theory_rows
+from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError, printable
@@ -18,16 +18,12 @@ from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import PRESETS
 
 
-def add_axioms(verbs: Verbs) -> None:
-    verbs.add(
-        "theory",
-        run_axioms,
-        "list the axioms",
-        "List every axiom with its name, sentence and source, and the presets that include it.",
-    )
+@verb({})
+def run_theory(options: argparse.Namespace) -> int:
+    """List the axioms.
 
-
-def run_axioms(options: argparse.Namespace) -> int:
+    Each axiom has a name, a sentence, a source, and the presets that include it.
+    """
     print(
         "A preset has an axiom: on = always; stars = if the trace has stars that fit right angles; "
         "gateways = if it has other stars; – = never"
@@ -58,20 +54,13 @@ def _state(name: str, preset: str) -> str:
     )
 
 
-def add_facts(verbs: Verbs) -> None:
-    parser = verbs.add(
-        "facts",
-        run_facts,
-        "print a trace as .lp facts",
-        "Print a trace and a theory as facts for clingo, with the command that solves them with "
-        "the encodings of this package.",
-    )
-    parser.add("trace", "trace file (JSON Lines), or - for standard input", type=trace_path)
-    add_theory(parser)
-    parser.set_defaults(facts=True)
-
-
+@verb({"trace": TRACE_SAID, **theory_rows()})
 def run_facts(options: argparse.Namespace) -> int:
+    """Print a trace as .lp facts.
+
+    Print a trace and a theory as facts for clingo, with the command that solves them with the
+    encodings of this package.
+    """
     text = encoding.program(settle(Trace.load(options.trace), theory_of(options)))
     if sys.stdout.isatty():  # escape control characters, which a terminal would obey
         text = "".join(f"{printable(line)}\n" for line in text.rstrip("\n").split("\n"))
@@ -82,21 +71,17 @@ def run_facts(options: argparse.Namespace) -> int:
 SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")
 
 
-def add_completion(verbs: Verbs) -> None:
-    parser = verbs.add(
-        "completion",
-        run_completion,
-        "print completions for a shell",
-        "Print the completion of verbs, options and files for a shell. Needs the package shtab: "
-        "pip install 'ssh-abduction[completion]'.",
-        'bash: eval "$(ssh-abduction completion bash)" in ~/.bashrc; zsh: write it to a file '
-        "_ssh-abduction in a folder of $fpath; "
-        "fish: write it to ~/.config/fish/completions/ssh-abduction.fish",
-    )
-    parser.add("shell", "the shell to print the script for", choices=SHELLS)
-
-
+@verb({f"shell {{{','.join(SHELLS)}}}": "the shell to print the script for"})
 def run_completion(options: argparse.Namespace) -> int:
+    """Print completions for a shell.
+
+    Print the completion of verbs, options and files. Needs the package shtab:
+    pip install 'ssh-abduction[completion]'.
+
+    bash: eval "$(ssh-abduction completion bash)" in ~/.bashrc; zsh: write it to a file
+    _ssh-abduction in a folder of $fpath; fish: write it to
+    ~/.config/fish/completions/ssh-abduction.fish
+    """
     with needed("completion", "shtab", "'ssh-abduction[completion]'"):
         import shtab
     if options.shell not in shtab.SUPPORTED_SHELLS:

@@ -26,21 +26,20 @@ from ssh_abduction.cli.outcome import (
     Warnings,
     all_given,
     answer_ending,
-    answer_opening,
     exit_code,
     on_ctrl_c,
+    progress_bar,
     warn,
     why_no_map,
 )
 from ssh_abduction.cli.text import headline
-from ssh_abduction.cli.verbosity import progress_bar
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.program import SIGNALLED
-from ssh_abduction.solver import Backbone, Search, Solution, Start, Stop, workers, written_map
+from ssh_abduction.solver import Search, Solution, Start, Stop, opening, workers, written_map
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
@@ -57,7 +56,6 @@ class HandedOver(NamedTuple):
     """What is known of the answer for a trace: plain data, which another process can print."""
 
     solution: Solution
-    found: int  # the number of maps that were found
     explanation: Explanation | None
     warnings: Sequence[str]
 
@@ -66,8 +64,7 @@ class HandedOver(NamedTuple):
         cls, search: Search, solution: Solution, explanation: Explanation | None = None
     ) -> HandedOver:
         """Collect what is known from a search and its solution."""
-        found = max(search.count, len(solution.maps))
-        return cls(solution, found, explanation, Warnings(search).of(solution))
+        return cls(solution, explanation, Warnings(search).of(solution))
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +90,6 @@ class SolveQuestion(FileQuestion):
         "machine is busy or memory is swapped; solve fewer traces at a time (--jobs), or set "
         "--memory-limit"
     )
-
-    @property
-    def has_limits(self) -> bool:
-        """Whether each answer needs its own process, which can be killed at a limit."""
-        return self.limit is not None or self.memory is not None
 
     def load(self, path: str) -> Trace:
         """Load a trace here, because a worker may not be able to read the file."""
@@ -146,7 +138,7 @@ class SolveQuestion(FileQuestion):
                 kept += [ssh_map] if self.json else []
             explanation = why_no_map(search)
             known = HandedOver.of(search, search.solution(tuple(kept)), explanation)
-            return self._answer(number, path, known, search.backbone)
+            return self._answer(number, path, known)
 
     def _guarded(
         self,
@@ -197,18 +189,16 @@ class SolveQuestion(FileQuestion):
     def warned(self, answer: FileAnswer, path: str, warning: str) -> FileAnswer:
         return replace(answer, warnings=(*answer.warnings, f"{named(path)}: {warning}"))
 
-    def _answer(
-        self, number: int, path: str, known: HandedOver, backbone: Backbone | None = None
-    ) -> FileAnswer:
+    def _answer(self, number: int, path: str, known: HandedOver) -> FileAnswer:
         """Make the answer for a solution: its line, exit code and warnings."""
-        solution, count, explanation, found = known
+        solution, explanation, found = known
         if self.json:
             written = [written_map(*given) for given in all_given(solution)]
-            opening = answer_opening(solution)
-            ending = answer_ending(solution, explanation, len(written), backbone, found)
-            line = json_line({"trace": path, **opening, "maps": written, **ending})
+            head = opening(solution.theory, solution.steps, solution.within)
+            end = answer_ending(solution, explanation, len(written), found)
+            line = json_line({"trace": path, **head, "maps": written, **end})
         else:
-            line = f"{named(path)}: {headline(solution, count, explanation)}"
+            line = f"{named(path)}: {headline(solution, explanation)}"
         where = f"{named(path)}:"
         warnings = tuple(text if text.startswith(where) else f"{where} {text}" for text in found)
         return FileAnswer(number, line, exit_code(solution), warnings)

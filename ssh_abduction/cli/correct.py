@@ -1,34 +1,39 @@
-"""ssh-abduction correct and name: say what is wrong in an existing map, and name its places."""
+"""ssh-abduction correct and name: say what is wrong in a map, and name its places.
+
+Searches obey these corrections, and report how they did.
+"""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import os
 import shlex
+import sys
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.cli.obeyed_corrections import clash_alone, misreading, seen_at, sentences_of
 from ssh_abduction.cli.options import (
-    add_map,
-    add_maps,
+    MAPS_SAID,
+    ONE_MAP,
     at_comma,
-    maps_path,
     read_maps,
     trace_beside,
     trace_of_maps,
 )
 from ssh_abduction.cli.outcome import warn
-from ssh_abduction.cli.parsing import Verbs
+from ssh_abduction.cli.parsing import maps_path, verb
 from ssh_abduction.data.corrections import (
     ASSERTIONS,
     FILE,
     Corrections,
     Naming,
+    Passage,
     Said,
     beside,
     direction,
@@ -36,14 +41,225 @@ from ssh_abduction.data.corrections import (
     number_at,
     save_corrections,
 )
-from ssh_abduction.data.drives import Drive, step_name, step_of
-from ssh_abduction.data.errors import MapError, TraceError, brief, named, printable
+from ssh_abduction.data.drives import (
+    Drive,
+    drives_of,
+    fingerprints_of,
+    step_name,
+    step_of,
+    together,
+)
+from ssh_abduction.data.errors import MapError, TheoryError, TraceError, brief, named, printable
 from ssh_abduction.data.map_parts import NAMED, region_of, thing_named
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted, meant
+from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.solver import (
+    Limits,
+    Solution,
+    Status,
+    obeyed,
+    solve,
+    with_correction_warnings,
+    with_names,
+)
 from ssh_abduction.theory.theory import Theory
+
+
+def corrections_of(options: argparse.Namespace) -> Corrections | None:
+    """Read the corrections of --corrections, or beside the output or the maps of --onto, if any."""
+    file = options.corrections or beside(options.output) or beside(options.onto)
+    return None if file is None else load_corrections(file)
+
+
+def as_corrected(
+    trace: Trace, theory: Theory, maps: str | None, given: str | None = None
+) -> tuple[Trace, Theory]:
+    """Apply the corrections beside a file of maps to a trace and a theory, and return both.
+
+    `given` is a file of corrections that the user names instead. The number of corrections obeyed
+    is printed on stderr. If the file beside the maps is of other drives, it is ignored with a
+    warning. Raises MapError if the file is malformed or contradicts the trace, or if `given` is of
+    other drives.
+    """
+    file = given or beside(maps)
+    said = Corrections() if file is None else load_corrections(file)
+    if not said.pairs and not said.gateways:
+        return trace, theory
+    if given is None:
+        try:
+            said.check_drives(dict(fingerprints_of(trace)))
+        except MapError as error:
+            warn([f"{error}; it is not obeyed"])
+            return trace, theory
+    corrected = obeyed(said, trace, theory)
+    say_obeyed(said, trace)
+    return corrected
+
+
+def say_obeyed(said: Corrections, trace: Trace) -> None:
+    """Print on stderr how many corrections are about drives of this trace."""
+    here = len([*sentences_of(said.known_in(drives_of(trace)))])
+    more = len([*sentences_of(said)]) - here
+    aside = f"; {more} more {'is' if more == 1 else 'are'} about other drives" if more else ""
+    text = f"obeying {counted(here, 'corrections')} of {named(said.source)}{aside}"
+    print(printable(text), file=sys.stderr)
+
+
+def keep_corrections(said: Corrections | None, output: str | None) -> None:
+    """Write the corrections that were obeyed beside a new file of maps, if it has none yet."""
+    if said is not None and output is not None and output != "-" and beside(output) is None:
+        copy = Path(output).parent / FILE
+        save_corrections(said, copy)
+        print(printable(f"copied {named(said.source)} to {named(copy)}"), file=sys.stderr)
+
+
+@dataclass(frozen=True)
+class Obeying:
+    """The corrections that a search obeys."""
+
+    corrections: Corrections
+    trace: Trace  # the trace, with its stars corrected
+    theory: Theory  # the theory, with the pairs of steps that a person asserts
+    as_seen: Trace  # the trace as it was recorded
+    without: Theory  # the theory without these pairs
+
+    @classmethod
+    def of(cls, options: argparse.Namespace, trace: Trace, theory: Theory) -> Obeying:
+        """Read the corrections of --corrections, or those beside the output. Raises MapError."""
+        said = corrections_of(options)
+        if said is None:
+            return cls(Corrections(), trace, theory, trace, theory)
+        corrected = cls(said, *obeyed(said, trace, theory), trace, theory)
+        say_obeyed(said, trace)
+        return corrected
+
+    def named(self, ssh_map: SSHMap) -> SSHMap:
+        """Return a map with the names that a person gave."""
+        return self.corrections.named(ssh_map, drives_of(self.trace))
+
+    def with_names(self, solution: Solution) -> Solution:
+        """Return a solution whose maps have the names that a person gave."""
+        return with_names(self.corrections, solution, self.trace)
+
+    def finished(self, solution: Solution, limits: Limits) -> Solution:
+        """Add names, and warn of drives that share no place because of a corrected gateway."""
+        counts = limits.work_limit is not None
+        limit = limits.work_limit if counts else limits.time_limit
+        spent = solution.effort.work if counts else solution.seconds.total
+        left = math.inf if limit is None else limit - (spent or 0.0)
+
+        def find(trace: Trace, theory: Theory, most: float) -> Solution:
+            limited: dict[str, Any] = {"work_limit" if counts else "time_limit": most}
+            return solve(trace, theory, max_maps=1, **limited)
+
+        return with_correction_warnings(self.corrections, self.with_names(solution), left, find)
+
+    def blamed(self, solution: Solution, explanation: Explanation | None) -> list[str]:
+        """List the corrections that may be the reason why the trace has no map.
+
+        Each correction is dropped in turn. If the steps of the explanation still have no map, this
+        correction is not to blame, and it is not listed. Without an explanation, two steps that
+        are said to be one are compared.
+        """
+        if solution.maps or not self.corrections:
+            return []
+        said = self.corrections.known_in(drives_of(self.trace))
+        source = named(said.source or "corrections")
+        if explanation is None:
+            sure = [
+                f"{source}: {pair}: it contradicts the trace{seen_at(pair, self.trace)}"
+                for pair in said.pairs
+                if clash_alone(pair, self.trace, self.without)
+            ]
+            if sure or solution.status is not Status.UNSATISFIABLE:
+                return sure
+            return [
+                f"{source}: {sentence}: perhaps it contradicts the trace"
+                for sentence in (*said.pairs, *said.gateways)
+            ]
+        # Drop corrections one by one, as long as there is still no map. Those left clash.
+        stretch = range(explanation.first, explanation.last + 1)
+        kept = replace(said, pairs=(), gateways=())
+        if self._has_no_map(kept, stretch):
+            return []
+        kept = said
+        sentences: list[Said | Passage] = [*said.pairs, *said.gateways]
+        for sentence in sentences:
+            fewer = kept.without(sentence)
+            kept = fewer if self._has_no_map(fewer, stretch) else kept
+        wrong = [one for one in sentences if one in kept.pairs or one in kept.gateways]
+        others = ", or another correction that is named here" if len(wrong) > 1 else ""
+        return [
+            f"{source}: {sentence}: it contradicts the trace{seen_at(sentence, self.trace)}{others}"
+            for sentence in wrong
+        ]
+
+    def how_to_mend(self, blamed: Sequence[str], explanation: Explanation | None) -> Iterator[str]:
+        """Yield a line that says how to mend the corrections of `blamed`, if there are any."""
+        if not blamed:
+            return
+        said = self.corrections.known_in(drives_of(self.trace))
+        lenient = misreading(self.without)
+        if lenient is None:
+            helps = False
+        elif explanation is None:
+            pairs = [p for p in said.pairs if clash_alone(p, self.trace, self.without)]
+            helps = bool(pairs) and not any(clash_alone(p, self.trace, lenient) for p in pairs)
+        else:
+            stretch = range(explanation.first, explanation.last + 1)
+            helps = not self._has_no_map(said, stretch, lenient)
+        them = "this correction" if len(blamed) == 1 else "one of these corrections"
+        also = ", or let views and stars be misread: solve with --set misread=4" if helps else ""
+        yield f"say the opposite of {them} (ssh-abduction correct), or delete it{also}"
+
+    def _has_no_map(self, said: Corrections, stretch: range, without: Theory | None = None) -> bool:
+        trace, theory = obeyed(said, self.as_seen, without or self.without)
+        part = theory.of_steps(stretch.start, len(stretch))
+        # In these steps, every view may be unknown.
+        part = part.replace(unknown_views=None in trace.views)
+        return explain(trace[stretch.start : stretch.stop], part) is not None
+
+
+def misreading(theory: Theory) -> Theory | None:
+    """Return the theory with misread views and stars; None if it allows or cannot allow them."""
+    with contextlib.suppress(TheoryError):
+        return None if theory.misread else theory.replace(misread=4)
+    return None
+
+
+def clash_alone(said: Said, trace: Trace, theory: Theory) -> bool:
+    """Whether two steps that are said to be one dstate or place cannot be so by themselves."""
+    if not said.kind.startswith("same"):
+        return False
+    drives = drives_of(trace)
+    steps = sorted(step_of(drives, step) for step in said.steps)
+    alone = [trace[t : t + 1].without_displacements() for t in steps]
+    nothing: dict[str, Any] = dict.fromkeys(ASSERTIONS, ())
+    theory = theory.replace(displacement="none", weigh="auto", **{**nothing, said.kind: ((0, 1),)})
+    with warnings.catch_warnings():  # of drives that are equal, or have nothing in common
+        warnings.simplefilter("ignore")
+        return explain(together(alone, ["first", "second"]), theory) is not None
+
+
+def seen_at(said: Said | Passage, trace: Trace) -> str:
+    """Say what the robot saw at two steps that are said to be one dstate, if this differs."""
+    if isinstance(said, Passage) or not said.kind.startswith("same"):
+        return ""
+    drives = drives_of(trace)
+    first, second = (trace.steps[step_of(drives, step)] for step in said.steps)
+    if said.kind == "same" and first.view != second.view:
+        seen = ("no view" if step.view is None else step.view for step in (first, second))
+        return f" ({', '.join(f'{s} shows {v}' for s, v in zip(said.steps, seen, strict=True))})"
+    return " (their stars differ)" if first.star != second.star else ""
+
+
+def sentences_of(corrections: Corrections) -> Iterator[str]:
+    """Put corrections into words: yield one sentence for each."""
+    yield from map(str, (*corrections.names, *corrections.pairs, *corrections.gateways))
+
 
 HELPS = {
     "same": "steps I and J, such as monday:12,tuesday:3, are one dstate",
@@ -60,26 +276,6 @@ HELPS = {
 }
 
 
-def add_correct(verbs: Verbs) -> None:
-    parser = verbs.add(
-        "correct",
-        run_correct,
-        "say what is wrong in a map",
-        "Correct a map. The corrections are saved in corrections.yaml beside the map. solve obeys "
-        "them if it writes into that folder (solve --output) or is given the file "
-        "(solve --corrections).",
-        "Each option may be given several times. Without any, print the corrections so far.",
-    )
-    add_maps(parser)
-    for name, words in HELPS.items():
-        metavar = "I,J" if name in ASSERTIONS else "GATEWAY"
-        parser.add(f"--{name.replace('_', '-')}", words, action=_InOrder, metavar=metavar)
-    said = "name or rename a place, path or region (p4, path2, kitchen), or the place of a step"
-    parser.add("--name", said, action=_InOrder, nargs=2, metavar=("WHAT", "NAME"))
-    parser.set_defaults(said=())
-    add_map(parser)
-
-
 class _InOrder(argparse.Action):
     """Appends an option and its value to `said`. So a later option can replace an earlier one."""
 
@@ -90,13 +286,38 @@ class _InOrder(argparse.Action):
         value: object,
         _option: str | None = None,
     ) -> None:
-        options.said = (*options.said, (self.dest, value))
+        options.said = (*getattr(options, "said", ()), (self.dest, value))
 
 
+@verb(
+    {
+        "maps": MAPS_SAID,
+        **{
+            f"--{name.replace('_', '-')} {'I,J' if name in ASSERTIONS else 'GATEWAY'}": (
+                said,
+                {"action": _InOrder},
+            )
+            for name, said in HELPS.items()
+        },
+        "--name WHAT NAME": (
+            "name or rename a place, path or region (p4, path2, kitchen), or the place of a step",
+            {"action": _InOrder},
+        ),
+        **ONE_MAP,
+    }
+)
 def run_correct(options: argparse.Namespace) -> int:
+    """Say what is wrong in a map.
+
+    The corrections are saved in corrections.yaml beside the map. solve obeys them if it writes into
+    that folder (solve --output) or is given the file (solve --corrections).
+
+    Each option may be given several times. Without any, print the corrections so far.
+    """
     saved = SavedMap.load(options.maps, options.map)
+    given = getattr(options, "said", ())
     before = said = saved.corrections
-    for kind, value in options.said:
+    for kind, value in given:
         if kind in ASSERTIONS:
             said = said.with_pair(kind, *_pair(saved, kind, value))
         elif kind == "name":
@@ -105,7 +326,7 @@ def run_correct(options: argparse.Namespace) -> int:
             saved = saved.named(said)
         else:
             said = said.with_gateway(kind == "open", saved.gateway(value))
-    if said == before and options.said:
+    if said == before and given:
         print("nothing changed: this was said before")
         return 0
     if said == before:
@@ -113,9 +334,7 @@ def run_correct(options: argparse.Namespace) -> int:
         return 0
     file = saved.save(said)
     warn(_unlike(saved, said, [pair for pair in said.pairs if pair not in before.pairs]))
-    if saved.theory.get("star") == "none" and {"open", "closed"} & {
-        kind for kind, _ in options.said
-    }:
+    if saved.theory.get("star") == "none" and {"open", "closed"} & {kind for kind, _ in given}:
         without = "this map was made without stars, so a gateway that is open or closed changes no"
         warn([f"{without} map; to use stars, set star=auto when you map or solve again"])
     sentences = counted(sum(1 for _ in sentences_of(said)), "corrections")
@@ -169,26 +388,23 @@ def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
     return steps[0], steps[1]
 
 
-def add_name(verbs: Verbs) -> None:
-    parser = verbs.add(
-        "name",
-        run_name,
-        "name a place, path or region",
-        "Name a place, a path or a region of a map. The name is written to corrections.yaml beside "
-        "the map, for a step at this place. Solving again may renumber the places, but the name "
-        "stays with the place of that step.",
-    )
-    add_maps(parser)
-    parser.add(
-        "what",
-        "a place such as p4, a path such as path2, a region such as region3, or its name so far; "
-        "or a step such as monday:12, for its place",
-    )
-    parser.add("name", 'the name, such as "kitchen"; write -- before a name that begins with -')
-    add_map(parser)
-
-
+@verb(
+    {
+        "maps": MAPS_SAID,
+        "what": (
+            "a place such as p4, a path such as path2, a region such as region3, or its name so "
+            "far; or a step such as monday:12, for its place"
+        ),
+        "name": 'the name, such as "kitchen"; write -- before a name that begins with -',
+        **ONE_MAP,
+    }
+)
 def run_name(options: argparse.Namespace) -> int:
+    """Name a place, path or region.
+
+    The name is written to corrections.yaml beside the map, for a step at this place. Solving again
+    may renumber the places, but the name stays with the place of that step.
+    """
     saved = SavedMap.load(options.maps, options.map)
     kind, step = saved.thing_to_name(options.what)
     file = saved.save(saved.corrections.with_name(options.name, kind, step))

@@ -1,21 +1,33 @@
-"""ssh-abduction import LOG: make a trace from a robot's log."""
+"""ssh-abduction import LOG: make a trace from a robot's log. Manage the folders of mapped logs.
+
+A folder belongs to the log whose digest is in its run.json. The log is done if this file does not
+say that the run was interrupted.
+"""
 
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
+import os
+import shutil
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import tempfile
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ssh_abduction.cli.options import add_output, check_output, write
+from ssh_abduction.cli.options import OUTPUT_TRACE, check_output, write_trace
 from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c, warn
-from ssh_abduction.cli.parsing import Parser, Verbs
+from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, verb
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import AbductionError
+from ssh_abduction.data.errors import AbductionError, named
+from ssh_abduction.data.files import write_file
 from ssh_abduction.runtime import program
 
 if TYPE_CHECKING:
@@ -39,62 +51,6 @@ ENDINGS = (
 MEANINGS = ("free", "unknown")
 
 
-def add_parser(verbs: Verbs) -> None:
-    parser = verbs.add(
-        "import",
-        run,
-        "make a trace from a robot's log",
-        "Read a robot's log of laser scans and odometry, find the distinctive places that it "
-        "passed, and write a trace with views, stars, displacements and actions. Corrected "
-        "poses in the log become the truth, which only the command 'evaluate' uses.",
-    )
-    parser.add(
-        "log",
-        "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
-        "compressed by gzip, bzip2, xz or zstd. '-' reads a CARMEN log from standard input, with "
-        "little memory, and shows each place when it is final",
-    )
-    add_output(parser)
-    add_reading(parser)
-
-
-def add_reading(parser: Parser) -> None:
-    """Add the options that say how to read a log, and how wide the robot is."""
-    group = parser.add_argument_group("reading logs")
-    said = "format of the log (default: guessed from its content)"
-    parser.add("--format", said, to=group, choices=FORMATS)
-    said = f"width of the robot in metres; it cannot pass narrower gaps (default: {WIDTH:g})"
-    parser.add("--width METRES", said, to=group, type=metres)
-    parser.add_setting(
-        "fov DEGREES",
-        "the angle from the first to the last beam of the laser; negative for a laser mounted "
-        "upside down (default: from the log, else 180)",
-        type=partial(_laser_value, "fov"),
-    )
-    said = "topic of the scans, if a bag has several; may be given again to read several lasers"
-    parser.add_setting("scan_topic TOPIC", said, many=True)
-    parser.add_setting("odom_topic TOPIC", "topic of the odometry, if a bag has several")
-    parser.add_setting(
-        "mount X,Y,DEGREES",
-        "where the laser is on the robot: metres ahead of the centre, metres to the left, and "
-        "degrees to the left of straight ahead (default: from the log, else 0,0,0)",
-        type=partial(_laser_value, "mount"),
-    )
-    parser.add_setting(
-        "no_return METRES",
-        "a range of at least this length means that the beam hit nothing (default: the "
-        "laser's maximum range, or a shorter range that often repeats and is no wall)",
-        type=partial(_laser_value, "no_return"),
-    )
-    parser.add_setting(
-        "zero_is",
-        "how to read ranges that are NaN, at most 0, or below the laser's minimum: free means "
-        "that the beam hit nothing, unknown that nothing is known (default: free if the "
-        "neighbouring beams are long, else unknown)",
-        choices=MEANINGS,
-    )
-
-
 def metres(text: str) -> float:
     """Convert text to metres, from 0.1 to 50. Raise ArgumentTypeError for anything else."""
     try:
@@ -106,21 +62,6 @@ def metres(text: str) -> float:
             f"expected metres, from 0.1 to 50, got {text!r}; give the width of the robot"
         )
     return value
-
-
-def read(path: str, options: argparse.Namespace) -> RobotLog:
-    """Read the log at `path` as the options say. Raises AbductionError."""
-    from perception.readers.logs import read_log
-
-    return read_log(path, **reading_of(options))
-
-
-def reading_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Collect the options that are arguments of `read_log`, by name."""
-    return {
-        name: getattr(options, name)
-        for name in ("format", "scan_topic", "odom_topic", "fov", "mount", "no_return", "zero_is")
-    }
 
 
 def _laser_value(field: str, text: str) -> Any:
@@ -142,7 +83,74 @@ def _laser_value(field: str, text: str) -> Any:
     return value
 
 
-def run(options: argparse.Namespace) -> int:
+# How to read a log, and how wide the robot is.
+READING: Rows = {
+    "# reading logs": "",
+    f"--format {{{','.join(FORMATS)}}}": "format of the log (default: guessed from its content)",
+    "--width METRES": (
+        f"width of the robot in metres; it cannot pass narrower gaps (default: {WIDTH:g})",
+        {"type": metres},
+    ),
+    "--set fov DEGREES": (
+        "the angle from the first to the last beam of the laser; negative for a laser mounted "
+        "upside down (default: from the log, else 180)",
+        {"type": partial(_laser_value, "fov")},
+    ),
+    "--set scan_topic TOPIC...": (
+        "topic of the scans, if a bag has several; may be given again to read several lasers"
+    ),
+    "--set odom_topic TOPIC": "topic of the odometry, if a bag has several",
+    "--set mount X,Y,DEGREES": (
+        "where the laser is on the robot: metres ahead of the centre, metres to the left, and "
+        "degrees to the left of straight ahead (default: from the log, else 0,0,0)",
+        {"type": partial(_laser_value, "mount")},
+    ),
+    "--set no_return METRES": (
+        "a range of at least this length means that the beam hit nothing (default: the "
+        "laser's maximum range, or a shorter range that often repeats and is no wall)",
+        {"type": partial(_laser_value, "no_return")},
+    ),
+    f"--set zero_is {{{','.join(MEANINGS)}}}": (
+        "how to read ranges that are NaN, at most 0, or below the laser's minimum: free means "
+        "that the beam hit nothing, unknown that nothing is known (default: free if the "
+        "neighbouring beams are long, else unknown)"
+    ),
+}
+
+
+def read(path: str, options: argparse.Namespace) -> RobotLog:
+    """Read the log at `path` as the options say. Raises AbductionError."""
+    from perception.readers.logs import read_log
+
+    return read_log(path, **reading_of(options))
+
+
+def reading_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Collect the options that are arguments of `read_log`, by name."""
+    return {
+        name: getattr(options, name)
+        for name in ("format", "scan_topic", "odom_topic", "fov", "mount", "no_return", "zero_is")
+    }
+
+
+@verb(
+    {
+        "log": (
+            "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
+            "compressed by gzip, bzip2, xz or zstd. '-' reads a CARMEN log from standard input, "
+            "with little memory, and shows each place when it is final"
+        ),
+        **OUTPUT_TRACE,
+        **READING,
+    }
+)
+def run_import(options: argparse.Namespace) -> int:
+    """Make a trace from a robot's log.
+
+    Read a robot's log of laser scans and odometry, find the distinctive places that it passed, and
+    write a trace with views, stars, displacements and actions. Corrected poses in the log become
+    the truth, which only the command 'evaluate' uses.
+    """
     check_output(options.output, "the trace")
     log, done = (_live if options.log == "-" else _whole)(options, lambda note: warn([note]))
     said = (
@@ -150,7 +158,7 @@ def run(options: argparse.Namespace) -> int:
         f"{counted(len(done.visits), 'visits')} to distinctive places; "
         f"{counted(len(done.trace), 'steps')}"
     )
-    write(done.trace, options.output, said)
+    write_trace(done.trace, options.output, said)
     return 0
 
 
@@ -239,3 +247,202 @@ def named_after(path: str) -> str:
         if ending.lower() in endings and stem.strip("."):
             name = stem
     return name if name.strip(".") else "log"
+
+
+# RUN is written last: it marks a run as finished.
+FILES = (TRACE, MAPS, "page.html", "report.html", RUN)
+LONGEST = 255  # the most bytes of the name of a folder
+DIGITS = 8  # of a log's digest, appended to its name if another log has the same name
+
+
+def write_run(folder: Path, files: Sequence[tuple[str, bytes]]) -> None:
+    """Write the files of a run into its folder, and make the folder if it is missing.
+
+    run.json is removed first and written last, so it never lies beside files of another run.
+    Raises an OSError that names the file.
+    """
+    if not files:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    given = dict(files)
+    for name in (RUN, *(name for name in FILES if name not in given)):
+        (folder / name).unlink(missing_ok=True)
+    for name in sorted(given, key=lambda name: name == RUN):
+        try:
+            write_file(folder / name, given[name])
+        except OSError as error:
+            error.filename = str(folder / name)  # the error may name the draft, or no file
+            raise
+
+
+def written_elsewhere(files: Sequence[tuple[str, bytes]]) -> str:
+    """Write the files of a run into a temporary folder, as its own has no room. Say in words where.
+
+    Returns "" if they cannot be written there, either.
+    """
+    with suppress(OSError):
+        spare = tempfile.mkdtemp(prefix="ssh-abduction-")
+        try:
+            write_run(Path(spare), files)
+        except OSError:
+            shutil.rmtree(spare, ignore_errors=True)
+        else:
+            return f"; until then the files of this run are in {named(spare)}"
+    return ""
+
+
+def check_folder(folder: Path) -> None:
+    """Raise AbductionError before long work if a folder cannot be made and written."""
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise AbductionError(
+            f"{named(folder)}: expected a folder to write, got a file: {named(there)}; "
+            "name another one"
+        )
+    if not os.access(there, os.W_OK):
+        raise AbductionError(
+            f"{named(folder)}: expected a folder that can be written, got no permission in "
+            f"{named(there)}; name another one"
+        )
+
+
+def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict[str, str]]:
+    """Choose a folder for each log, and find logs with the same content.
+
+    - A log that already has a run in `folder` keeps the folder of that run.
+    - A single new log gets `folder` itself. Each of several logs gets a folder in it, named after
+      the log.
+    - If that folder holds the run of another log, or if two logs have the same name, a part of the
+      log's digest is appended to the name.
+
+    So the order of the logs does not matter.
+
+    Returns:
+        The folder of each log. And for each log that is left out, another log with the same
+        content.
+    """
+    contents = {path: _content([path]) for path in dict.fromkeys(logs)}
+    runs = _runs_in(folder)
+    owners = {_key(place) for places in runs.values() for place in places}
+    new = {
+        (_key(folder / named_after(path)), content)
+        for path, content in contents.items()
+        if content and content not in runs
+    }
+    # A log that cannot be read, or only once, does not count: the other logs get the plain names.
+    named_so = Counter(key for key, _ in new)
+    found: dict[str, Path] = {}
+    same: dict[str, str] = {}
+    for path in sorted(contents, key=lambda path: (named_after(path), path)):
+        content, plain = contents[path], folder / named_after(path)
+        wished = folder if len(contents) == 1 else plain
+        if content in runs:
+            places = runs[content]
+            place = wished if wished in places else places[0]
+        else:
+            digits = content or hashlib.sha256(os.fsencode(os.path.abspath(path))).hexdigest()
+            choices = [
+                *([folder] if wished == folder else []),
+                *([plain] if content and named_so[_key(plain)] == 1 else []),
+                folder / f"{_cut(plain.name)}-{digits[:DIGITS]}",
+            ]
+            place = next((one for one in choices if _key(one) not in owners), folder / digits)
+            if place != wished and content:
+                is_taken = _key(wished) in owners
+                why = "has the map of another log" if is_taken else "is the name of several logs"
+                where = f"its folder is {named(place)}, as {named(wished)} {why}"
+                warn([f"{named(path)}: {where}"])
+        other = next((one for one, taken in found.items() if _key(taken) == _key(place)), None)
+        if other is None:
+            found[path] = place
+        else:
+            same[path] = other
+    return {path: found[path] for path in contents if path in found}, same
+
+
+def distinct(logs: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
+    """Return the logs without copies; and pairs of each copy and the log with the same content."""
+    first: dict[str, str] = {}  # by content; a log that cannot be read is like no other one
+    owners = [(log, first.setdefault(_content([log]) or log, log)) for log in logs]
+    copies = [pair for i, pair in enumerate(owners) if pair[0] != pair[1] or pair in owners[:i]]
+    return [*first.values()], copies
+
+
+def is_done(folder: Path, logs: Sequence[str], settings: dict[str, Any]) -> bool:
+    """Whether a folder holds a finished run of these logs with the same `MapQuestion.settings`."""
+    run = _run_in(folder)
+    content = run.get("digest")
+    is_same = run.get("settings") == json.loads(json.dumps(settings)) and content is not None
+    return is_same and not run.get("interrupted") and bool(content == _content(logs))
+
+
+def digest(logs: Sequence[str]) -> str | None:
+    """Compute the SHA-256 digest of the unpacked content of logs, as hexadecimal text.
+
+    For a folder, it is the digest of the names and contents of its files. For several logs, it
+    is the digest of the digests and the names of the drives. The result is None for a pipe, which
+    can be read only once. Raises LogError.
+    """
+    if len(logs) == 1:
+        return _digest_of(logs[0])
+    digests = [_digest_of(path) for path in logs]
+    lines = [f"{named_after(path)} {found}" for path, found in zip(logs, digests, strict=True)]
+    return None if None in digests else hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def _digest_of(path: str) -> str | None:
+    """Compute the digest of one log, as `digest` does. Raises LogError."""
+    from perception.readers.lines import opened
+
+    whole = hashlib.sha256()
+    file = Path(path)
+    if file.is_dir():
+        for part in sorted(file.rglob("*")):
+            whole.update(os.fsencode(f"{part.relative_to(file)}\0"))
+            if part.is_file():
+                with part.open("rb") as content:
+                    whole.update(hashlib.file_digest(content, "sha256").digest())
+    elif file.is_file() or not file.exists():
+        with opened(path) as content:
+            for block in iter(partial(content.read, 2**20), b""):
+                whole.update(block)
+    else:
+        return None
+    return whole.hexdigest()
+
+
+def _runs_in(folder: Path) -> dict[str, list[Path]]:
+    """Find the folders of runs in and below `folder`. Return them for each digest of a log."""
+    found: dict[str, list[Path]] = {}
+    with suppress(OSError):
+        for place in (folder, *sorted(one for one in folder.iterdir() if one.is_dir())):
+            content = _run_in(place).get("digest")
+            if isinstance(content, str):
+                found.setdefault(content, []).append(place)
+    return found
+
+
+def _run_in(folder: Path) -> dict[str, Any]:
+    """Read run.json in a folder; an empty dict if it is missing or cannot be read."""
+    with suppress(OSError, ValueError, RecursionError):
+        run = json.loads((folder / RUN).read_text(encoding="utf-8"))
+        return run if isinstance(run, dict) else {}
+    return {}
+
+
+def _content(logs: Sequence[str]) -> str | None:
+    """Compute the digest of logs; None if a log cannot be read, or can be read only once."""
+    with suppress(OSError, AbductionError):
+        return digest(logs)
+    return None
+
+
+def _key(folder: Path) -> str:
+    """Make a key that is equal for folders whose names some file systems do not distinguish."""
+    return unicodedata.normalize("NFC", os.path.abspath(folder)).casefold()
+
+
+def _cut(name: str) -> str:
+    """Shorten a name, so that there is room to append a part of a digest."""
+    room, encoded = LONGEST - DIGITS - 1, os.fsencode(name)
+    return os.fsdecode(encoded[:room]) if len(encoded) > room else name

@@ -67,11 +67,6 @@ class FileQuestion(Protocol):
         """The seconds after which a process without an answer is given up; None for no limit."""
         return None
 
-    @property
-    def has_limits(self) -> bool:
-        """Whether each answer needs its own process, which can be killed at a limit."""
-        return True
-
     def load(self, path: str) -> Any:
         """Read a file here, because a worker may not be able to read it."""
 
@@ -404,8 +399,6 @@ def _on_worker(question: FileQuestion, number: int, path: str, content: Any) -> 
     def given_up() -> bool:
         return bool(task.state == "cancelled")
 
-    if not question.has_limits:
-        return question.answer(number, path, content, given_up)
-    # A task that exceeds its limits is killed together with its process. So it gets its own
+    # A task that exceeds its limits is killed together with its process. So each task gets its own
     # process, as other tasks may run in this one.
     return next(answers_of_processes(question, [(number, path, content)], 1, given_up), None)

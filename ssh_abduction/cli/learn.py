@@ -10,22 +10,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ssh_abduction.cli.import_log import check_folder
 from ssh_abduction.cli.options import (
-    add_maps,
-    add_trace,
     check_number,
     check_picture,
     draw_plot,
-    output,
-    picture_file,
-    seed,
+    maps_and_trace,
     trace_of,
-    trace_path,
-    write,
+    write_trace,
 )
 from ssh_abduction.cli.outcome import warn
-from ssh_abduction.cli.parsing import Verbs
-from ssh_abduction.cli.run_folders import check_folder
+from ssh_abduction.cli.parsing import Rows, verb
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import AbductionError, MapError, named, said_of
 from ssh_abduction.data.map_file import read_json
@@ -43,49 +38,37 @@ if TYPE_CHECKING:
 IMAGES = "images.npz"  # the common sidecar file of traces that are clustered together
 
 
-def add_cluster(verbs: Verbs) -> None:
-    parser = verbs.add(
-        "cluster",
-        run_cluster,
-        "cluster images into views",
-        "Cluster the images of a trace into views, and write the trace with its views. With "
-        "--together, cluster the images of several traces as one table, so that a view means the "
-        "same in all of them. The number "
-        "of views k is chosen by M, the smallest distance between clusters divided by the largest "
-        "distance within a cluster: the largest M wins. If another number of views is about as "
-        "good, the trace also keeps those views, and a warning says whether they give another map.",
-    )
-    parser.add(
-        "traces", "trace file with images, or - for standard input", nargs="+", metavar="trace"
-    )
-    parser.add("--together", "the traces are drives through one building: give them common views")
-    parser.add(
-        "-o --output FILE",
-        "trace file to write, or - for standard output; with --together, the folder to write, "
-        "where each trace keeps its file name",
-        type=output,
-        required=True,
-    )
-    said = "number of views (default: the number that the measure M of the paper rates best)"
-    parser.add("--k K", said, type=int)
-    parser.add_setting("k_max K", "largest number of views to try (default: 20)", type=int)
-    parser.add_setting(
-        "by",
-        "choose k by M, or by trimmed M (default: M). Trimmed M uses medians instead of the "
-        "smallest and largest distances, so that no single image decides",
-        "M",
-        choices=("M", "trimmed"),
-    )
-    parser.add("--seed", "random seed of k-means (default: 0)", type=seed, default=0)
-    parser.add(
-        "--plot PNG",
-        "draw the measure M against the number of views, into this file. If the truth is known, "
-        "also draw U, which says how well the views agree with the true dstates",
-        type=picture_file,
-    )
-
-
+@verb(
+    {
+        "traces trace...": ("trace file with images, or - for standard input", {"type": str}),
+        "--together": "the traces are drives through one building: give them common views",
+        "-o --output FILE!": (
+            "trace file to write, or - for standard output; with --together, the folder to write, "
+            "where each trace keeps its file name"
+        ),
+        "--k K": "number of views (default: the number that the measure M of the paper rates best)",
+        "--set k_max K": "largest number of views to try (default: 20)",
+        "--set by {M,trimmed}=M": (
+            "choose k by M, or by trimmed M, which uses medians instead of the smallest and "
+            "largest distances, so that no single image decides"
+        ),
+        "--seed SEED=0": "random seed of k-means",
+        "--plot PNG": (
+            "draw the measure M against the number of views, into this file. If the truth is "
+            "known, also draw U, which says how well the views agree with the true dstates"
+        ),
+    }
+)
 def run_cluster(options: argparse.Namespace) -> int:
+    """Cluster images into views.
+
+    Cluster the images of a trace into views, and write the trace with its views. With --together,
+    cluster the images of several traces as one table, so that a view means the same in all of them.
+
+    The number of views k is chosen by M, the smallest distance between clusters divided by the
+    largest distance within a cluster: the largest M wins. If another number of views is about as
+    good, the trace also keeps those views, and a warning says whether they give another map.
+    """
     from perception.quality import uncertainty_coefficient, warn_of_doubts
     from perception.views import ViewClusterer
     from ssh_abduction.learning.traces import Traces
@@ -166,7 +149,9 @@ def _write(traces: Traces, files: dict[str, str], options: argparse.Namespace, s
     """
     if not options.together:
         (trace,) = traces.each
-        write(with_images_named_from(trace, Path(options.output).parent), options.output, said)
+        write_trace(
+            with_images_named_from(trace, Path(options.output).parent), options.output, said
+        )
         return
     from perception.images import save_images
 
@@ -206,61 +191,6 @@ def true_dstate_names(traces: Sequence[Trace]) -> list[str] | None:
     return [str(name) for name in found] if all(name is not None for name in found) else None
 
 
-def add_train(verbs: Verbs) -> None:
-    train = verbs.add(
-        "train",
-        run_train,
-        "train a recogniser on the labels of a map",
-        "Train a nearest-neighbour recogniser on the images of a trace. The label of an image is "
-        "its dstate in a map.",
-    )
-    said = "file for the trained recogniser"
-    train.add("-o --output FILE.skops", said, type=output, required=True)
-    curve = verbs.add(
-        "learning-curve",
-        run_learning_curve,
-        "measure a recogniser with few and with many images",
-        "Compute the share of images that are recognised, for growing numbers of training images, "
-        "by cross-validation. The label of an image is its dstate in a map.",
-    )
-    said = "number of folds of the cross-validation (default: 10)"
-    curve.add_setting("folds N", said, 10, type=int)
-    said = "random seed of the division into training and test images (default: 0)"
-    curve.add("--seed", said, type=seed, default=0)
-    curve.add("--plot PNG", "draw the learning curve into this file", type=picture_file)
-    curve.add("--json", "print the learning curve as JSON")
-    apart = verbs.add(
-        "tell-apart",
-        run_tell_apart,
-        "find the laser beams that distinguish dstates with the same view",
-        "Find the laser beams that distinguish two dstates that look alike, by default for each "
-        "pair of dstates with the same view.",
-    )
-    said = "two dstates of the map (default: each pair that shares a view)"
-    apart.add("--dstates I,J", said, type=pair)
-    apart.add("--plot PNG", "draw the beams over the scans, into this file", type=picture_file)
-    apart.add("--json", "print how much each beam helps, by each method, as JSON")
-    for parser in (train, curve, apart):
-        add_maps(parser)
-        add_trace(parser, " with images")
-        parser.add(
-            "--map I",
-            "the number of the map that gives the labels, from 1 (default: use only labels on "
-            "which all maps agree)",
-            type=int,
-        )
-    recognise = verbs.add(
-        "recognise",
-        run_recognise,
-        "recognise dstates from images",
-        "Find the dstate at which each image of a trace was taken, or nowhere if the image looks "
-        "like no dstate that the recogniser knows.",
-    )
-    recognise.add("recogniser", "file that train wrote")
-    recognise.add("trace", "trace file with images", type=trace_path)
-    recognise.add("--json", "print the dstates as a JSON list, null for nowhere")
-
-
 def pair(text: str) -> tuple[int, int]:
     """Convert text such as "0,4" to two numbers. Raise ArgumentTypeError for anything else."""
     first, comma, second = text.partition(",")
@@ -269,6 +199,16 @@ def pair(text: str) -> tuple[int, int]:
             f"expected two dstates with a comma between them, such as 0,4, got {text!r}; write two"
         )
     return int(first), int(second)
+
+
+# A map and a trace whose images get the dstates of the map as labels.
+LABELLED: Rows = {
+    **maps_and_trace(" with images"),
+    "--map N": (
+        "the number of the map that gives the labels, from 1 (default: use only labels on which "
+        "all maps agree)"
+    ),
+}
 
 
 def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
@@ -295,8 +235,13 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
     return images_of(trace)[sure], labels[sure], chosen, features_of(trace)
 
 
+@verb({**LABELLED, "-o --output FILE.skops!": "file for the trained recogniser"})
 def run_train(options: argparse.Namespace) -> int:
-    """Run the verb `train`: train a recogniser, and write it to a file."""
+    """Train a recogniser on the labels of a map.
+
+    Train a nearest-neighbour recogniser on the images of a trace. The label of an image is its
+    dstate in a map.
+    """
     from perception.recognition import recogniser
     from perception.store import save
 
@@ -309,8 +254,21 @@ def run_train(options: argparse.Namespace) -> int:
     return 0
 
 
+@verb(
+    {
+        **LABELLED,
+        "--set folds N=10": "number of folds of the cross-validation",
+        "--seed SEED=0": "random seed of the division into training and test images",
+        "--plot PNG": "draw the learning curve into this file",
+        "--json": "print the learning curve as JSON",
+    }
+)
 def run_learning_curve(options: argparse.Namespace) -> int:
-    """Run the verb `learning-curve`: print recognition rates by the number of training images."""
+    """Measure a recogniser with few and with many images.
+
+    Compute the share of images that are recognised, for growing numbers of training images, by
+    cross-validation. The label of an image is its dstate in a map.
+    """
     from perception.recognition import learning_curve, recogniser
 
     check_picture(options.plot)
@@ -330,8 +288,19 @@ def run_learning_curve(options: argparse.Namespace) -> int:
     return 0
 
 
+@verb(
+    {
+        "recogniser": "file that train wrote",
+        "trace": "trace file with images",
+        "--json": "print the dstates as a JSON list, null for nowhere",
+    }
+)
 def run_recognise(options: argparse.Namespace) -> int:
-    """Run the verb `recognise`: print the dstate of each image of a trace."""
+    """Recognise dstates from images.
+
+    Find the dstate at which each image of a trace was taken, or nowhere if the image looks like no
+    dstate that the recogniser knows.
+    """
     from perception.errors import PerceptionError
     from perception.images import images_of
     from perception.store import load
@@ -350,8 +319,22 @@ def run_recognise(options: argparse.Namespace) -> int:
     return 0
 
 
+@verb(
+    {
+        **LABELLED,
+        "--dstates I,J": (
+            "two dstates of the map (default: each pair that shares a view)",
+            {"type": pair},
+        ),
+        "--plot PNG": "draw the beams over the scans, into this file",
+        "--json": "print how much each beam helps, by each method, as JSON",
+    }
+)
 def run_tell_apart(options: argparse.Namespace) -> int:
-    """Run the verb `tell-apart`: print the laser beams that distinguish pairs of dstates."""
+    """Find the laser beams that distinguish dstates with the same view.
+
+    Compare two dstates that look alike, by default each pair of dstates with the same view.
+    """
     from perception.appearance import ReciprocalTransformer
     from perception.recognition import strongest, telling_features
 

@@ -18,30 +18,32 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from ssh_abduction.cli.correct import say_obeyed
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.import_log import WIDTH, add_reading, named_after, reading_of
-from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, answers_of, final_code, in_a_line
-from ssh_abduction.cli.obeyed_corrections import say_obeyed
-from ssh_abduction.cli.options import (
-    add_jobs,
-    add_max_maps,
-    add_theory,
-    check_jobs,
-    choices_of,
-    output,
-    theory_of,
-)
-from ssh_abduction.cli.outcome import EXIT_ERROR, StopFlag, exit_code, on_ctrl_c, unwritten, warn
-from ssh_abduction.cli.parsing import Verbs
-from ssh_abduction.cli.run_folders import (
+from ssh_abduction.cli.import_log import (
+    READING,
+    WIDTH,
     check_folder,
     digest,
     distinct,
     folders_of,
     is_done,
+    named_after,
+    reading_of,
     write_run,
     written_elsewhere,
 )
+from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, answers_of, final_code, in_a_line
+from ssh_abduction.cli.options import (
+    check_jobs,
+    choices_of,
+    many,
+    max_maps,
+    theory_of,
+    theory_rows,
+)
+from ssh_abduction.cli.outcome import EXIT_ERROR, StopFlag, exit_code, on_ctrl_c, unwritten, warn
+from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.corrections import (
     ASSERTIONS,
@@ -60,50 +62,6 @@ from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from ssh_abduction.robot_logs.log_maps import LogMap, LogMapping
-
-
-def add_parser(verbs: Verbs) -> None:
-    parser = verbs.add(
-        "map",
-        run,
-        "map a building from a robot's log",
-        "Find the minimal maps of a building from a robot's log. Writes trace.jsonl, maps.json, "
-        "page.html, report.html and run.json into a folder. With several logs, each gets its own "
-        "folder, and its result is one line. Logs that are already mapped with the same settings "
-        "are skipped. With --together, the logs are drives through one building, and get one map.",
-    )
-    parser.add(
-        "logs",
-        "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
-        "compressed by gzip, bzip2, xz or zstd",
-        nargs="+",
-        metavar="log",
-    )
-    parser.add("--together", "the logs are drives through one building: find their joint maps")
-    said = "folder to write; each of several logs gets a folder inside it"
-    parser.add("-o --output FOLDER", said, type=output, required=True)
-    add_max_maps(parser, "minimal maps", 300)
-    parser.add(
-        "--work-limit W",
-        "units of work for the search, each about a second of a quiet core; the same map on each "
-        "machine (default: the time limit or, without one, a unit for 20 seconds that the robot "
-        "drove, less a quarter for the ladder, and at least 30; a search that has no map then goes "
-        "on for up to 64 times as long)",
-        type=float,
-    )
-    parser.add("--time-limit S", "end the search after S seconds in any case", type=float)
-    said = (
-        "whether to compute how much each kind of evidence helps; this takes up to a quarter of "
-        "the work limit after the search, or a few units if that is more (default: true)"
-    )
-    parser.add_setting("ladder", said, default=True)
-    parser.add_setting(
-        "again", "whether to map also logs that are already mapped (default: false)", default=False
-    )
-    add_jobs(parser, "map", "logs")
-    add_reading(parser)
-    left_out = "the axioms of stars, sides and paths, as logs do not show these reliably"
-    add_theory(parser, default=f"topological, but without {left_out}")
 
 
 GIVEN_UP = "expected time to map this log, got an interruption; map it again"
@@ -343,7 +301,43 @@ class MapQuestion(FileQuestion):
         )
 
 
-def run(options: argparse.Namespace) -> int:
+@verb(
+    {
+        "logs log...": (
+            "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
+            "compressed by gzip, bzip2, xz or zstd"
+        ),
+        "--together": "the logs are drives through one building: find their joint maps",
+        "-o --output FOLDER!": "folder to write; each of several logs gets a folder inside it",
+        **max_maps("minimal maps", 300),
+        "--work-limit W": (
+            "units of work for the search, each about a second of a quiet core; the same map on "
+            "each machine (default: the time limit or, without one, a unit for 20 seconds that the "
+            "robot drove, less a quarter for the ladder, and at least 30; a search that has no map "
+            "then goes on for up to 64 times as long)"
+        ),
+        "--time-limit S": "end the search after S seconds in any case",
+        "--set ladder true|false=true": (
+            "whether to compute how much each kind of evidence helps; this takes up to a quarter "
+            "of the work limit after the search, or a few units if that is more"
+        ),
+        "--set again true|false=false": "whether to map also logs that are already mapped",
+        **many("map", "logs"),
+        **READING,
+        **theory_rows(
+            "topological, but without the axioms of stars, sides and paths, as logs do not show "
+            "these reliably"
+        ),
+    }
+)
+def run_map(options: argparse.Namespace) -> int:
+    """Map a building from a robot's log.
+
+    Find the minimal maps of a building. Writes trace.jsonl, maps.json, page.html, report.html and
+    run.json into a folder. With several logs, each gets its own folder, and its result is one line.
+    Logs that are already mapped with the same settings are skipped. With --together, the logs are
+    drives through one building, and get one map.
+    """
     check_jobs(options.jobs, "logs to map at a time")
     if "-" in options.logs:
         raise AbductionError(

@@ -7,14 +7,14 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ssh_abduction.cli.parsing import Parser, true_or_false
+from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, maps_path
 from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS, load_corrections
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
@@ -29,67 +29,50 @@ from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
 
 Step = TypeVar("Step")  # a step by its number or its name
 
-RULES = (
-    "a file of your own rules for clingo, written with the predicates of the encodings; may be "
-    "given again"
-)
-
 # The arguments that name files to read, and the options that name files to write.
 READ = ("trace", "traces", "log", "logs", "maps", "other", "world")
 WRITTEN = ("output", "joint_trace")
-
-# The names of the files in a folder that map wrote.
-MAPS, TRACE, RUN = "maps.json", "trace.jsonl", "run.json"
 
 MAPS_SAID = (
     "file of maps that solve -o wrote, a file of a single map, or a folder that the command "
     "'map' wrote; - for standard input"
 )
+TRACE_SAID = "trace file (JSON Lines), or - for standard input"
+JSON: Rows = {"--json": "print the answer as JSON"}
+# One of the maps in a file.
+ONE_MAP: Rows = {"--map I=1": "the number of the map, from 1, or its id"}
+OUTPUT_TRACE: Rows = {"-o --output TRACE!": "trace file to write, or - for standard output"}
 
 
-def add_theory(parser: Parser, default: str = "topological") -> None:
-    """Add the options that choose a theory: a preset or a file, and options for single fields.
+def theory_rows(default: str = "topological") -> Rows:
+    """Make the rows that choose a theory: a preset or a file, and options for single fields.
 
     `default` says in the help which theory is used if the user names none.
     """
-    group = parser.add_argument_group(
-        "theory",
-        "The axioms that maps must satisfy: a preset or a file, and changes to it. I and J are "
-        "numbers of steps, from 0; in a joint trace, also DRIVE:STEP, such as monday:12. Each "
-        "option but --theory may be given again.",
-    )
-    said = {**helps(), "rules": RULES}
-    parser.add(
-        "--theory PRESET|FILE",
-        f"a preset: {', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file "
-        f"of maps or a folder that the command 'map' wrote, to use the theory of its maps "
-        f"(default: {default})",
-        to=group,
-    )
+    rows: dict[str, str | tuple[str, Mapping[str, Any]]] = {
+        "# theory": (
+            "The axioms that maps must satisfy: a preset or a file, and changes to it. I and J are "
+            "numbers of steps, from 0; in a joint trace, also DRIVE:STEP, such as monday:12. Each "
+            "option but --theory may be given again."
+        ),
+        "--theory PRESET|FILE": (
+            f"a preset: {', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file "
+            f"of maps or a folder that the command 'map' wrote, to use the theory of its maps "
+            f"(default: {default})"
+        ),
+    }
     for name, text in ASSERTED.items():
-        parser.add(
-            f"--{name.replace('_', '-')} I,J",
-            f"assume that steps I and J {text}",
-            to=group,
-            action="append",
-        )
+        said = f"assume that steps I and J {text}"
+        rows[f"--{name.replace('_', '-')} I,J"] = said, {"action": "append"}
+    values = {"rules": "FILE...", "prices": "DSTATE,PLACE,PATH"}
+    by_type = {bool: "true|false", int: "N", float: "NUMBER"}
     for field in fields(Theory):
-        if field.name in ASSERTIONS or field.name in SETTLED:
-            continue
-        details: dict[str, Any] = {"metavar": "NAMES"}
-        if field.name == "prices":
-            details = {"metavar": "DSTATE,PLACE,PATH"}
-        elif field.name == "rules":
-            details = {"metavar": "FILE", "many": True}
-        elif field.name in CHOICES:
-            details = {"choices": CHOICES[field.name]}
-        elif isinstance(field.default, bool):
-            details = {"type": true_or_false, "metavar": "true|false"}
-        elif isinstance(field.default, int):
-            details = {"type": int, "metavar": "N"}
-        elif isinstance(field.default, float):
-            details = {"type": float, "metavar": "NUMBER"}
-        parser.add_setting(field.name, said.get(field.name, field.name), **details)
+        if field.name not in (*ASSERTIONS, *SETTLED):
+            value = values.get(field.name) or by_type.get(type(field.default), "NAMES")
+            if field.name in CHOICES:
+                value = f"{{{','.join(CHOICES[field.name])}}}"
+            rows[f"--set {field.name} {value}"] = helps().get(field.name, field.name)
+    return rows
 
 
 def helps() -> dict[str, str]:
@@ -101,53 +84,67 @@ def helps() -> dict[str, str]:
     _, _, attributes = inspect.cleandoc(Theory.__doc__ or "").partition("Attributes:")
     entries = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", attributes, re.MULTILINE)
     words = {name: " ".join(text.split()).rstrip(".") for name, text in entries}
-    return {name: text[0].lower() + text[1:] for name, text in words.items()}
+    rules = (
+        "a file of your own rules for clingo, written with the predicates of the encodings; may be "
+        "given again"
+    )
+    return {**{name: text[0].lower() + text[1:] for name, text in words.items()}, "rules": rules}
 
 
-def add_limits(
-    parser: Parser, printed: str, seconds: float | None = None, work: bool = False
-) -> None:
-    """Add the options that limit a search. The command prints `printed` at a limit.
+def limits(printed: str, seconds: float | None = None, work: bool = False) -> Rows:
+    """Make the rows that limit a search. The command prints `printed` at a limit.
 
     `seconds` is the default time limit; None for no limit. `work` says whether work can be limited.
     """
     default = "" if seconds is None else f" (default: {seconds:g}; inf for no limit)"
-    said = f"stop after S seconds and print {printed}{default}"
-    parser.add("--time-limit S", said, type=float, default=seconds)
-    if work:
-        said = (
-            "stop after W units of work, each about a second of a quiet core; the same answer on "
-            "each machine and under each load"
-        )
-        parser.add("--work-limit W", said, type=float)
-    said = f"stop when the process has used this many MiB, and print {printed}"
-    parser.add("--memory-limit MIB", said, type=int)
-
-
-def add_max_maps(parser: Parser, listed: str, default: int = 100) -> None:
-    """Add the option that limits how many maps are listed. The help calls them `listed`."""
-    said = f"list at most K {listed}; 0 for all (default: {default})"
-    parser.add("-n --maps K", said, type=int, default=default)
-
-
-def add_jobs(parser: Parser, act: str, things: str, said: str | None = None) -> None:
-    """Add the options that spread work on processes or a cluster, such as "solve" of "traces"."""
-    many = parser.add_argument_group(f"many {things}", said)
-    parser.add(
-        "--jobs N",
-        f"{act} N {things} at a time, each in its own process; -1 for one per core (default: 1; "
-        "with --scheduler, two per core of its workers)",
-        to=many,
-        type=int,
+    said = (
+        "stop after W units of work, each about a second of a quiet core; the same answer on "
+        "each machine and under each load"
     )
-    said = f"{act} on the workers of the Dask scheduler at this address, tcp://host:port"
-    parser.add("--scheduler ADDRESS", said, to=many)
+    return {
+        "--time-limit S": (
+            f"stop after S seconds and print {printed}{default}",
+            {"default": seconds},
+        ),
+        **({"--work-limit W": said} if work else {}),
+        "--memory-limit MIB": f"stop when the process has used this many MiB, and print {printed}",
+    }
 
 
-def add_output(parser: Parser) -> None:
-    """Add the option -o TRACE, which names the trace file to write."""
-    said = "trace file to write, or - for standard output"
-    parser.add("-o --output TRACE", said, type=output, required=True)
+def max_maps(listed: str, default: int = 100) -> Rows:
+    """Make the row that limits how many maps are listed. The help calls them `listed`."""
+    return {f"-n --maps K={default}": f"list at most K {listed}; 0 for all"}
+
+
+def many(act: str, things: str, said: str = "") -> Rows:
+    """Make the rows that spread work on processes or a cluster, such as "solve" of "traces"."""
+    return {
+        f"# many {things}": said,
+        "--jobs N": (
+            f"{act} N {things} at a time, each in its own process; -1 for one per core (default: "
+            "1; with --scheduler, two per core of its workers)"
+        ),
+        "--scheduler ADDRESS": (
+            f"{act} on the workers of the Dask scheduler at this address, tcp://host:port"
+        ),
+    }
+
+
+def maps_and_trace(needs: str = "") -> Rows:
+    """Make the rows `maps` and `trace`. If the user names no trace, the one beside the maps counts.
+
+    `needs` says in the help what the trace must have, such as " with images". The copy of the trace
+    in a file of maps has no images and no truth, so such a verb calls `trace_of`. If `needs` is
+    empty, the copy suffices, and the verb calls `solved_trace`.
+    """
+    by = "map" if needs else "solve -o or map"
+    return {
+        "maps": MAPS_SAID,
+        "[trace]": (
+            f"trace file (JSON Lines){needs}, or - for standard input (default: the trace that "
+            f"{by} wrote with the maps)"
+        ),
+    }
 
 
 def check_output(target: str, what: str) -> None:
@@ -184,7 +181,7 @@ def check_inputs_are_kept(options: argparse.Namespace) -> None:
                 )
 
 
-def write(trace: Trace, target: str, said: str) -> None:
+def write_trace(trace: Trace, target: str, said: str) -> None:
     """Write a trace to a file, and print a message.
 
     If the file is "-", the trace goes to standard output, and the message to stderr.
@@ -197,40 +194,8 @@ def write(trace: Trace, target: str, said: str) -> None:
         print(f"{said} in {named(target)}")
 
 
-def add_maps(parser: Parser) -> None:
-    """Add the argument `maps`: a file of maps, or a folder with one."""
-    parser.add("maps", MAPS_SAID, type=maps_path)
-
-
-def add_trace(parser: Parser, needs: str = "") -> None:
-    """Add the argument `trace`. If the user leaves it out, the trace beside the maps is taken.
-
-    `needs` says in the help what the trace must have, such as " with images". The copy of the trace
-    in a file of maps has no images and no truth, so such a verb calls `trace_of`. If `needs` is
-    empty, the copy suffices, and the verb calls `solved_trace`.
-    """
-    by = "map" if needs else "solve -o or map"
-    parser.add(
-        "trace",
-        f"trace file (JSON Lines){needs}, or - for standard input (default: the trace that "
-        f"{by} wrote with the maps)",
-        nargs="?",
-        type=trace_path,
-    )
-
-
-def maps_path(text: str) -> str:
-    """Return the file of maps that an argument names. If it names a folder, add maps.json."""
-    return str(Path(text) / MAPS) if Path(text).is_dir() else text
-
-
-def trace_path(text: str) -> str:
-    """Return the trace file that an argument names. If it names a folder, add trace.jsonl."""
-    return str(Path(text) / TRACE) if Path(text).is_dir() else text
-
-
 def trace_of(options: argparse.Namespace) -> str:
-    """Return the trace file of a verb with `add_maps` and `add_trace`.
+    """Return the trace file of a verb with `maps_and_trace`.
 
     Raises AbductionError if there is no trace, or the file of maps cannot be read.
     """
@@ -276,34 +241,6 @@ def trace_beside(maps: str) -> str | None:
     folder = Path(maps).parent
     is_written = Path(maps).name == MAPS and (folder / RUN).is_file() and (folder / TRACE).is_file()
     return str(folder / TRACE) if is_written else None
-
-
-def output(text: str) -> str:
-    """Return the name of a file or folder to write. Raise ArgumentTypeError if it is none."""
-    if not text or "\0" in text:
-        raise argparse.ArgumentTypeError(
-            f"expected the name of a file or folder, got {text!r}; name one"
-        )
-    return text
-
-
-def seed(text: str) -> int:
-    """Convert text to a seed of random numbers. Raise ArgumentTypeError for anything else."""
-    if not text.isdecimal() or int(text) >= 2**32:
-        raise argparse.ArgumentTypeError(
-            f"expected a whole number from 0 to {2**32 - 1}, got {text!r}; give one"
-        )
-    return int(text)
-
-
-def picture_file(text: str) -> str:
-    """Return the name of a file for a figure. Raise ArgumentTypeError for a wrong ending."""
-    if Path(text).suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise argparse.ArgumentTypeError(
-            f"expected a name that ends in .png, .pdf or .svg, got {text!r}"
-            "; add one of these endings"
-        )
-    return text
 
 
 def check_picture(file: str | None) -> None:
@@ -477,8 +414,3 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
             text = text.lower() if isinstance(value, bool) else text
             flags += ["--set", f"{field.name}={text}"]
     return flags
-
-
-def add_map(parser: Parser) -> None:
-    """Add the option that chooses one of the maps in a file."""
-    parser.add("--map I", "the number of the map, from 1, or its id (default: 1)", default="1")

@@ -1,8 +1,13 @@
-"""Turn the result of a search into JSON, an exit code, warnings, and why there is no map."""
+"""Turn the result of a search into JSON, an exit code, warnings, and why there is no map.
+
+Add the options -q and -v, and print lines of progress on stderr.
+"""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import logging
 import math
 import os
 import signal
@@ -15,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeAlias
 
-from ssh_abduction.data.errors import MapError, named
+from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.files import mend_of
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
@@ -24,9 +29,9 @@ from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.learning.runner_up import second_map
 from ssh_abduction.runtime import program
 from ssh_abduction.runtime.clock import counting
-from ssh_abduction.solver import Backbone, Cost, Search, Solution, Status, Watch
+from ssh_abduction.runtime.loggers import PACKAGE, PROGRESS
+from ssh_abduction.solver import Cost, Search, Solution, Status, Watch
 from ssh_abduction.solver import ending as written_ending
-from ssh_abduction.solver import opening as written_opening
 
 # After Ctrl-C, only traces of at most this many steps get warnings. 40,000 steps would take 2 s.
 SOON = 10_000
@@ -70,30 +75,19 @@ def why_no_map(search: Search) -> Explanation | None:
         return Explanation(clash.start, clash.stop - 1, ()) if clash else None
 
 
-def answer_opening(found: Search | Solution) -> dict[str, Any]:
-    """Make the fields of a solution's JSON that come before its maps."""
-    if isinstance(found, Search):
-        return written_opening(found.theory, len(found.trace), found.limits.within)
-    return written_opening(found.theory, found.steps, found.within)
-
-
 def all_given(solution: Solution) -> list[Given]:
     """Pair each map of a solution with its cost; with None if `within` is 0."""
     return list(zip_longest(solution.maps, solution.costs if solution.within else ()))
 
 
 def answer_ending(
-    solution: Solution,
-    explanation: Explanation | None,
-    maps: int,
-    backbone: Backbone | None,
-    found: Sequence[str],
+    solution: Solution, explanation: Explanation | None, maps: int, found: Sequence[str]
 ) -> dict[str, Any]:
     """Make the fields of a solution's JSON that come after its maps.
 
     `maps` is the number of maps that were written. `found` are all warnings.
     """
-    end = written_ending(solution, maps, backbone)
+    end = written_ending(solution, maps, solution.shared)
     end.pop("warnings", None)
     if found:
         end["warnings"] = found
@@ -217,3 +211,107 @@ def on_ctrl_c(action: Callable[[], None]) -> Iterator[None]:
         signal.set_wakeup_fd(descriptor, warn_on_full_buffer=False)
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+# Seconds before the first line of progress, and between lines. Most commands end earlier.
+EVERY = 10.0
+LEVELS = {1: logging.INFO, 2: logging.DEBUG}
+
+
+def add_verbosity(parser: argparse.ArgumentParser) -> None:
+    """Add -q and -v to a parser, so that they may come before or behind the verb."""
+    group = parser.add_argument_group("messages").add_mutually_exclusive_group()
+    none = argparse.SUPPRESS  # a default of the verb would overwrite a flag before the verb
+    said = "print only errors on stderr, no warnings and no progress"
+    group.add_argument("-q", "--quiet", action="store_true", default=none, help=said)
+    said = "log on stderr what is tried, found and proven; -vv: also what clingo is given"
+    group.add_argument("-v", "--verbose", action="count", default=none, help=said)
+
+
+@contextlib.contextmanager
+def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
+    """While the block runs, log on stderr as much as the options ask for.
+
+    If other programs read the output, and stdout and stderr are one file, no progress is shown.
+    """
+    verbose = getattr(options, "verbose", 0)
+    if getattr(options, "quiet", False):
+        nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - closed below
+        with nowhere, contextlib.redirect_stderr(nowhere):
+            yield
+    elif verbose:
+        with _handled(logging.getLogger(PACKAGE), _StderrHandler(), LEVELS[min(verbose, 2)]):
+            yield
+    elif sys.stderr.isatty() or (for_programs and _is_one_file()):
+        yield
+    else:
+        with _handled(PROGRESS, _NowAndThen(), logging.DEBUG):
+            yield
+
+
+def progress_bar() -> Any:
+    """Make a progress bar on stderr with rich. It shows nothing if stderr is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        redirect_stdout=False,
+        disable=not sys.stderr.isatty(),
+    )
+
+
+@contextlib.contextmanager
+def _handled(log: logging.Logger, handler: logging.Handler, level: int) -> Iterator[None]:
+    """While the block runs, pass the records of a log to a handler, from this level upwards."""
+    before = log.level
+    log.addHandler(handler)
+    log.setLevel(level)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
+        log.removeHandler(handler)
+
+
+def _is_one_file() -> bool:
+    """Whether stdout and stderr are the same file, so that progress would mix with the output."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        return os.path.samestat(os.fstat(sys.stdout.fileno()), os.fstat(sys.stderr.fileno()))
+    return False
+
+
+class _StderrHandler(logging.Handler):
+    """A log handler that prints each record with its module and the seconds since the start."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._began = time.monotonic()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        seconds, source = time.monotonic() - self._began, record.name.removeprefix(f"{PACKAGE}.")
+        _say(f"{seconds:.2f} s: {source}: {record.getMessage()}")
+
+
+class _NowAndThen(logging.Handler):
+    """A log handler that prints a record if it has printed none for EVERY seconds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._last = time.monotonic()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        now = time.monotonic()
+        if now - self._last >= EVERY:
+            self._last = now
+            _say(record.getMessage())
+
+
+def _say(text: str) -> None:
+    # If the reader of stderr quits, the command goes on.
+    with contextlib.suppress(OSError, ValueError):
+        print(f"ssh-abduction: {printable(text)}", file=sys.stderr, flush=True)

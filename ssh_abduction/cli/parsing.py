@@ -1,16 +1,118 @@
-"""Parse the command line, with groups of verbs, settings, and hints for misspelt names."""
+"""Parse the command line, with groups of verbs, settings, and hints for misspelt names.
+
+Each verb is a function with a table of rows, one for each argument and option. Its docstring is the
+help text.
+"""
 
 from __future__ import annotations
 
 import argparse
+import inspect
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from pathlib import Path
+from typing import Any, NoReturn, TypeAlias
 
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.words import meant
 
+# The help text of each argument, by its form, such as "-n --maps K=100" (see `Parser.add_rows`).
+# A tuple adds further arguments of argparse's `add_argument`, or fields of Setting, by name.
+Rows: TypeAlias = Mapping[str, str | tuple[str, Mapping[str, Any]]]
+
 NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
+
+# The names of the files in a folder that map wrote.
+MAPS, TRACE, RUN = "maps.json", "trace.jsonl", "run.json"
+
+
+def true_or_false(text: str) -> bool:
+    """Convert "true" or "false" to a bool. Raise ArgumentTypeError for anything else."""
+    if text not in ("true", "false"):
+        raise argparse.ArgumentTypeError(f"expected true or false, got {text!r}; write one of them")
+    return text == "true"
+
+
+def output(text: str) -> str:
+    """Return the name of a file or folder to write. Raise ArgumentTypeError if it is none."""
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(
+            f"expected the name of a file or folder, got {text!r}; name one"
+        )
+    return text
+
+
+def seed(text: str) -> int:
+    """Convert text to a seed of random numbers. Raise ArgumentTypeError for anything else."""
+    if not text.isdecimal() or int(text) >= 2**32:
+        raise argparse.ArgumentTypeError(
+            f"expected a whole number from 0 to {2**32 - 1}, got {text!r}; give one"
+        )
+    return int(text)
+
+
+def picture_file(text: str) -> str:
+    """Return the name of a file for a figure. Raise ArgumentTypeError for a wrong ending."""
+    if Path(text).suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise argparse.ArgumentTypeError(
+            f"expected a name that ends in .png, .pdf or .svg, got {text!r}"
+            "; add one of these endings"
+        )
+    return text
+
+
+def maps_path(text: str) -> str:
+    """Return the file of maps that an argument names. If it names a folder, add maps.json."""
+    return str(Path(text) / MAPS) if Path(text).is_dir() else text
+
+
+def trace_path(text: str) -> str:
+    """Return the trace file that an argument names. If it names a folder, add trace.jsonl."""
+    return str(Path(text) / TRACE) if Path(text).is_dir() else text
+
+
+# What converts the text of a value, by the word for the value. OUTPUT is for the option --output.
+OUTPUT = "--output"
+TYPES: Mapping[str, Callable[[str], Any]] = {
+    OUTPUT: output,
+    "true|false": true_or_false,
+    **dict.fromkeys(("N", "K", "MIB"), int),
+    **dict.fromkeys(("S", "W", "P", "METRES", "SHARE", "DEGREES", "NUMBER"), float),
+    "SEED": seed,
+    "PNG": picture_file,
+    **dict.fromkeys(("maps", "MAPS"), maps_path),
+    **dict.fromkeys(("trace", "TRACE"), trace_path),
+}
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A verb of the program: the function `run_NAME`, whose docstring is the help of the verb."""
+
+    run: Callable[[argparse.Namespace], int]  # does what the options ask for; returns the exit code
+    rows: Rows  # the arguments and options
+
+    @property
+    def name(self) -> str:
+        """The name of the verb, such as "tell-apart"."""
+        return self.run.__name__.removeprefix("run_").replace("_", "-")
+
+    @property
+    def help(self) -> str:
+        """The text at the top of the help: paragraphs, of which the first is a summary."""
+        return inspect.cleandoc(self.run.__doc__ or "")
+
+    @property
+    def summary(self) -> str:
+        """The line in the list of verbs."""
+        first = self.help.partition("\n\n")[0]
+        return (first[:1].lower() + first[1:]).removesuffix(".")
+
+
+def verb(rows: Rows) -> Callable[[Callable[[argparse.Namespace], int]], Verb]:
+    """Make a verb of the function `run_NAME`, with a table of its arguments and options."""
+    return lambda run: Verb(run, rows)
 
 
 @dataclass(frozen=True)
@@ -21,10 +123,10 @@ class Setting:
     help: str  # the help text
     # Converts the text of the value. Raises ValueError or argparse.ArgumentTypeError.
     type: Callable[[str], Any] = str
-    choices: tuple[str, ...] | None = None  # the texts that are allowed; None if `type` decides
+    choices: Sequence[str] | None = None  # the texts that are allowed; None if `type` decides
     metavar: str = "TEXT"  # the word for the value in the help
-    # Whether the setting may be given several times. Its value is then a list.
-    many: bool = False
+    default: str | None = None  # the text of the value if the user does not give the setting
+    nargs: str | None = None  # "+" if it may be given several times; its value is then a list
 
     @property
     def shown(self) -> str:
@@ -44,13 +146,6 @@ class Setting:
             raise argparse.ArgumentTypeError(
                 f"expected {expected}, got {text!r}; write one"
             ) from None
-
-
-def true_or_false(text: str) -> bool:
-    """Convert "true" or "false" to a bool. Raise ArgumentTypeError for anything else."""
-    if text not in ("true", "false"):
-        raise argparse.ArgumentTypeError(f"expected true or false, got {text!r}; write one of them")
-    return text == "true"
 
 
 class _Set(argparse.Action):
@@ -78,7 +173,7 @@ class _Set(argparse.Action):
             value = setting.read(text)
         except argparse.ArgumentTypeError as error:
             raise argparse.ArgumentError(self, f"{setting.name}: {error}") from None
-        if setting.many:
+        if setting.nargs:
             value = [*(getattr(namespace, setting.name) or []), value]
         setattr(namespace, setting.name, value)
 
@@ -92,52 +187,50 @@ class Parser(argparse.ArgumentParser):
         # The names of this program's verbs, by their heading in the help.
         self.groups: dict[str, tuple[str, ...]] = {}
 
-    def add(
-        self, spec: str, said: str, *, to: argparse._ArgumentGroup | None = None, **details: Any
-    ) -> None:
-        """Add an argument or an option.
+    def add_rows(self, rows: Rows) -> None:
+        """Add an argument, an option, a setting or a group for each row.
 
-        Args:
-            spec: An argument such as "trace"; an option with a value such as "-n --maps K", or
-                with choices such as "--by"; or a flag such as "--json".
-            said: The help text.
-            to: The group in which the help lists it; None for none.
-            details: Further arguments of argparse's `add_argument`, by name.
+        These are the forms of the rows:
+
+        - "maps", "[trace]": an argument, and one that may be left out. "traces trace..." is the
+          argument `traces`, which takes one or more values, each called trace in the help.
+        - "--json": a flag.
+        - "-n --maps K=100": an option with a value, called K in the help, and its default. "K!"
+          means that the option is required, and "X..." that it takes several values. "--by {a,b}"
+          lists all values that are allowed.
+        - "--set within K=0": the setting `within`, which the user gives as --set within=VALUE.
+        - "# theory": a group for the options that follow.
         """
-        names = [word for word in spec.split() if word.startswith("-")]
-        if not names:
-            names = [spec]
-        elif words := spec.split()[len(names) :]:
-            details["metavar"] = words[0]
-        elif not details:
-            details["action"] = "store_true"
-        (to or self).add_argument(*names, help=said, **details)
+        group: argparse._ActionsContainer = self
+        for form, told in rows.items():
+            said, more = (told, {}) if isinstance(told, str) else told
+            words, _, default = form.partition("=")
+            shown = f"{said} (default: {default})" if default else said
+            if form.startswith("# "):
+                group = self.add_argument_group(form[2:], said)
+            elif form.startswith("--set "):
+                (name,), details = _read_form(words[6:])
+                self._add_setting(name, shown, {"default": default or None, **details, **more})
+            else:
+                names, details = _read_form(words)
+                given = {"default": default} if default else {}
+                group.add_argument(*names, help=shown, **{**details, **given, **more})
 
-    def add_setting(self, spec: str, said: str, default: Any = None, **details: Any) -> None:
-        """Add a setting. The parsed options have its value as the attribute of the same name.
-
-        Args:
-            spec: The name, with underscores, and perhaps the word for its value: "near METRES".
-            said: The help text.
-            default: The value if the user does not give the setting.
-            details: Other fields of Setting, by name.
-        """
-        name, _, metavar = spec.partition(" ")
+    def _add_setting(self, name: str, said: str, details: Mapping[str, Any]) -> None:
         if not self.settings:
             shown = "change one of the settings that are listed below; may be given again"
-            self.add("--set NAME=VALUE", shown, action=_Set, dest=argparse.SUPPRESS)
-        if isinstance(default, bool):
-            details["type"], metavar = true_or_false, "true|false"
-        if metavar:
-            details["metavar"] = metavar
-        self.settings[name] = Setting(name, said, **details)
-        self.set_defaults(**{name: default})
+            self.add_argument(
+                "--set", help=shown, action=_Set, dest=argparse.SUPPRESS, metavar="NAME=VALUE"
+            )
+        setting = self.settings[name] = Setting(name, said, **details)
+        self.set_defaults(**{name: setting.default and setting.read(setting.default)})
 
     def format_help(self) -> str:
         """Make the help text, with verbs in groups and with the settings."""
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
-        formatter.add_text(self.description)
+        for paragraph in (self.description or "").split("\n\n"):
+            formatter.add_text(paragraph)
         for group in self._action_groups:
             actions = [
                 a
@@ -219,26 +312,30 @@ class Parser(argparse.ArgumentParser):
         super().error(printable(message))  # the message repeats what the user typed
 
 
-class Verbs(argparse._SubParsersAction):  # type: ignore[type-arg]
-    """The verbs of a program."""
-
-    def add(
-        self,
-        name: str,
-        run: Callable[[argparse.Namespace], int],
-        said: str,
-        description: str,
-        epilog: str | None = None,
-    ) -> Parser:
-        """Add a verb and return its parser.
-
-        Args:
-            name: The name of the verb.
-            run: Does what the options ask for, and returns the exit code.
-            said: The text for the list of verbs.
-            description: The text at the top of the help of this verb.
-            epilog: The text at its end.
-        """
-        parser: Parser = self.add_parser(name, help=said, description=description, epilog=epilog)
-        parser.set_defaults(run=run)
-        return parser
+def _read_form(form: str) -> tuple[list[str], dict[str, Any]]:
+    """Read the form of a row, without its default: return its names, and details for argparse."""
+    words = form.strip("[]").split()
+    count = sum(word.startswith("-") for word in words) or 1  # of names, before the values
+    names, values = words[:count], words[count:]
+    is_option, details = names[0].startswith("-"), dict[str, Any]()
+    values = values or ([] if is_option else names)
+    if not values:
+        return names, {"action": "store_true"}
+    metavars = tuple(re.sub(r"\.\.\.$|!$", "", value) for value in values)
+    if metavars[0].startswith("{"):
+        details["choices"] = metavars[0][1:-1].split(",")
+    else:
+        details["metavar"] = metavars if metavars[1:] else metavars[0]
+    if kind := TYPES.get(OUTPUT if names[-1] == OUTPUT else metavars[0]):
+        details["type"] = kind
+    if metavars[1:]:
+        details["nargs"] = len(metavars)
+    elif values[0].endswith("..."):
+        details["nargs"] = "*" if form.startswith("[") else "+"
+        if is_option:
+            details["action"] = "extend"
+    elif form.startswith("["):
+        details["nargs"] = "?"
+    if values[0].endswith("!"):
+        details["required"] = True
+    return names, details

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import simulator
-from ssh_abduction.cli.options import add_output, check_jobs, output, seed, write
-from ssh_abduction.cli.parsing import Verbs
+from ssh_abduction.cli.options import OUTPUT_TRACE, check_jobs, write_trace
+from ssh_abduction.cli.outcome import progress_bar
+from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.cli.verbosity import progress_bar
 from ssh_abduction.data.errors import AbductionError, brief, named, printable
 from ssh_abduction.data.files import save_file, shipped, write_file
 
@@ -29,99 +29,74 @@ ENDINGS = (".log", ".clf", ".bag", ".mcap")
 SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").glob("*.json"))
 
 
-def add_simulate(verbs: Verbs) -> None:
-    text = (
-        "Drive a robot through a world, and write a trace with an image, an action and the "
-        "odometry at each dstate. Run cluster on the trace to get views. With --format, write a "
-        "log of scans and odometry, as a real robot records it, and a file with the "
-        "truth beside it."
-    )
-    parser = verbs.add("simulate", run_simulate, "drive a robot through a world", text)
-    parser.add(
-        "world",
-        f"the world: {', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or "
-        "a floor plan (.xml)",
-    )
-    parser.add(
-        "--format",
-        "write a robot's log instead of a trace: a CARMEN log, or a ROS bag (.bag, .mcap, or "
-        "a folder)",
-        dest="log",
-        choices=("carmen", "bag"),
-    )
-    parser.add("--tours N", "drive the route N times (default: 1)", type=int, default=1)
-    parser.add("--seed", "random seed of all noise (default: 0)", type=seed, default=0)
-    parser.add(
-        "--route ACTIONS",
-        "drive this route instead of the world's own: actions (travel, right, left, around, or the "
-        "name of a lift) or, with --format, names of places, separated by commas",
-    )
-    add = parser.add_setting
-    add(
-        "images",
-        "log laser ranges, or panoramas of a 360-degree camera, which are written to an .npz "
-        "file beside the trace (default: ranges)",
-        "ranges",
-        choices=("ranges", "panoramas"),
-    )
-    add("stars", "whether to log the openings seen at each place (default: true)", True)
-    add(
-        "every METRES",
-        "log an image each time that the robot has driven this far, instead of an image at "
-        "each dstate; with --format, metres from one scan to the next (default: 0.25)",
-        type=float,
-    )
-    add(
-        "start X,Y,DEGREES",
-        "start here instead of at the world's own start: x and y in metres, and the heading "
-        "in degrees counterclockwise from the x axis",
-    )
-    add(
-        "reach METRES",
-        "half the width of a corridor: the distance that the robot keeps from a wall that it "
-        "follows (default: the world's own)",
-        type=float,
-    )
-    add(
-        "odometry_noise SHARE",
-        "standard deviation of the odometry, as a share of each motion (default: 0.02); with "
-        "--format, standard deviation in metres after one metre (default: 0.05); the errors "
-        "of headings grow with it",
-        type=float,
-    )
-    add(
-        "scale_error SHARE",
-        "the odometry reports distances that are too long by this share (default: 0)",
-        0.0,
-        type=float,
-    )
-    add(
-        "bend_error DEGREES",
-        "drift of the reported heading to the left, in degrees per metre (default: 0)",
-        0.0,
-        type=float,
-    )
-    add(
-        "textures",
-        "whether each wall has its own texture in panoramas, or parallel walls share one "
-        "(default: unique)",
-        choices=("unique", "repeated"),
-    )
-    add("paint_seed SEED", "random seed of the textures in panoramas (default: 0)", type=seed)
-    add(
-        "hours FROM,TO",
-        "hours of the day at which the drive begins and ends, which decide the light in "
-        "panoramas (default: 12,12)",
-    )
-    add_output(parser)
-
-
+@verb(
+    {
+        "world": (
+            f"the world: {', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or "
+            "a floor plan (.xml)"
+        ),
+        "--format {carmen,bag}": (
+            "write a robot's log instead of a trace: a CARMEN log, or a ROS bag (.bag, .mcap, or "
+            "a folder)"
+        ),
+        "--tours N=1": "drive the route N times",
+        "--seed SEED=0": "random seed of all noise",
+        "--route ACTIONS": (
+            "drive this route instead of the world's own: actions (travel, right, left, around, or "
+            "the name of a lift) or, with --format, names of places, separated by commas"
+        ),
+        "--set images {ranges,panoramas}=ranges": (
+            "log laser ranges, or panoramas of a 360-degree camera, which are written to an .npz "
+            "file beside the trace"
+        ),
+        "--set stars true|false=true": "whether to log the openings seen at each place",
+        "--set every METRES": (
+            "log an image each time that the robot has driven this far, instead of an image at "
+            "each dstate; with --format, metres from one scan to the next (default: 0.25)"
+        ),
+        "--set start X,Y,DEGREES": (
+            "start here instead of at the world's own start: x and y in metres, and the heading "
+            "in degrees counterclockwise from the x axis"
+        ),
+        "--set reach METRES": (
+            "half the width of a corridor: the distance that the robot keeps from a wall that it "
+            "follows (default: the world's own)"
+        ),
+        "--set odometry_noise SHARE": (
+            "standard deviation of the odometry, as a share of each motion (default: 0.02); with "
+            "--format, standard deviation in metres after one metre (default: 0.05); the errors "
+            "of headings grow with it"
+        ),
+        "--set scale_error SHARE=0": (
+            "the odometry reports distances that are too long by this share"
+        ),
+        "--set bend_error DEGREES=0": (
+            "drift of the reported heading to the left, in degrees per metre"
+        ),
+        "--set textures {unique,repeated}": (
+            "whether each wall has its own texture in panoramas, or parallel walls share one "
+            "(default: unique)"
+        ),
+        "--set paint_seed SEED": "random seed of the textures in panoramas (default: 0)",
+        "--set hours FROM,TO": (
+            "hours of the day at which the drive begins and ends, which decide the light in "
+            "panoramas (default: 12,12)"
+        ),
+        **OUTPUT_TRACE,
+    }
+)
 def run_simulate(options: argparse.Namespace) -> int:
+    """Drive a robot through a world.
+
+    Write a trace with an image, an action and the odometry at each dstate. Run cluster on the trace
+    to get views. With --format, write a log of scans and odometry, as a real robot records it, and
+    a file with the truth beside it.
+    """
     from simulator.robot import Body
     from simulator.tours import simulate
     from simulator.world import World
 
-    if options.log:
+    if options.format:
         return _write_log(options, _drive(options))
     if options.world.endswith(".xml"):
         raise AbductionError(
@@ -136,7 +111,9 @@ def run_simulate(options: argparse.Namespace) -> int:
     trace = simulate(world, options.tours, options.seed, body=body, **how)
     if camera and options.output != "-":
         trace = _with_table(trace, options.output)
-    write(trace, options.output, f"{counted(len(trace), 'images')} of {printable(world.name)}")
+    write_trace(
+        trace, options.output, f"{counted(len(trace), 'images')} of {printable(world.name)}"
+    )
     return 0
 
 
@@ -183,7 +160,7 @@ def _write_log(options: argparse.Namespace, drive: RecordedDrive) -> int:
     from perception.readers.writers import write_bag, write_carmen
 
     target = Path(options.output)
-    if options.log == "carmen":
+    if options.format == "carmen":
         numbers = drive.odometer.parameters().items()
         noise = {f"simulator_odometry_{name}": value for name, value in numbers}
         write_carmen(target, scans_of(drive), noise)
@@ -251,31 +228,25 @@ def _with_table(trace: Trace, target: str) -> Trace:
 MOST_SEEDS = 10_000
 
 
-def add_reproduce(verbs: Verbs) -> None:
-    parser = verbs.add(
-        "reproduce",
-        run_reproduce,
-        "run the paper's experiments",
-        "Reproduce an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn. "
-        "Writes figures, data and a page into a folder.",
-    )
-    said = "which experiment of the paper to repeat"
-    parser.add("experiment", said, choices=("notched-rectangle", "taylor-hall"))
-    parser.add("--seeds", "random seeds, such as 0-19 or 1,5,7 (default: 0-19)", default="0-19")
-    parser.add("--json", "print each claim, with the paper's value and ours for each seed, as JSON")
-    parser.add(
-        "--jobs N", "the number of processes; -1 for one per core (default: 2)", type=int, default=2
-    )
-    parser.add_setting(
-        "outcomes",
-        "for notched-rectangle, whether to try other depths of the notch and other spreads of the "
-        "robot's poses, too (default: true)",
-        True,
-    )
-    parser.add("-o --output FOLDER", "folder to write (default: out/EXPERIMENT)", type=output)
-
-
+@verb(
+    {
+        "experiment {notched-rectangle,taylor-hall}": "which experiment of the paper to repeat",
+        "--seeds SEEDS=0-19": "random seeds, such as 0-19 or 1,5,7",
+        "--json": "print each claim, with the paper's value and ours for each seed, as JSON",
+        "--jobs N=2": "the number of processes; -1 for one per core",
+        "--set outcomes true|false=true": (
+            "for notched-rectangle, whether to try other depths of the notch and other spreads of "
+            "the robot's poses, too"
+        ),
+        "-o --output FOLDER": "folder to write (default: out/EXPERIMENT)",
+    }
+)
 def run_reproduce(options: argparse.Namespace) -> int:
+    """Run the paper's experiments.
+
+    Reproduce an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn. Writes
+    figures, data and a page into a folder.
+    """
     from ssh_abduction.evaluation.paper_report import reproduce, steps
 
     seeds, name = _seeds(options.seeds), options.experiment
@@ -328,20 +299,13 @@ def _seeds(text: str) -> list[int]:
     return found
 
 
-def add_examples(verbs: Verbs) -> None:
-    parser = verbs.add(
-        "examples",
-        run_examples,
-        "copy the examples into a folder",
-        "Copy the examples of the package into a folder: traces, programs and a notebook. If a "
-        "file of the same name has other content, nothing is copied.",
-    )
-    parser.add(
-        "-o --output FOLDER", "folder to write (default: examples)", type=output, default="examples"
-    )
-
-
+@verb({"-o --output FOLDER=examples": "folder to write"})
 def run_examples(options: argparse.Namespace) -> int:
+    """Copy the examples into a folder.
+
+    Copy the traces, programs and the notebook of the package. If a file of the same name has other
+    content, nothing is copied.
+    """
     folder = Path(options.output)
     examples = {
         folder / path.name: path.read_bytes()

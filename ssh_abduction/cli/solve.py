@@ -18,44 +18,42 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.obeyed_corrections import (
+from ssh_abduction.cli.correct import (
     Obeying,
     corrections_of,
     keep_corrections,
     say_obeyed,
 )
+from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import (
-    add_jobs,
-    add_limits,
-    add_max_maps,
-    add_theory,
+    TRACE_SAID,
     check_output,
-    maps_path,
+    limits,
+    many,
+    max_maps,
     number_steps,
-    output,
     theory_of,
-    trace_path,
+    theory_rows,
 )
 from ssh_abduction.cli.outcome import (
     Given,
     Warnings,
     all_given,
     answer_ending,
-    answer_opening,
     exit_code,
     on_ctrl_c,
     save_solution,
     warn,
     why_no_map,
 )
-from ssh_abduction.cli.parsing import Verbs
+from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import (
     counted,
     describe,
     describe_backbone,
     findings,
     first_map,
+    found_in,
     headline,
     table,
     told_apart,
@@ -70,7 +68,6 @@ from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime import program
 from ssh_abduction.runtime.loggers import PROGRESS
 from ssh_abduction.solver import (
-    Backbone,
     Front,
     Search,
     Solution,
@@ -78,6 +75,7 @@ from ssh_abduction.solver import (
     Status,
     Stop,
     fault_front,
+    opening,
     solve,
     summary_of,
     written_map,
@@ -92,70 +90,56 @@ HELD = 1000
 HELD_DSTATES = 500_000
 
 
-def add_parser(verbs: Verbs) -> None:
-    parser = verbs.add(
-        "solve",
-        run,
-        "find the minimal maps of a trace, or of many",
-        "Find the minimal maps of a trace. With several traces, the result of each is one line.",
-    )
-    said = "trace file (JSON Lines), or - for standard input"
-    parser.add("traces", said, nargs="+", metavar="trace", type=trace_path)
-    add_max_maps(parser, "maps")
-    parser.add("--json", "print the solution as JSON; for many traces, one line each")
-    parser.add("--together", "the traces are drives through one building: find their joint maps")
-    parser.add("-o --output FILE", "also write the solution to this file, as JSON", type=output)
-    parser.add(
-        "--onto MAPS",
-        "add the trace to the first map in this file, which solve -o wrote, and keep its "
-        "dstates and places; takes about as long as solving the new trace alone",
-        type=maps_path,
-    )
-    parser.add(
-        "--corrections FILE",
-        "obey the names and corrections in this file, or in corrections.yaml of this folder "
-        "(default: corrections.yaml in the folder of the file of --output or, if there is none, of "
-        "--onto)",
-    )
-    parser.add(
-        "--front K",
-        "report the fewest dstates of a map with at most 0, 1, … K faults (steps that are treated "
-        "as wrong), by the causal theory. If misread or slipped is set, only faults of the kinds "
-        "that are set count. The report also names the knee: the number of faults beyond which "
-        "further faults save few dstates",
-        type=int,
-    )
-    add_limits(parser, "the best answer so far", work=True)
-    add_jobs(
-        parser,
-        "solve",
-        "traces",
-        "With several traces, or with one of these options, each result is one line, in the order "
-        "of the traces. If a trace fails, its line says why, and the others are still solved. The "
-        "exit code is 1 if there was an error, else the highest code of the traces. Limits hold "
-        "for each trace. The memory limit is for the whole process: it includes other threads of "
-        "a Dask worker and, except on Linux, earlier traces.",
-    )
-    add_theory(parser)
-    parser.add_setting(
-        "within K",
-        "also list maps with up to K dstates more than the minimum; for each number of "
-        "dstates, only the best maps (default: 0). With displacements, K is in nats",
-        default=0,
-        type=int,
-    )
-    parser.add_setting(
-        "joint_trace FILE", "with --together: also write the joint trace to this file"
-    )
-    parser.add_setting(
-        "without_speedups NAMES",
-        "speed-ups to turn off, separated by commas, to measure what they save. None of them "
-        f"changes an answer: {', '.join(SPEEDUPS)}",
-        default="",
-    )
+@verb(
+    {
+        "traces trace...": TRACE_SAID,
+        **max_maps("maps"),
+        "--json": "print the solution as JSON; for many traces, one line each",
+        "--together": "the traces are drives through one building: find their joint maps",
+        "-o --output FILE": "also write the solution to this file, as JSON",
+        "--onto MAPS": (
+            "add the trace to the first map in this file, which solve -o wrote, and keep its "
+            "dstates and places; takes about as long as solving the new trace alone"
+        ),
+        "--corrections FILE": (
+            "obey the names and corrections in this file, or in corrections.yaml of this folder "
+            "(default: corrections.yaml in the folder of the file of --output or, if there is "
+            "none, of --onto)"
+        ),
+        "--front K": (
+            "report the fewest dstates of a map with at most 0, 1, … K faults (steps that are "
+            "treated as wrong), by the causal theory. If misread or slipped is set, only faults of "
+            "the kinds that are set count. The report also names the knee: the number of faults "
+            "beyond which further faults save few dstates"
+        ),
+        **limits("the best answer so far", work=True),
+        **many(
+            "solve",
+            "traces",
+            "With several traces, or with one of these options, each result is one line, in the "
+            "order of the traces. If a trace fails, its line says why, and the others are still "
+            "solved. The exit code is 1 if there was an error, else the highest code of the "
+            "traces. Limits hold for each trace. The memory limit is for the whole process: it "
+            "includes other threads of a Dask worker and, except on Linux, earlier traces.",
+        ),
+        **theory_rows(),
+        "--set within K=0": (
+            "also list maps with up to K dstates more than the minimum; for each number of "
+            "dstates, only the best maps. With displacements, K is in nats"
+        ),
+        "--set joint_trace FILE": "with --together: also write the joint trace to this file",
+        "--set without_speedups NAMES": (
+            "speed-ups to turn off, separated by commas, to measure what they save. None of them "
+            f"changes an answer: {', '.join(SPEEDUPS)}",
+            {"default": ""},
+        ),
+    }
+)
+def run_solve(options: argparse.Namespace) -> int:
+    """Find the minimal maps of a trace, or of many.
 
-
-def run(options: argparse.Namespace) -> int:
+    With several traces, the result of each is one line.
+    """
     if options.output is not None:
         check_output(options.output, "the solution")
     if options.onto is not None:
@@ -284,7 +268,7 @@ class _Text:
 
     def end(self, solution: Solution, explanation: Explanation | None) -> Callable[[], str]:
         """Make the output now, as text. Return a function that gives this text."""
-        lines = _lines(self._search, solution, explanation, self._search.backbone)
+        lines = answer_lines(solution, explanation)
         blamed = self._obeying.blamed(solution, explanation)
         text = _text(chain(lines, blamed, self._obeying.how_to_mend(blamed, explanation)))
         return lambda: text
@@ -294,7 +278,7 @@ class _Text:
         # To compare several maps may take long.
         first = tuple(self.kept[:1])
         kept = first if solution.status is Status.OPTIMAL and first else solution.maps
-        return _text(_lines(self._search, replace(solution, maps=kept), None, None))
+        return _text(answer_lines(replace(solution, maps=kept, shared=None), None))
 
 
 class _Json:
@@ -336,19 +320,13 @@ class _Json:
     def end(self, solution: Solution, explanation: Explanation | None) -> Callable[[], str]:
         """Return a function that makes the rest of the JSON: the maps in memory, and the fields."""
         given = all_given(solution)
-        fields = self._fields(solution, explanation, self._search.backbone, len(given))
+        fields = self._fields(solution, explanation, len(given))
         return lambda: self._opening() + "".join(map(self._line, given)) + fields
 
-    def _fields(
-        self,
-        solution: Solution,
-        explanation: Explanation | None,
-        backbone: Backbone | None,
-        more: int = 0,
-    ) -> str:
+    def _fields(self, solution: Solution, explanation: Explanation | None, more: int = 0) -> str:
         """Make the fields after the maps; `more` maps are not printed yet."""
-        maps, warnings = self._maps + more, self._found.of(solution)
-        end = answer_ending(solution, explanation, maps, backbone, warnings)
+        warnings = self._found.of(solution)
+        end = answer_ending(solution, explanation, self._maps + more, warnings)
         if blamed := self._obeying.blamed(solution, explanation):
             end["corrections"] = blamed
         return f"\n],{json_line(end)[1:]}\n"
@@ -359,14 +337,16 @@ class _Json:
         if not self._maps and solution.maps:
             words += self._line((solution.maps[0], None))
         # The backbone is left out: another thread may be changing it.
-        return words + self._fields(solution, None, None)
+        return words + self._fields(replace(solution, shared=None), None)
 
     def _opening(self) -> str:
         """Begin the JSON; "" if it is begun already."""
         if self._begun:
             return ""
         self._begun = True
-        return json_line(answer_opening(self._search))[:-1] + ', "maps": ['
+        search = self._search
+        head = opening(search.theory, len(search.trace), search.limits.within)
+        return json_line(head)[:-1] + ', "maps": ['
 
     def _let_go(self) -> str:
         """Write the maps in memory in the order in which they were found, and forget them."""
@@ -382,16 +362,19 @@ def _text(lines: Iterable[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _lines(
-    search: Search, solution: Solution, explanation: Explanation | None, backbone: Backbone | None
+def answer_lines(
+    solution: Solution, explanation: Explanation | None, existing: SSHMap | None = None
 ) -> Iterator[str]:
-    """Yield the lines that describe the result of a search to people."""
-    yield headline(solution, search.count, explanation)
-    yield from findings(solution)
+    """Yield the lines that describe the result of a search to people.
+
+    `existing` is the map to which drives were added, if there was one.
+    """
+    yield headline(solution, explanation)
+    yield from findings(solution, existing)
     if solution.status is Status.UNSATISFIABLE:
-        if explanation:
+        if explanation and solution.trace is not None:
             yield from explanation.sentences
-            first, last = search.trace.at(explanation.first), search.trace.at(explanation.last)
+            first, last = map(solution.trace.at, (explanation.first, explanation.last))
             where = f"at {last}" if first == last else f"from {first} to {last}"
             mend = (
                 "leave one of these axioms out: --set without=NAME"
@@ -406,12 +389,13 @@ def _lines(
             first = "step" if steps == 1 else f"{steps} steps"
             yield f"\nbest map of the first {first}\n{describe(partial_map)}"
         return
-    yield first_map(solution, search.count)
-    if backbone and (search.count > 1 or not solution.complete):
-        yield f"\n{summary_of(solution, search.count, backbone)}"
-    if backbone and not solution.minimal_listed:
-        yield describe_backbone(backbone, search.trace)
-    yield from told_apart(solution, search.count)
+    yield first_map(solution)
+    count, backbone = found_in(solution), solution.shared
+    if backbone and (count > 1 or not solution.complete):
+        yield f"\n{summary_of(solution, count, backbone)}"
+    if backbone and not solution.minimal_listed and solution.trace is not None:
+        yield describe_backbone(backbone, solution.trace)
+    yield from told_apart(solution)
 
 
 @contextlib.contextmanager
@@ -469,17 +453,12 @@ def _onto(options: argparse.Namespace) -> int:
     warn(solution.warnings)
     save_solution(solution, options.output)
     keep_corrections(said, options.output)
-    if options.json:
-        print(json_line(solution.to_dict()))
-        return exit_code(solution)
-    count = len(solution.maps)
-    print(headline(solution, count, None))
-    lines = (
-        *findings(solution, existing.maps[0]),
-        first_map(solution, count),
-        *told_apart(solution, count),
+    added = replace(solution, shared=None)
+    print(
+        json_line(solution.to_dict())
+        if options.json
+        else "\n".join(answer_lines(added, None, existing.maps[0]))
     )
-    print("\n".join(lines))
     return exit_code(solution)
 
 

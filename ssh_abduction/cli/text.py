@@ -38,11 +38,13 @@ NOUNS: dict[Matter, tuple[str, str]] = {
 }
 
 
-def headline(solution: Solution, count: int, explanation: Explanation | None) -> str:
-    """Write one line about how a search ended.
+def found_in(solution: Solution) -> int:
+    """Return the number of maps that the search of a solution found. It may hold fewer."""
+    return max(sum(level.count for level in solution.levels), len(solution.maps))
 
-    `count` is the number of maps found. The solution may hold fewer.
-    """
+
+def headline(solution: Solution, explanation: Explanation | None) -> str:
+    """Write one line about how a search ended."""
     if explanation:
         return f"{solution.status.value}: {explanation}"
     if solution.status is Status.UNSATISFIABLE:
@@ -70,7 +72,7 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
         if weighed is not None:
             bound = f"{weighed.bound:.1f} nats or more"
         return f"feasible{why}: {counts}, {claim}; {_proven(bound)}; {seconds}"
-    return f"optimal: {counts}; {_number_of_maps(solution, count)}; {seconds}"
+    return f"optimal: {counts}; {_number_of_maps(solution)}; {seconds}"
 
 
 def _proven(bound: str) -> str:
@@ -78,9 +80,9 @@ def _proven(bound: str) -> str:
     return f"any map has {bound}" if bound else "no bound is proven"
 
 
-def _number_of_maps(solution: Solution, count: int) -> str:
+def _number_of_maps(solution: Solution) -> str:
     """Say how many minimal maps there are, how many of each further level, and if all are found."""
-    least = solution.levels[0].count if solution.levels else count
+    least = solution.levels[0].count if solution.levels else len(solution.maps)
     found = counted(least, "minimal maps")
     if solution.weighed is not None:
         found = f"{counted(least, 'maps')} of least cost"
@@ -130,19 +132,19 @@ def _kept(existing: SSHMap, solution: Solution) -> str:
     return f"the {pieces} pieces of the map of {names} are kept, and joined to {len(left)}; "
 
 
-def first_map(solution: Solution, count: int) -> str:
-    """Describe the first of the maps that a search found. `count` is their number."""
-    return f"\n{'map 1' if count > 1 else 'map'}\n{describe(solution.maps[0])}"
+def first_map(solution: Solution) -> str:
+    """Describe the first of the maps that a search found."""
+    return f"\n{'map 1' if found_in(solution) > 1 else 'map'}\n{describe(solution.maps[0])}"
 
 
-def told_apart(solution: Solution, count: int) -> Iterator[str]:
-    """Yield lines about how the maps of a solution differ; `count` maps were found."""
+def told_apart(solution: Solution) -> Iterator[str]:
+    """Yield lines about how the maps of a solution differ."""
     if len(solution.maps) > 1:
         from ssh_abduction.rivals.comparison import compare  # loads numpy
         from ssh_abduction.rivals.listing import Listing
 
         held = len(solution.maps)
-        some = "" if count == held else f" (of the first {held} found)"
+        some = "" if found_in(solution) == held else f" (of the first {held} found)"
         yield f"\nwhat tells the maps apart{some}"
         yield from compared(compare(Listing(solution.maps, drives=solution.drives)))
 

@@ -1,0 +1,555 @@
+"""ssh-abduction localise, route, show, export and view: use a known map.
+
+Follow a robot in the map, find its way, and show the map here, in other programs or in the browser.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import tempfile
+import warnings
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ssh_abduction.cli.options import (
+    JSON,
+    MAPS_SAID,
+    ONE_MAP,
+    check_number,
+    check_picture,
+    draw_plot,
+    flags_of,
+    read_maps,
+    some_maps,
+    trace_beside,
+    trace_of_maps,
+    written_theory,
+)
+from ssh_abduction.cli.outcome import warn
+from ssh_abduction.cli.parsing import trace_path, verb
+from ssh_abduction.cli.text import describe, steps_in_words, table
+from ssh_abduction.data.checks import a_whole_number
+from ssh_abduction.data.corrections import named_beside
+from ssh_abduction.data.errors import (
+    AbductionError,
+    LocaliserError,
+    MapError,
+    brief,
+    named,
+    printable,
+    said_of,
+)
+from ssh_abduction.data.files import json_line
+from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.map_parts import described
+from ssh_abduction.data.maps import SSHMap, maps_of
+from ssh_abduction.data.schema import FieldReader, only_known
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver import drives_in
+
+if TYPE_CHECKING:
+    from ssh_abduction.data.maps import SSHMap
+    from ssh_abduction.data.trace import Trace
+    from ssh_abduction.online.localiser import Localiser
+    from ssh_abduction.page.content import Called
+    from ssh_abduction.page.replays import Run
+    from ssh_abduction.rivals.listing import Listing
+    from ssh_abduction.theory.theory import Theory
+
+
+HEAD = ("step", "action", "seen", "", "dstate")
+NUMBERS = ("probability", "nowhere", "entropy", "normaliser")
+# For each chance, what has this probability.
+CHANCES = {
+    "misread": "at a step, the view or image does not fit the dstate where the robot is (default: "
+    "0.01)",
+    "slipped": "an action fails, or the robot is kidnapped during it (default: 0.01)",
+    "unmapped": "the robot is outside the map at the start, after a slip, or after an action for "
+    "which the map has no link (default: 0.1)",
+    "reentered": "a robot outside the map is back on it after its next action (default: 0.1)",
+}
+NOWHERE = "–"
+
+
+@verb(
+    {
+        "maps": MAPS_SAID,
+        "other": (
+            "trace of a robot in the mapped world that uses the same names of views and actions; "
+            "- for standard input; or a folder that the command 'map' wrote",
+            {"type": trace_path},
+        ),
+        "--map N": "the number of the map, from 1 (default: 1)",
+        "--trace TRACE": (
+            "the trace that was mapped; its steps tell which stars were seen at each dstate, and "
+            "how reliable views and links are (default: the trace that solve -o or map wrote with "
+            "the maps)"
+        ),
+        "--recogniser FILE.skops": (
+            "recogniser that train wrote for this map, to use images instead of views (default: "
+            "in a folder that map wrote, one for the images of its trace)"
+        ),
+        **{f"--set {name} P": f"the probability that {said}" for name, said in CHANCES.items()},
+        "--set zero_one true|false=false": (
+            "whether views and actions never fail: the defaults of misread, slipped and unmapped "
+            "are then 0, and that of reentered is 1"
+        ),
+        "--plot PNG": "draw into this file how unsure the belief is at each step",
+        **JSON,
+    }
+)
+def run_localise(options: argparse.Namespace) -> int:
+    """Follow a robot in a known map.
+
+    Find where in a known map the robot was at each step of another trace. Markov localisation
+    computes a belief over dstates after each step. The robot may start anywhere, be kidnapped, or
+    leave the map.
+    """
+    check_picture(options.plot)
+    localiser, trace = _localiser(options)
+    beliefs = [belief.to_dict() for belief in localiser.beliefs(trace)]
+    if options.json:
+        head = {"map": options.map or 1, "dstates": len(localiser.ssh_map.dstates)}
+        head["chances"] = asdict(localiser.chances)
+        lines = [json_line({"step": step, **belief}) for step, belief in enumerate(beliefs)]
+        print(json_line(head)[:-1] + ', "beliefs": [\n' + ",\n".join(lines) + "\n]}")
+    else:
+        print(_headline(beliefs))
+        seen = ["image" if localiser.reads_images else step.view for step in trace]
+        done = ["", *(action.name for action in trace.actions)]
+        told = zip(done, seen, beliefs, strict=True)
+        rows = [
+            [step, action, NOWHERE if view is None else view, *_found(belief, localiser.ssh_map)]
+            for step, (action, view, belief) in enumerate(told)
+        ]
+        place = ("place",) if localiser.ssh_map.places else ()
+        print(table((*HEAD, *place, *NUMBERS), rows))
+    draw_plot(options, "draw_beliefs", beliefs)
+    return 0
+
+
+def _localiser(options: argparse.Namespace) -> tuple[Localiser, Trace]:
+    """Make the localiser that the options ask for, and load the trace that it follows.
+
+    Raises AbductionError, which names the file.
+    """
+    from ssh_abduction.online.belief import Chances
+    from ssh_abduction.online.localiser import Localiser
+
+    data = read_maps(options.maps)
+    maps = named_maps(some_maps(data, options.maps, "localise in"), data, options.maps)
+    check_number(options.map, maps, options.maps)
+    if len(maps) > 1 and options.map is None:
+        warnings.warn(
+            f"{named(options.maps)}: the first of {len(maps)} maps is taken; choose one with --map",
+            stacklevel=1,
+        )
+    given = only_known(**{name: getattr(options, name) for name in CHANCES})
+    chances = replace(Chances.none() if options.zero_one else Chances(), **given)
+    ssh_map = maps[(options.map or 1) - 1]
+    mapped = Trace.load(options.trace) if options.trace else _mapped(options.maps)
+    other = Trace.load(options.other)
+    recogniser = _recogniser(options, ssh_map, mapped, other)
+    of_recogniser = said_of(named(options.recogniser or options.maps), LocaliserError)
+    with said_of(named(options.maps), MapError), of_recogniser:
+        return Localiser(ssh_map, recogniser, trace=mapped, chances=chances), other
+
+
+def _mapped(maps: str) -> Trace | None:
+    """Return the trace that was mapped, if it is beside the maps or in their file."""
+    beside = trace_beside(maps)
+    return Trace.load(beside) if beside else trace_of_maps(maps)
+
+
+def _recogniser(
+    options: argparse.Namespace, ssh_map: SSHMap, mapped: Trace | None, other: Trace
+) -> Any:
+    """Return the named recogniser, or train one if a log was mapped and both traces have images."""
+    if options.recogniser:
+        from perception.store import load
+
+        return load(options.recogniser).model
+    is_log = options.trace is None and trace_beside(options.maps) is not None
+    if not is_log or mapped is None or other.steps[0].image is None:
+        return None
+    from ssh_abduction.robot_logs.log_maps import recogniser_of
+
+    return recogniser_of(mapped, ssh_map)
+
+
+def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:
+    """List the steps with each verdict, such as "located", and those where the belief collapsed."""
+    steps = gathered((belief["verdict"], step) for step, belief in enumerate(beliefs))
+    parts = [f"{verdict} at {steps_in_words(some)}" for verdict, some in steps.items()]
+    if collapses := [step for step, belief in enumerate(beliefs) if belief["collapsed"]]:
+        parts.append(f"the belief collapsed at {steps_in_words(collapses)}")
+    return "; ".join(parts)
+
+
+def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
+    """Make the cells about a belief: the verdict, the dstate and its place, and numbers."""
+    dstate: int | None = belief["dstate"]
+    cells: list[object] = [belief["verdict"], NOWHERE if dstate is None else dstate]
+    if ssh_map.places:
+        place = None if dstate is None else ssh_map.dstates[dstate].place
+        cells.append(NOWHERE if place is None else ssh_map.numbered("place", place))
+    shares = [f"{belief[name]:.3f}" for name in ("probability", "nowhere")]
+    return [*cells, *shares, f"{belief['entropy']:.2f}", f"{belief['normaliser']:.3g}"]
+
+
+@verb(
+    {
+        "maps": MAPS_SAID,
+        "--from A": (
+            "start: the number of a dstate, a step such as monday:12, or a place or region by "
+            "number or name, such as p3, region2 or kitchen (default: the robot's last dstate)",
+            {"dest": "start"},
+        ),
+        "--to B!": ("goal: a dstate, place or region, named as for --from", {"dest": "goal"}),
+        "--avoid X...": "dstates, places and regions that the route must not visit",
+        "--by {actions,places,metres}=actions": (
+            "what to minimise. With actions or metres, a route uses only moves that the robot has "
+            "made. With places, it may use any move along a path of the map, and drive back where "
+            "it came from"
+        ),
+        **ONE_MAP,
+        **JSON,
+    }
+)
+def run_route(options: argparse.Namespace) -> int:
+    """Find the actions that lead to a place.
+
+    Find the shortest route through a map: the actions from one dstate or place to another, and the
+    views to expect on the way. If the map lists regions, say first which regions the route leaves
+    and enters, and which paths it passes.
+
+    ssh-abduction show lists the dstates and places of a map. docs/reference/formats.md describes
+    the JSON.
+    """
+    from ssh_abduction.online.routes import action_in_words, route  # loads networkx
+    from ssh_abduction.rivals.listing import Listing
+
+    listing = Listing.load(options.maps)
+    given = {name.text for ssh_map in listing.maps for name in ssh_map.names}
+    avoid = _names(options.avoid, given)
+    with said_of(listing.source, MapError):
+        how: dict[str, Any] = {"by": options.by, "map": options.map}
+        found = route(listing, options.start, options.goal, avoid=avoid, **how)
+    if options.json:
+        print(json_line(found.to_dict()))
+        return 0
+    print(printable(found.sentence))
+    if found.legs:
+        called = listing.maps[found.map - 1].called
+        print(printable(f"by regions: {'; '.join(leg.in_words(called) for leg in found.legs)}"))
+    if found.moves:
+        chosen = listing.maps[found.map - 1]
+        rows = [
+            [
+                action_in_words(move),
+                "" if move.dstate is None else move.dstate,
+                "not known" if move.view is None else move.view,
+                "" if move.place is None else chosen.numbered("place", move.place),
+                move.course,
+                *([] if move.metres is None else [f"{move.metres:.2f}"]),
+                "" if move.known else "never tried",
+            ]
+            for move in found.moves
+        ]
+        metres = [] if found.metres is None else ["metres"]
+        print(table(["action", "dstate", "expect", "place", "path", *metres, ""], rows))
+    return 0
+
+
+def _names(words: list[str] | None, given: Collection[str]) -> list[str]:
+    """Split words at commas, to list what to avoid. Names that a person gave may have commas."""
+    return [
+        name
+        for word in words or ()
+        for name in ([word] if word in given else word.split(","))
+        if name
+    ]
+
+
+@verb({"maps": MAPS_SAID, "--map N": "show only the map with this number, from 1 (default: all)"})
+def run_show(options: argparse.Namespace) -> int:
+    """Print the dstates, places, paths and links of maps.
+
+    Regions are also printed.
+    """
+    data, where = read_json(options.maps), str(options.maps)
+    maps = named_maps(maps_of(data, where), data, where)
+    check_number(options.map, maps, options.maps)
+    if not maps:
+        print("no map")
+        return 0
+    if options.map:
+        print(_with_regions(maps[options.map - 1]))
+    else:
+        print("\n\n".join(f"map {i + 1}\n{_with_regions(m)}" for i, m in enumerate(maps)))
+    return 0
+
+
+def _with_regions(ssh_map: SSHMap) -> str:
+    """Describe a map and its regions: sets of places beside paths, or behind one place."""
+    regions = [f"  {described(region, ssh_map.called)}" for region in ssh_map.regions or ()]
+    return "\n".join([describe(ssh_map), *regions])
+
+
+def named_maps(found: Sequence[SSHMap], data: Any, file: str) -> tuple[SSHMap, ...]:
+    """Return the maps found in a file, with the names of corrections.yaml. Raises MapError."""
+    steps = len(found[0].dstate_at) if found else 0
+    drives = drives_in(FieldReader(file), data, steps) if found else ()
+    return named_beside(found, drives, file)
+
+
+# Repeats ssh_abduction.output.export, whose import of networkx would delay all verbs.
+FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
+
+
+@verb(
+    {
+        "maps": MAPS_SAID,
+        f"--to {{{','.join(FORMATS)}}}!": (
+            "the format to write: nav2 and tmap2 are for programs that drive a robot, svg is a "
+            "picture, and the others are graphs"
+        ),
+        **ONE_MAP,
+        "--trace TRACE": (
+            "the trace that was mapped; its turns give a better layout of a map without poses"
+        ),
+        "-o --output FILE": ("file to write (default: standard output)", {"default": "-"}),
+        "--set level {places,dstates}": (
+            "what a node is: a place or a dstate (default: places for nav2 and tmap2 if the map "
+            "has places, else dstates)"
+        ),
+        "--set hide_undecided true|false=false": (
+            "whether to leave out each place that the robot only passed, always between the same "
+            "two neighbours (nav2 and tmap2 only)"
+        ),
+        "--set name TEXT=ssh-abduction": "the name of the map in nav2 and tmap2 files",
+        "--set frame TEXT=map": "the name of the coordinate frame in nav2 and tmap2 files",
+    }
+)
+def run_export(options: argparse.Namespace) -> int:
+    """Write a map for Nav2, tmap2, GraphML, DOT or networkx.
+
+    Write a map in the format of another program: a route graph for Nav2 (GeoJSON), a topological
+    map for LCAS's topological_navigation (tmap2, YAML), GraphML, Graphviz DOT, SVG, or JSON for
+    networkx.
+
+    Positions are in metres from the first dstate if the map has poses. Otherwise they come from a
+    layout, and a warning says so. docs/reference/formats.md describes each format.
+    """
+    from ssh_abduction.data.map_file import write_map
+    from ssh_abduction.output.export import export_doubts, export_map  # loads networkx
+    from ssh_abduction.rivals.listing import Listing
+
+    listing = Listing.load(options.maps)
+    chosen = listing.maps[listing.number(options.map)]
+    how: dict[str, Any] = {"level": options.level, "hide_undecided": options.hide_undecided}
+    how["turns"] = None if options.trace is None else Trace.load(options.trace)
+    with said_of(listing.source, MapError):
+        text = export_map(chosen, options.to, name=options.name, frame=options.frame, **how)
+    if options.output == "-":
+        print(text.removesuffix("\n"))
+    else:
+        write_map(options.output, text.removesuffix("\n"))
+    warn(export_doubts(chosen, options.to, **how))
+    return 0
+
+
+@verb(
+    {
+        "maps": MAPS_SAID,
+        "[trace]": (
+            "the trace that was mapped; adds actions and laser images, and is needed for --serve "
+            "(default: the trace in the folder of the maps, if map wrote it, or in the file of "
+            "maps, if solve -o wrote it)"
+        ),
+        "-o --output FILE": "write the page to this file and do not open it",
+        "--run TRACE": (
+            "a second trace from the mapped world. The page replays it, with a belief about where "
+            "the robot is at each step. It may be the trace that was mapped. Beliefs come from its "
+            "views, or from the file of --belief"
+        ),
+        "--belief FILE": (
+            "file with what localise --json printed for the trace of --run, or for the trace that "
+            "was mapped"
+        ),
+        "--serve": (
+            "serve the page, on this computer only, so that it can explain why two steps are one "
+            "dstate or not, and solve again with assumptions; needs the trace. Ctrl-C ends the "
+            "server"
+        ),
+        "--time-limit S=30": "with --serve, seconds for each answer",
+        "--set port N": ("with --serve, the port (default: any free port)", {"default": "0"}),
+        "--set open true|false=true": "whether to open the page in the browser",
+    }
+)
+def run_view(options: argparse.Namespace) -> int:
+    """See rival maps in the browser.
+
+    Show maps on one page: what all maps share, where they differ, each map alone, two maps side by
+    side, and what happened at each step.
+
+    The page is one file that works without a network. Without --serve, it cannot ask the solver. It
+    shows the commands for that.
+    """
+    from ssh_abduction.cli.correct import as_corrected
+    from ssh_abduction.data.corrections import beside
+    from ssh_abduction.data.map_file import read_json
+    from ssh_abduction.data.trace import Trace
+    from ssh_abduction.page.content import Called, content_of  # loads numpy
+    from ssh_abduction.page.html import Page
+    from ssh_abduction.rivals.listing import Listing
+
+    options.trace = options.trace or trace_beside(options.maps)
+    trace = trace_of_maps(options.maps) if options.trace is None else Trace.load(options.trace)
+    _check(options, trace)
+    data = read_json(options.maps)
+    source = "standard input" if options.maps == "-" else options.maps
+    listing = Listing.from_dict(data, source).named_beside(options.maps)
+    theory = written_theory(data)
+    seen = trace
+    if trace is not None and theory is not None:
+        trace, theory = as_corrected(trace, theory, options.maps)
+    flags = [] if theory is None else flags_of(theory, trace)
+    flags += [] if trace == seen else ["--corrections", str(beside(options.maps))]
+    called = Called(
+        "maps.json" if options.maps == "-" else shlex.quote(options.maps),
+        shlex.quote(options.trace) if options.trace else "TRACE",
+        "".join(f" {shlex.quote(flag)}" for flag in flags),
+    )
+    localised = _run(options, trace, data)
+    if options.serve:
+        assert trace is not None
+        return _serve(options, listing, trace, theory, localised, called)
+    page = Page(content_of(listing, trace, localised, called))
+    file = options.output or str(Path(tempfile.mkdtemp(prefix="ssh-abduction-")) / "maps.html")
+    page.save(file)
+    print(file)
+    if not options.output and options.open:
+        _open(Path(file).absolute().as_uri())
+    return 0
+
+
+def _check(options: argparse.Namespace, trace: Trace | None) -> None:
+    """Raise AbductionError if the options contradict each other."""
+    if options.serve and trace is None:
+        raise AbductionError(
+            "--serve: expected the trace that was mapped, got none; give it after the maps"
+        )
+    if options.serve and options.output:
+        raise AbductionError(
+            "--output: expected none with --serve, which writes no file; leave out one of the two"
+        )
+    if not 0 <= options.port <= 65535:
+        raise AbductionError(f"port: expected 0 to 65535, got {options.port}; name a free port")
+
+
+def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
+    """Make the localised run that the options ask for; None if they ask for none."""
+    from ssh_abduction.data.trace import Trace
+    from ssh_abduction.page.replays import Run
+
+    if options.run is None and options.belief is None:
+        return None
+    followed = Trace.load(options.run) if options.run is not None else trace
+    if followed is None:
+        raise AbductionError(
+            "--belief: expected the trace of the run, got none; name it with --run, or give the "
+            "trace that was mapped"
+        )
+    if options.belief is None:
+        from ssh_abduction.online.localiser import Localiser
+
+        return Run(followed, lambda ssh_map: Localiser(ssh_map, trace=trace).beliefs(followed))
+    return _with_beliefs(followed, options.belief, data)
+
+
+def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
+    """Make a run with the beliefs of a file that `localise --json` wrote. Raises MapError."""
+    from ssh_abduction.data.map_file import read_json
+    from ssh_abduction.data.maps import maps_of
+    from ssh_abduction.page.replays import Run
+
+    record = read_json(file)
+    beliefs = record.get("beliefs") if isinstance(record, dict) else None
+    if not isinstance(beliefs, list) or not all(isinstance(belief, dict) for belief in beliefs):
+        raise MapError(
+            f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write "
+            "them with localise --json"
+        )
+    maps, number = maps_of(data, "maps"), record.get("map", 1)
+    mend = "run localise with these maps"
+    a_whole_number(f"{named(file)}: map", number, MapError, 1, len(maps), what="a map", mend=mend)
+    if record.get("dstates", count := len(maps[number - 1].dstates)) != count:
+        raise MapError(
+            f"{named(file)}: dstates: expected {count}, as map {number} has, got "
+            f"{brief(record['dstates'])}; run localise with these maps"
+        )
+    if len(beliefs) != len(followed):
+        raise MapError(
+            f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, got "
+            f"{len(beliefs)}; name that run with --run"
+        )
+    chosen, labels = maps[number - 1], maps[number - 1].renumbered().dstate_at
+    visited = dict.fromkeys([*chosen.dstate_at, *range(len(chosen.dstates))])
+    new = {s: i for i, s in enumerate(visited)}  # the page numbers dstates by first visit
+    try:
+        renumbered = [
+            {**belief, "probabilities": [[new[s], p] for s, p in belief["probabilities"]]}
+            for belief in beliefs
+        ]
+    except (KeyError, TypeError, ValueError):
+        raise MapError(
+            f"{named(file)}: probabilities: expected pairs [dstate, probability], got something "
+            "else; localise again"
+        ) from None
+    return Run(followed, lambda ssh_map: renumbered if ssh_map.dstate_at == labels else None)
+
+
+def _serve(
+    options: argparse.Namespace,
+    listing: Listing,
+    trace: Trace,
+    theory: Theory | None,
+    localised: Run | None,
+    called: Called,
+) -> int:
+    import signal
+
+    from ssh_abduction.page.server import PageServer
+    from ssh_abduction.runtime import program
+    from ssh_abduction.solver import end_all
+
+    where: dict[str, Any] = {"port": options.port, "time_limit": options.time_limit}
+    try:
+        server = PageServer(listing, trace, theory, run=localised, called=called, **where)
+    except OSError as error:
+        raise AbductionError(
+            f"port: expected a free port, got {options.port}: {error.strerror}; name another one"
+        ) from None
+    with server:
+        print(server.url, flush=True)
+        if options.open:
+            _open(server.url)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            if program.heard[-1:] != [signal.SIGTERM]:
+                program.raised.clear()  # Ctrl-C is the normal way to end the server
+        finally:
+            end_all()
+    return 0
+
+
+def _open(address: str) -> None:
+    import webbrowser
+
+    webbrowser.open(address)
