@@ -33,7 +33,7 @@ from visited import Events, Truth, judged, truth_of
 
 from perception.readers.logs import read_log
 from ssh_abduction import Solution, SSHMap, Trace
-from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.maps import maps_of
 
 PAIRS, EVENTS = "pairs", "events"

@@ -16,7 +16,7 @@ from strategies import STARS, step_pairs
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.claims import check_bound
-from ssh_abduction.data.action import QUARTERS, Action
+from ssh_abduction.data.step import QUARTERS, Action
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Start, Status
 from ssh_abduction.solver.asp import facts

@@ -23,7 +23,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import TraceError
 from ssh_abduction.data import gateways as judge
-from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.maps import maps_of
 from ssh_abduction.data.star import Frame, Gateway, Star
 from ssh_abduction.data.trace import Action, Step

@@ -30,9 +30,8 @@ from ssh_abduction.data import Action, DState, MapError, Step, TraceError, toget
 from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
 from ssh_abduction.page import html
-from ssh_abduction.page.content import DRAWN, content_of
+from ssh_abduction.page.content import ALPHABET, DRAWN, LOST, beams_of, content_of, drawn_images
 from ssh_abduction.page.html import Page
-from ssh_abduction.page.replays import ALPHABET, LOST, beams_of, drawn_images
 from ssh_abduction.page.server import PageServer
 from ssh_abduction.rivals import Listing
 from ssh_abduction.solver import Watch
@@ -142,7 +141,7 @@ def test_page_shows_ranges_of_a_sidecar_file_and_no_panoramas(
     assert drawn["images"][1][0] == ALPHABET[0]
     assert drawn["images"][0][0] > drawn["images"][1][0]
     assert drawn_images(replace(trace, extra={"panorama": [2, 3, 1]})) is None
-    monkeypatch.setattr("ssh_abduction.page.replays.MOST", 1)
+    monkeypatch.setattr("ssh_abduction.page.content.MOST", 1)
     with pytest.warns(UserWarning, match="2 images are more than a page holds"):
         assert drawn_images(trace) is None
     (tmp_path / "images.npz").unlink()

@@ -24,7 +24,7 @@ import pytest
 from ssh_abduction import OnlineMapper, SSHMap
 from ssh_abduction.cli import main, parser
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.output import streets, to_svg
+from ssh_abduction.output import layout, to_svg
 from ssh_abduction.robot_logs import log_maps
 from ssh_abduction.solver import Solution, Status, solve
 from ssh_abduction.theory.encodings import Rules
@@ -216,7 +216,7 @@ def compare(block: Block) -> None:
 def test_code_blocks_print_the_shown_output(
     block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(streets, "WORK", 0)  # no page shows what these lines draw
+    monkeypatch.setattr(layout, "WORK", 0)  # no page shows what these lines draw
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     compare(block)

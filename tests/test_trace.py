@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssh_abduction import Trace
-from ssh_abduction.data import Action, Step, TraceError, trace_file
+from ssh_abduction.data import Action, Step, TraceError
 from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.trace import LONGEST_LINE
 
 HEADER = '{"format": "ssh-trace", "version": 1}'
 STEP = '{"view": "a", "action": "travel"}'
@@ -332,7 +333,7 @@ def test_endless_line_is_not_read_into_memory(tmp_path: Path) -> None:
         file.truncate(2**30)
     with pytest.raises(TraceError, match=":2: line: expected at most 16 MiB"):
         Trace.load(path)
-    assert trace_file.LONGEST_LINE == 16 * 2**20
+    assert LONGEST_LINE == 16 * 2**20
 
 
 def test_trace_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:

@@ -483,7 +483,7 @@ def test_solution_file_that_is_not_json_is_refused(text: str, said: str, tmp_pat
 
 def test_huge_solution_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     aces.solution().save(tmp_path / "maps.json")
-    monkeypatch.setattr("ssh_abduction.data.map_file.LARGEST", 2**20)
+    monkeypatch.setattr("ssh_abduction.data.map_parts.LARGEST", 2**20)
     assert Solution.load(tmp_path / "maps.json") == aces.solution()
     with pytest.raises(MapError, match="expected at most 1 MiB, got more"):
         Solution.load("/dev/zero")

@@ -28,9 +28,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TypeAlias
 
-from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.groups import reached
 from ssh_abduction.data.star import Openings
+from ssh_abduction.data.step import QUARTERS
 from ssh_abduction.theory.planarity import can_be_drawn, clockwise_orders, has_way, is_planar
 
 # A dstate, and 1 (ahead) or -1 (behind).

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from functools import partial
 
 from ssh_abduction.checker.reading import Course, Found, Reading, course_of, heading_of, opposite
-from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.drives import ALONE, drives_of
 from ssh_abduction.data.gateways import (
     Sight,
@@ -29,6 +28,7 @@ from ssh_abduction.data.gateways import (
 from ssh_abduction.data.map_parts import course_named
 from ssh_abduction.data.maps import DState
 from ssh_abduction.data.star import Openings
+from ssh_abduction.data.step import QUARTERS
 
 
 def star_pattern(m: Reading) -> Found:

@@ -31,7 +31,7 @@ from ssh_abduction.cli.parsing import maps_path, verb
 from ssh_abduction.cli.text import compared, counted, depending, table
 from ssh_abduction.data.errors import MapError, brief, named, printable, said_of
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import noun_of

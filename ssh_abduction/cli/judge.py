@@ -42,8 +42,7 @@ from ssh_abduction.cli.text import counted
 from ssh_abduction.data.drives import fingerprints_of, step_named
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_finite, named, printable
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.map_file import read_json
-from ssh_abduction.data.map_parts import thing_named
+from ssh_abduction.data.map_parts import read_json, thing_named
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant

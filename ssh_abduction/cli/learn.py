@@ -23,7 +23,7 @@ from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Rows, verb
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import AbductionError, MapError, named, said_of
-from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.maps import SSHMap, check_labels, maps_of
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace, with_images_named_from

@@ -18,7 +18,7 @@ from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, maps_path
 from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS, load_corrections
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
-from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace

@@ -22,7 +22,7 @@ from typing import Any, TypeAlias
 
 from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.files import mend_of
-from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import Explanation, explain

@@ -44,8 +44,7 @@ from ssh_abduction.data.errors import (
 )
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import gathered
-from ssh_abduction.data.map_file import read_json
-from ssh_abduction.data.map_parts import described
+from ssh_abduction.data.map_parts import described, read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.schema import FieldReader, only_known
 from ssh_abduction.data.trace import Trace
@@ -55,8 +54,7 @@ if TYPE_CHECKING:
     from ssh_abduction.data.maps import SSHMap
     from ssh_abduction.data.trace import Trace
     from ssh_abduction.online.localiser import Localiser
-    from ssh_abduction.page.content import Called
-    from ssh_abduction.page.replays import Run
+    from ssh_abduction.page.content import Called, Run
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.theory.theory import Theory
 
@@ -345,7 +343,7 @@ def run_export(options: argparse.Namespace) -> int:
     Positions are in metres from the first dstate if the map has poses. Otherwise they come from a
     layout, and a warning says so. docs/reference/formats.md describes each format.
     """
-    from ssh_abduction.data.map_file import write_map
+    from ssh_abduction.data.map_parts import write_map
     from ssh_abduction.output.export import export_doubts, export_map  # loads networkx
     from ssh_abduction.rivals.listing import Listing
 
@@ -402,7 +400,7 @@ def run_view(options: argparse.Namespace) -> int:
     """
     from ssh_abduction.cli.correct import as_corrected
     from ssh_abduction.data.corrections import beside
-    from ssh_abduction.data.map_file import read_json
+    from ssh_abduction.data.map_parts import read_json
     from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.content import Called, content_of  # loads numpy
     from ssh_abduction.page.html import Page
@@ -455,7 +453,7 @@ def _check(options: argparse.Namespace, trace: Trace | None) -> None:
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
     """Make the localised run that the options ask for; None if they ask for none."""
     from ssh_abduction.data.trace import Trace
-    from ssh_abduction.page.replays import Run
+    from ssh_abduction.page.content import Run
 
     if options.run is None and options.belief is None:
         return None
@@ -474,9 +472,9 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
 
 def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     """Make a run with the beliefs of a file that `localise --json` wrote. Raises MapError."""
-    from ssh_abduction.data.map_file import read_json
+    from ssh_abduction.data.map_parts import read_json
     from ssh_abduction.data.maps import maps_of
-    from ssh_abduction.page.replays import Run
+    from ssh_abduction.page.content import Run
 
     record = read_json(file)
     beliefs = record.get("beliefs") if isinstance(record, dict) else None

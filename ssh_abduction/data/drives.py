@@ -40,7 +40,6 @@ from pathlib import Path
 from statistics import median
 from typing import overload
 
-from ssh_abduction.data.action import Action
 from ssh_abduction.data.checks import a_list, a_text, all_instances
 from ssh_abduction.data.errors import TraceError, brief, checked_index
 from ssh_abduction.data.files import json_line
@@ -49,7 +48,7 @@ from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.schema import SparseData
 from ssh_abduction.data.star import is_four
-from ssh_abduction.data.step import Step
+from ssh_abduction.data.step import Action, Step
 from ssh_abduction.data.trace import Trace, checked_trace, images_file
 from ssh_abduction.data.words import counted
 

@@ -155,7 +155,7 @@ def source_of(path: str) -> str:
 
 
 @contextmanager
-def opened(path: str, what: str, error: type[AbductionError]) -> Iterator[BinaryIO]:
+def opened_file(path: str, what: str, error: type[AbductionError]) -> Iterator[BinaryIO]:
     """Open a file to read its bytes; "-" is standard input.
 
     If it cannot be opened, or read in the block, raise `error`, which names `what`.

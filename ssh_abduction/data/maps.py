@@ -25,18 +25,12 @@ from ssh_abduction.data.checks import a_list, a_whole_number, all_instances, an_
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import firsts, gathered, parts
-from ssh_abduction.data.map_file import (
-    MAP_FORMAT,
-    SOLUTION_FORMAT,
-    VERSION,
-    check_format,
-    map_fields,
-    read_json,
-    write_map,
-)
 from ssh_abduction.data.map_parts import (
     FAULTS,
+    MAP_FORMAT,
     NAMED,
+    SOLUTION_FORMAT,
+    VERSION,
     DState,
     Fault,
     Fit,
@@ -44,8 +38,12 @@ from ssh_abduction.data.map_parts import (
     Name,
     Pose,
     Region,
+    check_format,
+    map_fields,
+    read_json,
     renumbered,
     right_of,
+    write_map,
 )
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace

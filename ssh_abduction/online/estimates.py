@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from ssh_abduction.data.action import STANDARD_ACTIONS, TURN_DEGREES
 from ssh_abduction.data.gateways import ways
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Covariance, Displacement, Odometry, moved
 from ssh_abduction.data.star import SPREAD, Star
+from ssh_abduction.data.step import STANDARD_ACTIONS, TURN_DEGREES
 from ssh_abduction.data.trace import Action, Trace, View
 
 Array: TypeAlias = NDArray[np.float64]

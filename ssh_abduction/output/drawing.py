@@ -9,6 +9,7 @@ from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.output.layout import Turns
 from ssh_abduction.output.scene import (
     Disc,
     Label,
@@ -21,7 +22,6 @@ from ssh_abduction.output.scene import (
     escaped,
     scene_of,
 )
-from ssh_abduction.output.straight import Turns
 
 MARGIN = 24.0  # units of the page around the picture
 PIXELS, LARGEST = 96.0, 20.0  # units of the page in an inch, and inches of new axes at most
@@ -69,7 +69,8 @@ def _mark(mark: Mark, scale: float) -> str:
         return _element("g", f"<title>{escaped(mark.title)}</title>{inside}", **kind)
     if isinstance(mark, Line):
         return _line(mark, scale)
-    x, y = mark.at[0] * scale + 0.0, -mark.at[1] * scale + 0.0  # + 0.0 turns -0.0 into 0.0
+    # + 0.0 turns -0.0 into 0.0
+    x, y = round(mark.at[0] * scale, 1) + 0.0, round(-mark.at[1] * scale, 1) + 0.0
     if isinstance(mark, Disc):
         return _disc(mark, x, y)
     return _label(mark, x, y)
@@ -111,7 +112,7 @@ def _label(label: Label, x: float, y: float) -> str:
 
 def _at(point: Point, scale: float) -> str:
     """Write a point of the map as "x,y" on the page, where y points down."""
-    return f"{point[0] * scale + 0.0:.1f},{-point[1] * scale + 0.0:.1f}"
+    return f"{round(point[0] * scale, 1) + 0.0:.1f},{round(-point[1] * scale, 1) + 0.0:.1f}"
 
 
 def _element(tag: str, content: str = "", /, **attributes: str) -> str:

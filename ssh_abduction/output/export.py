@@ -36,8 +36,8 @@ from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.drawing import to_svg
 from ssh_abduction.output.graphs import in_text, to_dot, to_graphml, to_networkx
+from ssh_abduction.output.layout import Turns, degrees_of
 from ssh_abduction.output.roads import DIGITS, NO_PLACES, Road, Roads, Stop, undecided_places
-from ssh_abduction.output.straight import Turns, degrees_of
 
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
 FOR_NAVIGATION = ("nav2", "tmap2")  # these need positions

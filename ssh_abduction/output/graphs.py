@@ -15,7 +15,7 @@ from ssh_abduction.data.map_parts import course_named, ids_at, list_in_words
 from ssh_abduction.data.maps import DState, SSHMap, checked_map
 from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.output.straight import Turns, degrees_of
+from ssh_abduction.output.layout import Turns, degrees_of
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,8 +17,7 @@ from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.map_parts import ids_at
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, View
-from ssh_abduction.output.layout import Layout, layout, travelled
-from ssh_abduction.output.straight import Turns
+from ssh_abduction.output.layout import Layout, Turns, layout, travelled
 
 # Costs in metres: the least cost of a road, and the cost of a turn on the spot. A robot that drives
 # 0.5 m/s turns by 90 degrees in about a second.

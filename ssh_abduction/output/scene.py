@@ -27,8 +27,7 @@ from ssh_abduction.data.map_parts import Region, course_named, list_in_words
 from ssh_abduction.data.maps import DState, MapPath, SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import noun_of
-from ssh_abduction.output.layout import Layout, layout, travelled, untravelled
-from ssh_abduction.output.straight import Turns
+from ssh_abduction.output.layout import Layout, Turns, layout, travelled, untravelled
 
 Point: TypeAlias = tuple[float, float]
 

@@ -15,11 +15,10 @@ from typing import Any
 from ssh_abduction.data.checks import a_function, needed
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.files import filled
-from ssh_abduction.data.map_file import write_map
+from ssh_abduction.data.map_parts import write_map
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
-from ssh_abduction.page.content import content_of
-from ssh_abduction.page.replays import Run
+from ssh_abduction.page.content import Run, content_of
 from ssh_abduction.rivals.listing import Maps
 
 HERE = Path(__file__).parent

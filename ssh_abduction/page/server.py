@@ -28,9 +28,8 @@ from ssh_abduction.data.checks import a_list, one_of
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page import answers
-from ssh_abduction.page.content import Called, content_of
+from ssh_abduction.page.content import Called, Run, content_of
 from ssh_abduction.page.html import html_of
-from ssh_abduction.page.replays import Run
 from ssh_abduction.rivals.listing import Listing, PairInMap
 from ssh_abduction.solver import LimitError, Watch, in_process
 from ssh_abduction.theory.theory import Theory

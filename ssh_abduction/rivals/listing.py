@@ -33,8 +33,7 @@ from ssh_abduction.data.corrections import named_beside
 from ssh_abduction.data.drives import Drive, pieces_in_words
 from ssh_abduction.data.errors import MapError, brief, named
 from ssh_abduction.data.groups import firsts, gathered
-from ssh_abduction.data.map_file import read_json
-from ssh_abduction.data.map_parts import Fault
+from ssh_abduction.data.map_parts import Fault, read_json
 from ssh_abduction.data.maps import ID_LENGTH, SSHMap, checked_maps, maps_of
 from ssh_abduction.data.schema import PlainData
 from ssh_abduction.data.trace import View

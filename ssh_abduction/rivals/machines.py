@@ -31,11 +31,11 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.groups import firsts, reached
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import Star, star_to_json
+from ssh_abduction.data.step import QUARTERS
 from ssh_abduction.data.trace import Action, Trace, View
 from ssh_abduction.data.words import counted
 from ssh_abduction.solver import Watch, observation

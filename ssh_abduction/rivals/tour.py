@@ -40,10 +40,10 @@ from scipy import sparse
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.groups import firsts, gathered, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Frame, Star, angle_between
+from ssh_abduction.data.step import QUARTERS
 from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.rivals.machines import OF_FRAMES, Can, Seen, is_possible, leads_of
 from ssh_abduction.theory.settle import settle

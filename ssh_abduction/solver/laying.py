@@ -16,11 +16,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from ssh_abduction.data.action import Action
 from ssh_abduction.data.drives import drives_of, starts_of, together
 from ssh_abduction.data.groups import first_index_of, numbered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.step import Step
+from ssh_abduction.data.step import Action, Step
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.board import Judging

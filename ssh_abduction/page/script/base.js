@@ -3,7 +3,7 @@
 const NS = "http://www.w3.org/2000/svg";
 const ALPHABET = Array.from({ length: 92 }, (_, k) => String.fromCharCode(35 + k))
   .filter((c) => !"&<>\\".includes(c))
-  .join(""); // as in page/replays.py
+  .join(""); // as in page/content.py
 const COLOURS = 8; // the number of colours of paths
 const NEAREST = 22; // pixels: a click picks the nearest dstate that is no farther away
 const PLAYING = 700; // milliseconds for each step

@@ -15,8 +15,7 @@ from typing import Any
 from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.schema import FieldReader
-from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.trace_file import read_trace
+from ssh_abduction.data.trace import Trace, read_trace
 from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.steps.certificate import Basis, Certificate
 from ssh_abduction.solver.values import Bound, Cost, Effort, Grounding, Level, Seconds

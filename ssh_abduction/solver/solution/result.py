@@ -22,7 +22,13 @@ from ssh_abduction.data.drives import (
 )
 from ssh_abduction.data.errors import MapError, SolverError, brief, named
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.map_file import SOLUTION_FORMAT, VERSION, check_format, read_json, write_map
+from ssh_abduction.data.map_parts import (
+    SOLUTION_FORMAT,
+    VERSION,
+    check_format,
+    read_json,
+    write_map,
+)
 from ssh_abduction.data.maps import SSHMap, check_of_trace, maps_of
 from ssh_abduction.data.schema import FieldReader, plain
 from ssh_abduction.data.trace import Trace, checked_trace

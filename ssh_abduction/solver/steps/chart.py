@@ -26,7 +26,7 @@ from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
-from ssh_abduction.data.action import QUARTERS
+from ssh_abduction.data.step import QUARTERS
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.pairs import Earlier

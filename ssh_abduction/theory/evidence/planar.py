@@ -27,10 +27,10 @@ from functools import cache
 from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
-from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.groups import NodeClasses, gathered, minimal_part
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Openings
+from ssh_abduction.data.step import QUARTERS
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence

@@ -31,10 +31,10 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 from ssh_abduction.checker.checker import violations
-from ssh_abduction.data.action import Action
 from ssh_abduction.data.drives import frames_of
 from ssh_abduction.data.groups import first_index_of
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.step import Action
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.sources.metric.completing import valid_map

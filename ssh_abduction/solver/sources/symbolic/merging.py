@@ -51,9 +51,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.star import Openings
+from ssh_abduction.data.step import QUARTERS
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.runtime.clock import SHORT_TURN, each_looking, look_at_clock
 from ssh_abduction.solver.steps.apart import Matrix

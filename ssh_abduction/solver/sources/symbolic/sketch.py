@@ -52,7 +52,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Self
 
-from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.gateways import (
     Sight,
     allowed_headings,
@@ -62,6 +61,7 @@ from ssh_abduction.data.gateways import (
 )
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.star import Star
+from ssh_abduction.data.step import QUARTERS
 from ssh_abduction.data.trace import Action, Step, Trace, View
 from ssh_abduction.solver.steps.log import observation
 from ssh_abduction.theory.theory import Theory

@@ -46,9 +46,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from ssh_abduction.checker.checker import violations
-from ssh_abduction.data.action import QUARTERS
 from ssh_abduction.data.groups import NodeClasses, numbered
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.step import QUARTERS
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.runtime.clock import each_looking, look_at_clock
 from ssh_abduction.solver.sources.metric.completing import completed
