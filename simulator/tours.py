@@ -94,8 +94,29 @@ def simulate(
     Raises:
         SimulatorError: The route cannot be driven.
     """
-    _check(world, stars, every, camera)
+    if every is not None:
+        mend, what = "leave it out for images at dstates", "a number of metres"
+        a_number("every", every, SimulatorError, above=0, what=what, mend=mend)
+    a_flag("stars", stars, SimulatorError)
+    given = {"laser": laser, "body": body, "tolerance": tolerance, "camera": camera}
+    for (name, value), kind in zip(given.items(), (Laser, Body, Tolerance, Camera), strict=True):
+        if value is not None:
+            mend = f"make one with {kind.__name__}(), or leave it out"
+            an_instance(name, value, kind, SimulatorError, mend=mend)
     driver = _driver(world, tours, seed, laser, body, tolerance)
+    _refuse(
+        world,
+        (
+            every is not None and bool(world.lifts),
+            "every: expected no distance, as evenly spaced images would join the floors at its "
+            "lifts; leave it out",
+        ),
+        (
+            world.by_places,
+            "route: expected actions, got places, and a robot that drives to places writes a log "
+            "of scans; write --format carmen, or give a route of actions",
+        ),
+    )
     # The camera has its own noise, so that it does not change the drive.
     noise = np.random.default_rng([seed, 1])
     log = StepLog(driver, camera, noise, len(world.segments), tours * len(world.route))
@@ -113,28 +134,6 @@ def simulate(
     )
 
 
-def _check(world: World, stars: bool, every: float | None, camera: Camera | None) -> None:
-    """Check the arguments of `simulate` that other functions do not check."""
-    if every is not None:
-        mend, what = "leave it out for images at dstates", "a number of metres"
-        a_number("every", every, SimulatorError, above=0, what=what, mend=mend)
-    a_flag("stars", stars, SimulatorError)
-    if camera is not None:
-        mend = "make one with Camera(), or leave it out for ranges"
-        an_instance("camera", camera, Camera, SimulatorError, mend=mend)
-    an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
-    if every is not None and world.lifts:
-        raise SimulatorError(
-            f"every: expected no distance in {world.name}, as evenly spaced images would join "
-            "the floors at its lifts; leave it out"
-        )
-    if world.by_places:
-        raise SimulatorError(
-            f"{world.name}: route: expected actions, got places, and a robot that drives to places "
-            "writes a log of scans; write --format carmen, or give a route of actions"
-        )
-
-
 def record(
     world: World,
     tours: int = 1,
@@ -150,11 +149,8 @@ def record(
     turns every ten degrees. Raises SimulatorError if the route cannot be driven.
     """
     driver = _driver(world, tours, seed)
-    if world.lifts:
-        raise SimulatorError(
-            f"{world.name}: lifts: expected none in the log of a robot, as a log does not show "
-            "that the floor changes; leave out --format"
-        )
+    said = "lifts: expected none in the log of a robot, as a log does not show that the floor "
+    _refuse(world, (bool(world.lifts), f"{said}changes; leave out --format"))
     recorder = driver.recorder = Recorder(every)
     recorder.note(driver.world, driver.robot.pose)
     steps = []
@@ -185,13 +181,13 @@ def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]
             yield number, stop
             x, y, _ = driver.robot.pose
             way = space.part(world.segments.reshape(-1, 2)).way((x, y), world.stops[stop])
-            if way is None:
-                off = world.clearance(*world.stops[stop])
-                mend = f"open the walls, or move {stop}, which is {off:.2f} m off the nearest one"
-                raise SimulatorError(
-                    f"{world.name}: route: expected a way from ({x:.2f}, {y:.2f}) to {stop}, "
-                    f"got none; {mend}"
-                )
+            off = world.clearance(*world.stops[stop])
+            said = (
+                f"route: expected a way from ({x:.2f}, {y:.2f}) to {stop}, got none; open the "
+                f"walls, or move {stop}, which is {off:.2f} m off the nearest one"
+            )
+            _refuse(world, (way is None, said))
+            assert way is not None
             try:
                 deque(drive_along(driver, space, way), maxlen=0)
             except SimulatorError as error:
@@ -212,40 +208,35 @@ def _driver(
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     a_whole_number("tours", tours, SimulatorError, 1, MOST_TOURS)
     a_whole_number("seed", seed, SimulatorError)
-    for name, given, kind in (
-        ("laser", laser, Laser),
-        ("body", body, Body),
-        ("tolerance", tolerance, Tolerance),
-    ):
-        if given is not None:
-            mend = f"make one with {kind.__name__}(), or leave it out"
-            an_instance(name, given, kind, SimulatorError, mend=mend)
     body = body or Body()
-    _check_world(world, body)
+    x, y, _ = world.start
+    _refuse(
+        world,
+        (
+            bool(world.lifts) and world.angles == "any",
+            "lifts: expected a world whose streets meet at right angles, got one of any angles; "
+            'write "angles": "right", or leave out the lifts',
+        ),
+        (
+            not world.route,
+            "route: expected at least one action, got none; add it to the world, or give one",
+        ),
+        # The robot must fit where it starts.
+        (
+            not world.holds(x, y) or world.clearance(x, y) < body.radius,
+            f"start: expected a place {body.radius} m off the walls, got ({x}, {y}); move it",
+        ),
+    )
     rng = np.random.default_rng(seed)
     arranged, robot = world.arranged(rng), SimulatedRobot(body, world.start, rng)
     return Driver(arranged, robot, laser or Laser(), rng, tolerance or Tolerance())
 
 
-def _check_world(world: World, body: Body) -> None:
-    """Check that a robot can drive in a world. Raises SimulatorError."""
-    if world.lifts and world.angles == "any":
-        raise SimulatorError(
-            f"{world.name}: lifts: expected a world whose streets meet at right angles, got one "
-            'of any angles; write "angles": "right", or leave out the lifts'
-        )
-    if not world.route:
-        raise SimulatorError(
-            f"{world.name}: route: expected at least one action, got none; add it to the "
-            "world, or give one"
-        )
-    x, y, _ = world.start
-    # The robot must fit where it starts.
-    if not world.holds(x, y) or world.clearance(x, y) < body.radius:
-        raise SimulatorError(
-            f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, "
-            f"{y}); move it"
-        )
+def _refuse(world: World, *cases: tuple[bool, str]) -> None:
+    """Raise SimulatorError with the text of the first case that is true."""
+    for is_wrong, said in cases:
+        if is_wrong:
+            raise SimulatorError(f"{world.name}: {said}")
 
 
 def _at_dstates(log: StepLog, world: World, tours: int, stars: bool) -> Iterator[Step]:
@@ -306,8 +297,10 @@ def _legs(
     """Drive all tours. Before each action, yield its number over all tours, and its name."""
     pilot = pilot or (Pilot(driver) if world.angles == "any" else Corridors(driver))
     watch = DriveWatch(world, driver, tours)
-    with watch.start():
+    try:
         pilot.begin()
+    except SimulatorError as error:
+        raise SimulatorError(f"{error}{watch.because(driver.robot.pose)}") from None
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
@@ -383,7 +376,7 @@ class DriveWatch:
 
     The control laws see only images, so they do not notice when they confuse places. The watch
     compares the true pose with the true dstates (places with headings) of the world, if the world
-    has any. Its methods are used as `with` blocks around motions. Errors name the action and the
+    has any. `action` is used as a `with` block around each action. Errors name the action and the
     likely cause.
     """
 
@@ -391,17 +384,6 @@ class DriveWatch:
     driver: Driver  # of the robot that is watched
     tours: int  # number of tours that are driven
     _home: Pose | None = field(default=None, init=False)
-
-    @contextmanager
-    def start(self) -> Iterator[None]:
-        """Watch the robot on its way to its first dstate. Errors then name likely causes.
-
-        Raises SimulatorError if the robot does not reach a dstate.
-        """
-        try:
-            yield
-        except SimulatorError as error:
-            raise SimulatorError(f"{error}{self._because(self.driver.robot.pose)}") from None
 
     @contextmanager
     def action(self, number: int, name: str) -> Iterator[None]:
@@ -416,7 +398,7 @@ class DriveWatch:
         try:
             yield
         except SimulatorError as error:
-            raise SimulatorError(f"{error} ({where}){self._because(before)}") from None
+            raise SimulatorError(f"{error} ({where}){self.because(before)}") from None
         after = self.driver.robot.pose
         # The robot may not be where the control law assumes: nearer to another place, or far away.
         far = {name: math.dist(at, after[:2]) for name, at in self.world.places.items()}
@@ -425,7 +407,7 @@ class DriveWatch:
             raise SimulatorError(
                 f"{self.world.name}: {where}: expected the robot to come to "
                 f"{_at(expected, self.world.places[expected])}, got it {_at('', after)}, "
-                f"{far[expected]:.1f} m off; so it drives another route{self._because(before)}"
+                f"{far[expected]:.1f} m off; so it drives another route{self.because(before)}"
             )
         if place == len(self.world.route) - 1 and not self._are_alike(self._home, after):
             self._ended_elsewhere(tour, self._home, after)
@@ -440,7 +422,7 @@ class DriveWatch:
         )
         # Further tours would start from a wrong pose.
         if self.tours > 1:
-            raise SimulatorError(f"{text}; mend the route, or drive one tour{self._because(pose)}")
+            raise SimulatorError(f"{text}; mend the route, or drive one tour{self.because(pose)}")
         warnings.warn(
             f"{text}; it cannot be driven again from there", SimulatorWarning, stacklevel=2
         )
@@ -473,7 +455,7 @@ class DriveWatch:
                 ahead.append((x, state.place))
         return min(ahead)[1] if ahead else None
 
-    def _because(self, before: Pose) -> str:
+    def because(self, before: Pose) -> str:
         """The likely causes of an error since a pose, to end a message; empty if there are none."""
         world, body, noise = self.world, self.driver.robot.body, self.driver.laser.noise
         is_square, half = world.angles == "right", self._half_width(before)
