@@ -366,7 +366,7 @@ def covariance_of(report: Report, tolerance: Tolerance) -> Covariance:
     # A wrong heading moves the end sideways.
     by_start = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     whole = report.covariance + by_start @ left @ by_start.T + left
-    a, b, c = (tuple(float(f"{v:.4g}") for v in row) for row in (whole + whole.T) / 2)
+    a, b, c = (tuple(float(f"{v:.8g}") for v in row) for row in (whole + whole.T) / 2)
     return a, b, c  # type: ignore[return-value]
 
 
