@@ -306,7 +306,7 @@ def test_maps_without_regions_are_read() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("id", 4, r"regions\[0\].id: expected 0, its number in the list, got 4"),
+        ("id", 4, "regions: expected the ids 0, 1, 2"),
         ("places", [7], r"places: expected some places of the map"),
         ("bounds", [[0, 2]], r"bounds: expected pairs of a path of the map and 1 or -1"),
         ("inside", [0], r"inside: expected numbers of earlier regions"),

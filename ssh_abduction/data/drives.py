@@ -256,10 +256,9 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
     drives = [trace.steps[d.first : d.stop] for trace in parts for d in drives_of(trace)]
     if len(drives) == 1:
         return parts[0]
-    _warn_of_repeats(parts)
-    _warn_of_other_names(parts)
-    _warn_of_other_units(parts)
-    _warn_of_other_views(parts)
+    for doubts in (_repeats, _other_names, _other_units, _other_views):
+        for doubt in doubts(parts):
+            warnings.warn(doubt, stacklevel=2)
     begins = accumulate([0, *map(len, parts[:-1])])
     closures = [
         replace(closure, first=begin + closure.first, last=begin + closure.last)
@@ -345,19 +344,18 @@ def _names_of(traces: Sequence[Trace], *numbers: int) -> str:
     return f" ({', '.join(map(str, names))})" if all(names) else ""
 
 
-def _warn_of_repeats(traces: Sequence[Trace]) -> None:
-    """Warn if two traces have a drive with the same steps: most likely it was given twice."""
+def _repeats(traces: Sequence[Trace]) -> Iterator[str]:
+    """Say if two traces have a drive with the same steps: most likely it was given twice."""
     first: dict[tuple[Step, ...], tuple[int, str]] = {}
     for i, name, steps in ((i, *drive) for i, t in enumerate(traces) for drive in _recorded(t)):
         k, other = first.setdefault(steps, (i, name))
         named = f" ({other}, {name})" if _name(traces[k]) and _name(traces[i]) else ""
         if k != i:
-            text = f"traces {k + 1} and {i + 1} have the same steps{named}; give each drive once"
-            warnings.warn(text, stacklevel=3)
+            yield f"traces {k + 1} and {i + 1} have the same steps{named}; give each drive once"
 
 
-def _warn_of_other_names(traces: Sequence[Trace]) -> None:
-    """Warn if traces have different names for travels or turns that are alike in all else.
+def _other_names(traces: Sequence[Trace]) -> Iterator[str]:
+    """Say if traces have different names for travels or turns that are alike in all else.
 
     A trace with several such names uses them for something, such as the angles of its turns.
     """
@@ -370,11 +368,10 @@ def _warn_of_other_names(traces: Sequence[Trace]) -> None:
             first, others = known.setdefault(alike, (i, names))
             if not names & others and len(names) == len(others) == 1:
                 pair = " and ".join(brief(min(some)) for some in (others, names))
-                warnings.warn(
+                yield (
                     f"action: traces {first + 1} and {i + 1}{_names_of(traces, first, i)} have "
                     f"different names for one kind of action: {pair}; give both one name if they "
-                    "are one action",
-                    stacklevel=3,
+                    "are one action"
                 )
 
 
@@ -388,31 +385,29 @@ def travels_of(trace: Trace) -> list[float]:
     ]
 
 
-def _warn_of_other_units(traces: Sequence[Trace]) -> None:
-    """Warn if the displacements of two traces are so different that their units must be."""
+def _other_units(traces: Sequence[Trace]) -> Iterator[str]:
+    """Say if the displacements of two traces are so different that their units must be."""
     usual = {i: median(some) for i, trace in enumerate(traces) if (some := travels_of(trace))}
     least, most = (pick(usual, key=usual.__getitem__, default=0) for pick in (min, max))
     if usual and usual[most] > UNITS * usual[least]:
-        warnings.warn(
+        yield (
             f"displacement: the median travel of trace {least + 1} is {usual[least]:.3g} m, and "
             f"that of trace {most + 1} is {usual[most]:.3g} m{_names_of(traces, least, most)}; "
-            "give both in metres",
-            stacklevel=3,
+            "give both in metres"
         )
 
 
-def _warn_of_other_views(traces: Sequence[Trace]) -> None:
-    """Warn if two traces have no view in common: then they can have no dstate in common."""
+def _other_views(traces: Sequence[Trace]) -> Iterator[str]:
+    """Say if two traces have no view in common: then they can have no dstate in common."""
     seen = [set(trace.views) for trace in traces]
     if len(seen) < 2 or any(None in views for views in seen):  # unknown: it may be any view
         return
     alone = [i for i, v in enumerate(seen) if v.isdisjoint(set().union(*seen[:i], *seen[i + 1 :]))]
     for i in alone[-1:] if len(seen) == 2 else alone:  # of two traces, one is enough
-        warnings.warn(
+        yield (
             f"views: trace {i + 1}{_names_of(traces, i)} has no view in common with another "
             "trace, so no view says where the trace belongs; leave it out, or give one name to "
-            "views that are one",
-            stacklevel=3,
+            "views that are one"
         )
 
 

@@ -452,17 +452,13 @@ def turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
     # the bearing or the gateway of a turn is more precise than right, left and around
     if action.bearing is not None:
         return any(angle_between(r, round(action.bearing)) <= SPREAD for r in found)
-    gateways = list(zip(before.bearings, before.spreads, strict=True))
-    is_ahead = [angle_between(bearing, 0) <= spread + ROUNDING for bearing, spread in gateways]
     if action.gateway is not None:
-        beside = [gateways[k] for k in range(before.slots) if not is_ahead[k]]
-        if action.turn == "left":
-            beside.reverse()
-        return action.gateway <= len(beside) and bool(found & arc(*beside[action.gateway - 1]))
+        slot = before.nth(action.turn, action.gateway)
+        return slot is not None and bool(found & arc(before.bearings[slot], before.spreads[slot]))
     if action.turn == "around":
-        others = zip(is_ahead, before.opposite, strict=True)
-        behind = [gateways[k] for ahead, k in others if ahead and k is not None]
-        return any(found & arc(*gateway) for gateway in [(180, 0), *behind[:1]])
+        behind = (k for slot, k in enumerate(before.opposite) if before.faces(slot))
+        gateways = [(before.bearings[k], before.spreads[k]) for k in behind if k is not None]
+        return any(found & arc(*gateway) for gateway in [(180, 0), *gateways[:1]])
     sides = (r if action.turn == "right" else 360 - r for r in found)
     return any(2 * SPREAD < side < 180 - 2 * SPREAD for side in sides)
 
@@ -510,13 +506,8 @@ def passes(frame: Frame) -> tuple[int, int] | None:
     The robot must face the first one, or have the second one straight behind it. None if there is
     no such pair.
     """
-    for k, (bearing, spread, other) in enumerate(
-        zip(frame.bearings, frame.spreads, frame.opposite, strict=True)
-    ):
-        if other is not None and (
-            angle_between(bearing, 0) <= spread + ROUNDING
-            or angle_between(frame.bearings[other], 180) <= frame.spreads[other] + ROUNDING
-        ):
+    for k, other in enumerate(frame.opposite):
+        if other is not None and (frame.faces(k) or frame.has_behind(other)):
             return k, other
     return None
 

@@ -445,7 +445,7 @@ class _MapReader(FieldReader):
     @property
     def pair(self) -> Shape[Any]:
         """The shape of two integers."""
-        return self.exactly(2, self.integer, "a list of two numbers")
+        return self.several(self.integer, "a list of two numbers", 2)
 
     def fields(self, data: Any) -> dict[str, Any]:
         """Return the arguments of SSHMap by name."""
@@ -455,18 +455,24 @@ class _MapReader(FieldReader):
         places, paths = may_have("places", self.integer), may_have("paths", self._path)
         names = may_have("names", self._name)
         # Fields refer to dstates, places and paths by their ids, so check these first.
-        self._check_ids(dstates, places, paths)
-        labels = self._labels(record, len(dstates))
+        self._check_numbered("dstates", dstates)
+        self._check_listed("places", places, {s.place for s in dstates})
+        self._check_listed("places", places, {q for path in paths for q in path.order})
+        self._check_listed("paths", [path.id for path in paths], {s.path for s in dstates})
+        label = self.within(0, len(dstates) - 1, f"the id of one of {len(dstates)} dstates")
+        if not (labels := each("labels", label)):
+            raise self.wrong("labels", "the dstate of each step", [])
+        last = len(labels) - 1
+        starts = may_have("starts", self.within(1, last, f"a step from 1 to {last}"))
+        if list(starts) != sorted({*starts}):
+            raise self.wrong("starts", "steps in order", list(starts))
         self._check_once("names", [name.text for name in names])
         region = partial(self._region, {*places}, {path.id for path in paths})
         regions = None if record.get("regions") is None else each("regions", region)
-        for number, found in enumerate(regions or ()):
-            if found.id != number:
-                expected = f"{number}, its number in the list"
-                raise self.wrong(f"regions[{number}].id", expected, found.id)
+        self._check_numbered("regions", regions or ())
         return {
             "dstate_at": labels,
-            "starts": self._starts(record, len(labels)),
+            "starts": starts,
             "dstates": dstates,
             "links": each("links", partial(self._link, len(dstates))),
             "places": places,
@@ -478,45 +484,22 @@ class _MapReader(FieldReader):
             "names": names,
         }
 
-    def _check_ids(
-        self, dstates: Sequence[DState], places: Sequence[int], paths: Sequence[MapPath]
-    ) -> None:
-        """Check that dstates are numbered, and places and paths listed if they are used."""
-        ids = [s.id for s in dstates]
-        if ids != list(range(len(dstates))):
-            raise self.wrong("dstates", "the ids 0, 1, 2, … in this order", ids)
-        used_places = {s.place for s in dstates} | {q for p in paths for q in p.order}
-        path_ids = [p.id for p in paths]
-        for name, known, used in (
-            ("places", places, used_places),
-            ("paths", path_ids, {s.path for s in dstates}),
-        ):
-            if missing := used - {None, *known}:
-                expected = f"every id that is used, also {min(missing, key=str)}"
-                raise self.wrong(name, expected, list(known))
-            self._check_once(name, known)
+    def _check_numbered(self, name: str, things: Sequence[DState | Region]) -> None:
+        """Check that the ids are the indices."""
+        ids = [thing.id for thing in things]
+        if ids != list(range(len(ids))):
+            raise self.wrong(name, "the ids 0, 1, 2, … in this order", ids)
+
+    def _check_listed(self, name: str, ids: Sequence[int], used: Set[int | None]) -> None:
+        """Check that all ids that are used are listed, each once."""
+        if missing := used - {None, *ids}:
+            expected = f"every id that is used, also {min(missing, key=str)}"
+            raise self.wrong(name, expected, list(ids))
+        self._check_once(name, ids)
 
     def _check_once(self, name: str, values: Sequence[object]) -> None:
         if len(set(values)) < len(values):
             raise self.wrong(name, "each once", list(values))
-
-    def _labels(self, record: Mapping[str, Any], dstates: int) -> tuple[int, ...]:
-        """Convert and check the dstate of each step."""
-        labels = self.each(record, "labels", self.integer)
-        if not labels:
-            raise self.wrong("labels", "the dstate of each step", [])
-        for i, label in enumerate(labels):
-            if not 0 <= label < dstates:
-                expected = f"the id of one of {dstates} dstates"
-                raise self.wrong(f"labels[{i}]", expected, label)
-        return labels
-
-    def _starts(self, record: Mapping[str, Any], steps: int) -> tuple[int, ...]:
-        """Convert and check the steps at which drives start, besides step 0."""
-        starts = self.each(record, "starts", self.integer, optional=True)
-        if list(starts) != sorted({*starts}) or not all(0 < t < steps for t in starts):
-            raise self.wrong("starts", f"steps from 1 to {steps - 1} in order", list(starts))
-        return starts
 
     def _dstate(self, value: Any, name: str) -> DState:
         """Read a dstate. The caller checks that its place and path exist."""
@@ -590,24 +573,24 @@ class _MapReader(FieldReader):
 
     def _region(self, places: Set[int], paths: Set[int], value: Any, name: str) -> Region:
         """Read a region. Its places and paths must be those of the map."""
-        reader = _MapReader(f"{self.where}: {name}")
-        region = reader.record(
+        region = self.record(
             Region,
-            self.mapping(value, name),
-            "",
-            id=reader.integer,
-            places=reader.integers,
-            bounds=reader.several(reader.pair, "a list"),
-            door=reader.maybe(reader.integer),
-            inside=reader.integers,
+            value,
+            name,
+            id=self.integer,
+            places=self.integers,
+            bounds=self.several(self.pair, "a list"),
+            door=self.maybe(self.integer),
+            inside=self.integers,
         )
         spots = [*region.places, *(() if region.door is None else (region.door,))]
         if not region.places or not {*spots} <= places:
-            raise reader.wrong("places", "some places of the map", spots)
+            raise self.wrong(f"{name}.places", "some places of the map", spots)
         if any(h not in paths or d not in (1, -1) for h, d in region.bounds):
-            raise reader.wrong("bounds", "pairs of a path of the map and 1 or -1", [*region.bounds])
+            expected = "pairs of a path of the map and 1 or -1"
+            raise self.wrong(f"{name}.bounds", expected, [*region.bounds])
         if any(not 0 <= i < region.id for i in region.inside):
-            raise reader.wrong("inside", "numbers of earlier regions", [*region.inside])
+            raise self.wrong(f"{name}.inside", "numbers of earlier regions", [*region.inside])
         return region
 
     def _name(self, value: Any, name: str) -> Name:
@@ -624,7 +607,7 @@ class _MapReader(FieldReader):
             return None
         numbers = dict.fromkeys(("chi2", "dof", "p", "scale", "bend"), self.number)
         fit = self.record(Fit, record["fit"], "fit", **numbers)
-        three: Shape[Any] = self.exactly(3, self.number, "three numbers")
+        three: Shape[Any] = self.several(self.number, "three numbers", 3)
         rows, spreads = (
             self.each(record, name, three, optional=True) for name in ("poses", "spreads")
         )

@@ -91,6 +91,12 @@ class FieldReader:
 
     def __init__(self, where: str) -> None:
         self.where = a_text("where", where, self.error)
+        is_object = "an object", lambda value: isinstance(value, Mapping)
+        self.mapping: Shape[Mapping[str, Any]] = self.that(*is_object)
+        self.integer: Shape[int] = self.that("an integer", _is_integer)
+        self.integers: Shape[tuple[int, ...]] = self.several(self.integer, "a list of integers")
+        self.whole: Shape[int] = self.within(0, math.inf, "a whole number, 0 or more")
+        self.text: Shape[str] = self.text_called("a text")
 
     def wrong(self, name: str, expected: str, value: Any) -> AbductionError:
         """Return the error for a field with a wrong value."""
@@ -128,22 +134,6 @@ class FieldReader:
             raise self.wrong(name, "a list", value)
         return value
 
-    def mapping(self, value: Any, name: str) -> Mapping[str, Any]:
-        if not isinstance(value, Mapping):
-            raise self.wrong(name, "an object", value)
-        return value
-
-    def integer(self, value: Any, name: str) -> int:
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise self.wrong(name, "an integer", value)
-        return value
-
-    def integers(self, value: Any, name: str) -> tuple[int, ...]:
-        return self.several(self.integer, "a list of integers")(value, name)
-
-    def whole(self, value: Any, name: str) -> int:
-        return self.within(0, math.inf, "a whole number, 0 or more")(value, name)
-
     def number(self, value: Any, name: str) -> float:
         if not is_finite(value):
             raise self.wrong(name, "a finite number", value)
@@ -154,18 +144,19 @@ class FieldReader:
             raise self.wrong(name, "a number, 0 or more", value)
         return float(value)
 
-    def text(self, value: Any, name: str) -> str:
-        return self.text_called("a text")(value, name)
+    def that(self, expected: str, is_good: Callable[[Any], bool]) -> Shape[Any]:
+        """Make the shape of a value that passes a test. Messages call it `expected`."""
 
-    def text_called(self, expected: str) -> Shape[str]:
-        """Make the shape of a text, which messages call `expected`."""
-
-        def read(value: Any, name: str) -> str:
-            if not isinstance(value, str):
+        def read(value: Any, name: str) -> Any:
+            if not is_good(value):
                 raise self.wrong(name, expected, value)
             return value
 
         return read
+
+    def text_called(self, expected: str) -> Shape[str]:
+        """Make the shape of a text, which messages call `expected`."""
+        return self.that(expected, lambda value: isinstance(value, str))
 
     def values(self, read: Shape[T]) -> Shape[dict[str, T]]:
         """Make the shape of an object whose values all have one shape."""
@@ -175,13 +166,7 @@ class FieldReader:
 
     def within(self, low: int, high: float, expected: str) -> Shape[int]:
         """Make the shape of an integer from `low` to `high`, which messages call `expected`."""
-
-        def read(value: Any, name: str) -> int:
-            if not low <= self.integer(value, name) <= high:
-                raise self.wrong(name, expected, value)
-            return int(value)
-
-        return read
+        return self.that(expected, lambda value: _is_integer(value) and low <= value <= high)
 
     def maybe(self, read: Shape[T], default: Any = None) -> Shape[T | Any]:
         """Make the shape of a value that may be null, which becomes the default."""
@@ -189,42 +174,32 @@ class FieldReader:
 
     def one_of(self, choices: Collection[str]) -> Shape[Any]:
         """Make the shape of a text that is one of these."""
+        return self.that(
+            " or ".join(choices), lambda value: isinstance(value, str) and value in choices
+        )
 
-        def read(value: Any, name: str) -> Any:
-            if not isinstance(value, str) or value not in choices:
-                raise self.wrong(name, " or ".join(choices), value)
-            return value
-
-        return read
-
-    def several(self, read: Shape[T], expected: str) -> Shape[tuple[T, ...]]:
-        """Make the shape of a list, which messages call `expected`."""
+    def several(
+        self, read: Shape[T], expected: str, count: int | None = None
+    ) -> Shape[tuple[T, ...]]:
+        """Make the shape of a list, of `count` values if given, which messages call `expected`."""
 
         def read_all(value: Any, name: str) -> tuple[T, ...]:
-            if not isinstance(value, list):
+            if not isinstance(value, list) or count not in (None, len(value)):
                 raise self.wrong(name, expected, value)
             return tuple(read(part, f"{name}[{i}]") for i, part in enumerate(value))
-
-        return read_all
-
-    def exactly(self, count: int, read: Shape[T], expected: str) -> Shape[Any]:
-        """Make the shape of a list of `count` values, which messages call `expected`."""
-
-        def read_all(value: Any, name: str) -> tuple[T, ...]:
-            if not isinstance(value, list) or len(value) != count:
-                raise self.wrong(name, expected, value)
-            return tuple(read(part, name) for part in value)
 
         return read_all
 
     def view(self, expected: str) -> Shape[View | None]:
         """Make the shape of a view: a text or an integer, or None for an unknown one."""
 
-        def read(value: Any, name: str) -> View | None:
-            is_view = isinstance(value, str | int | None) and not isinstance(value, bool)
-            if not is_view or (isinstance(value, str) and not is_writable(value)):
-                raise self.wrong(name, expected, value)
-            view: View | None = value
-            return view
+        def is_view(value: Any) -> bool:
+            if isinstance(value, str):
+                return is_writable(value)
+            return value is None or _is_integer(value)
 
-        return read
+        return self.that(expected, is_view)
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)

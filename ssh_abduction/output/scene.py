@@ -13,6 +13,7 @@ that has none: see `DState.site`.
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -50,7 +51,7 @@ DEVIATIONS = 2.0  # the half axes of ellipses, in standard deviations
 # In a map without places, dstates nearer than this share of the longest link are drawn as if the
 # robot only turned between them.
 TURNS = 0.1
-BENT = 8  # pieces of the chain that is drawn for a bent link
+ASIDE = 3.0  # in units of the page, how far the arrow of a link is from the line of its ends
 # The largest number of characters of a view below a dstate. A longer view is cut at the beginning,
 # because long names often begin alike.
 LONGEST_LABEL = 20
@@ -234,9 +235,8 @@ class _Drawing:
     def along(self, s: DState, ahead: float, left: float = 0.0) -> Point:
         """The point `ahead` and `left` of a dstate, in units of the page times `unit`."""
         x, y, heading = self.at[s.id]
-        ahead, left, heading = self.far(ahead), self.far(left), heading or 0.0
-        cos, sin = math.cos(heading), math.sin(heading)
-        return x + ahead * cos - left * sin, y + ahead * sin + left * cos
+        spot = complex(x, y) + self.far(1) * complex(ahead, left) * cmath.rect(1.0, heading or 0.0)
+        return spot.real, spot.imag
 
     def _is_first(self, site: int) -> bool:
         """Whether the robot began at a site."""
@@ -344,14 +344,9 @@ class _Drawing:
 
     def head(self, tip: Point, way: float, colour: str, ahead: float, aside: float) -> Line:
         """Draw the head of an arrow that ends `ahead` of a point, in direction `way` (radians)."""
-        cos, sin = math.cos(way), math.sin(way)
-        corners = ((ahead, 0.0), (-ahead, aside), (-ahead, -aside))
-        x, y = tip
-        turned = [
-            (x + self.far(u) * cos - self.far(v) * sin, y + self.far(u) * sin + self.far(v) * cos)
-            for u, v in corners
-        ]
-        return _filled(turned, colour, 0.5)
+        corners = (complex(ahead, 0.0), complex(-ahead, aside), complex(-ahead, -aside))
+        unit = cmath.rect(self.far(1), way)
+        return _filled(_points(complex(*tip) + unit * corner for corner in corners), colour, 0.5)
 
     def streets_along(self, path: MapPath) -> list[tuple[int, int]]:
         """The streets of a path in direction +1: travelled ones, the longest first.
@@ -367,37 +362,31 @@ class _Drawing:
         return streets or list(pairwise(path.order))[: 0 if self.metric else 1]
 
     def links(self) -> list[Mark]:
-        """Draw the links of a map without places as bent arrows."""
+        """Draw the links of a map without places as arrows."""
         marks: list[Mark] = []
-        for chain, _ in self.curves():
-            (ax, ay), (bx, by) = chain[-2:]
-            marks.append(Line((chain,), "#999", 1.4 * self.unit))
-            marks.append(self.head((bx, by), math.atan2(by - ay, bx - ax), "#999", 4, 3.5))
+        for (start, end), _ in self.arrows():
+            way = math.atan2(end[1] - start[1], end[0] - start[0])
+            marks.append(Line(((start, end),), "#999", 1.4 * self.unit))
+            marks.append(self.head(end, way, "#999", 4, 3.5))
         return marks
 
-    def curves(self) -> list[tuple[tuple[Point, ...], str]]:
-        """Find the bent chain of points, and the actions, of each pair of linked dstates."""
-        curves = []
+    def arrows(self) -> list[tuple[tuple[Point, ...], str]]:
+        """Find the ends of the arrow, and the actions, of each pair of linked dstates."""
+        arrows = []
         for (source, target), names in link_names(self.map).items():
             a, b = self.map.dstates[source], self.map.dstates[target]
-            (x, y), (u, v) = here, there = self.at[source][:2], self.at[target][:2]
-            apart = math.dist(here, there) or 1.0
-            is_turn = apart < self.far(2 * END) and self.metric
-            bend = 0.35 if is_turn else 0.08
+            here, there = complex(*self.at[source][:2]), complex(*self.at[target][:2])
             if self.at[source][2] is None:
-                gap = self.far(RADIUS + 4) / apart
-                start = x + (u - x) * gap, y + (v - y) * gap
-                end, bend = (u - (u - x) * gap, v - (v - y) * gap), 0.2
+                gap = (there - here) / (abs(there - here) or 1.0) * self.far(RADIUS + 4)
+                start, end = here + gap, there - gap
             else:
-                start, end = self.along(a, END + 2), self.along(b, END + 2 if is_turn else -BEGIN)
-            bend *= math.dist(start, end)
-            mx, my = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
-            # Bend a turn away from the dstate, and two opposite links away from each other.
-            away = (mx - x, my - y) if is_turn else (end[1] - start[1], start[0] - end[0])
-            far = math.hypot(*away) or 1.0
-            middle = (mx + away[0] / far * bend, my + away[1] / far * bend)
-            curves.append((_bent(start, middle, end), names))
-        return curves
+                is_turn = self.metric and abs(there - here) < self.far(2 * END)
+                start = complex(*self.along(a, END + 2))
+                end = complex(*self.along(b, END + 2 if is_turn else -BEGIN))
+            # Two opposite links are beside each other.
+            aside = 1j * (start - end) / (abs(start - end) or 1.0) * self.far(ASIDE)
+            arrows.append((_points([start + aside, end + aside]), names))
+        return arrows
 
     def lifts(self) -> list[Mark]:
         """Draw lifts of a map with places as dashed lines."""
@@ -484,8 +473,8 @@ class _Drawing:
             ]
             yield self.map.called("path", path.id), beside, 6, colour_of(path.id), 12, False
         if not self.map.places:
-            for chain, names in self.curves():
-                yield names, [chain[BENT // 2]], 0, "#777", 10, False
+            for ((x, y), (u, v)), names in self.arrows():
+                yield names, [((x + u) / 2, (y + v) / 2)], 0, "#777", 10, False
 
     def _around(self, at: Point, w: float, h: float, gap: float) -> Iterator[Point]:
         """Yield points near a point for a label of this half width and height."""
@@ -597,12 +586,9 @@ def _filled(corners: Sequence[Point], colour: str, width: float, outline: str = 
     return Line(((*corners, corners[0]),), outline or colour, width, fill=colour)
 
 
-def _bent(start: Point, middle: Point, end: Point) -> tuple[Point, ...]:
-    """Place points on the quadratic curve that bends towards a middle."""
-    ends = [complex(*point) for point in (start, middle, end)]
-    shares = [k / BENT for k in range(BENT + 1)]
-    curve = [(1 - t) ** 2 * ends[0] + 2 * t * (1 - t) * ends[1] + t**2 * ends[2] for t in shares]
-    return tuple((point.real, point.imag) for point in curve)
+def _points(numbers: Iterable[complex]) -> tuple[Point, ...]:
+    """Convert complex numbers to points."""
+    return tuple((number.real, number.imag) for number in numbers)
 
 
 def _scale(spots: Sequence[Point], nearest: float) -> tuple[float, float]:

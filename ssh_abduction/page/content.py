@@ -21,14 +21,15 @@ import math
 import time
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import count, pairwise
-from statistics import fmean, median
+from statistics import fmean
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from perception.errors import PerceptionError
 from perception.images import images_held
@@ -111,7 +112,7 @@ def content_of(
         "replays": replays(maps, [one["labeling"] for one in entries], trace, run),
         "maps": entries,
         "labelings": [{"labels": labels, "views": views} for labels, views in shared.labelings],
-        "places": _differences(list(shared.places)),
+        "places": list(shared.places),
         "orders": list(shared.orders),
         "faults": list(shared.faults),
         "regions": list(shared.regions),
@@ -223,22 +224,6 @@ def _choice(choice: Choice) -> dict[str, Any]:
     return {"questions": [str(question) for question in choice.questions], "options": options}
 
 
-def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
-    """Shorten lists of (place, path, direction), which have an entry for each dstate.
-
-    The first list stays. A later one is replaced by its differences from the first, as a dict
-    {index: value}, if that is shorter.
-    """
-    first = items[0]
-    entries: list[Any] = [first]
-    for item in items[1:]:
-        pairs = enumerate(zip(item, first, strict=False))
-        differing = {str(i): value for i, (value, other) in pairs if value != other}
-        is_shorter = len(item) == len(first) and 2 * len(differing) < len(item)
-        entries.append(differing if is_shorter else item)
-    return entries
-
-
 def _layouts(
     maps: Sequence[SSHMap], entries: Sequence[dict[str, Any]], trace: Trace | None
 ) -> list[tuple[int, Layout]]:
@@ -267,16 +252,11 @@ def _layouts(
 
 
 def _unit(found: Layout) -> float:
-    """Compute the median |dx| + |dy| from places, or dstates, to the nearest one.
-
-    At most 200 of them are measured.
-    """
-    points = list(found.places.values()) or [(x, y) for x, y, _ in found.dstates]
-    nearest = [
-        min((abs(x - u) + abs(y - v) for u, v in points if (u, v) != (x, y)), default=0.0)
-        for x, y in points[:200]
-    ]
-    return median([d for d in nearest if d > 0] or [1.0])
+    """Compute the median distance from places, or dstates, to the nearest one."""
+    points = {*found.places.values()} or {(x, y) for x, y, _ in found.dstates}
+    if len(points) < 2:
+        return 1.0
+    return float(np.median(cKDTree([*points]).query([*points], 2)[0][:, 1]))
 
 
 def _numbers(found: Layout, ssh_map: SSHMap) -> dict[str, Any]:
@@ -353,49 +333,6 @@ def _spots(first: SSHMap, found: Layout) -> list[Spot]:
     return spots
 
 
-class _Counts:
-    """Counts the maps that have each dstate, place and street, given by its steps.
-
-    `along` counts the maps in which a dstate or street is on a path with certain steps. Its keys
-    are pairs: the dstate or street, and the steps of the path.
-    """
-
-    def __init__(self) -> None:
-        self.dstates: Counter[Steps] = Counter()
-        self.places: Counter[Steps] = Counter()
-        self.streets: Counter[Pair] = Counter()
-        self.along: Counter[tuple[Steps | Pair, Steps]] = Counter()
-
-    def add(self, ssh_map: SSHMap) -> None:
-        """Count what a map has."""
-        at = [ssh_map.dstates[label] for label in ssh_map.dstate_at]
-        of_dstate = _members(ssh_map.dstate_at)
-        of_place = _members([s.place for s in at])
-        of_path = _members([s.path for s in at])
-        self.dstates.update(of_dstate.values())
-        self.places.update(of_place.values())
-        paths = ((steps, at[steps[0]].path) for steps in of_dstate.values())
-        self.along.update((steps, of_path[h]) for steps, h in paths if h is not None)
-        # Only streets that the robot travelled count: it went between two places along one path, or
-        # in a map without paths. The order of other places on a path is one of many possible ones.
-        streets: dict[Pair, Steps | None] = {}
-        for s, _, x in ssh_map.links:
-            a, b = ssh_map.dstates[s], ssh_map.dstates[x]
-            if None in (a.place, b.place) or a.place == b.place or a.path != b.path:
-                continue
-            if a.floor == b.floor and a.place in of_place and b.place in of_place:
-                pair = frozenset((of_place[a.place], of_place[b.place]))
-                streets[pair] = None if a.path is None else of_path[a.path]
-        if not ssh_map.places:
-            streets = {
-                frozenset((of_dstate[s], of_dstate[x])): None
-                for s, _, x in ssh_map.links
-                if s != x and s in of_dstate and x in of_dstate
-            }
-        self.streets.update(streets.keys())
-        self.along.update((pair, path) for pair, path in streets.items() if path is not None)
-
-
 def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
     """Collect all dstates, places and travelled streets that any map has, for JSON.
 
@@ -405,27 +342,58 @@ def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
     largest number of maps that agree on all steps along its path. `streets` are lists [node, node,
     maps, path].
     """
-    counts = _Counts()
+    # Count the maps that have each dstate, place and street, given by its steps; and those in which
+    # a dstate or street is on a path with certain steps.
+    dstates, places, streets = Counter[Steps](), Counter[Steps](), Counter[Pair]()
+    along = Counter[tuple[Steps | Pair, Steps]]()
     for ssh_map in maps:
-        counts.add(ssh_map)
+        at = [ssh_map.dstates[label] for label in ssh_map.dstate_at]
+        of_dstate, of_place, of_path = (
+            _members(names)
+            for names in (ssh_map.dstate_at, [s.place for s in at], [s.path for s in at])
+        )
+        dstates.update(of_dstate.values())
+        places.update(of_place.values())
+        on_path = ((steps, at[steps[0]].path) for steps in of_dstate.values())
+        along.update((steps, of_path[h]) for steps, h in on_path if h is not None)
+        travelled = _streets(ssh_map, of_place if ssh_map.places else of_dstate)
+        streets.update(travelled.keys())
+        along.update((pair, of_path[h]) for pair, h in travelled.items() if h is not None)
     agreed: dict[Any, int] = {}
-    for (thing, _), maps_with in counts.along.items():
+    for (thing, _), maps_with in along.items():
         agreed[thing] = max(maps_with, agreed.get(thing, 0))
-    nodes = counts.places or counts.dstates
+    nodes = places or dstates
     number = {steps: i for i, steps in enumerate(nodes)}
     return {
         "nodes": [{"steps": s, "maps": n, **_middle(s, spots)} for s, n in nodes.items()],
         "dstates": [
             {"steps": s, "maps": count, "path": agreed.get(s, count), **_middle(s, spots)}
-            for s, count in counts.dstates.items()
-            if counts.places
+            for s, count in dstates.items()
+            if places
         ],
         "streets": [
             [*sorted(number[steps] for steps in pair), count, agreed.get(pair, count)]
-            for pair, count in counts.streets.items()
+            for pair, count in streets.items()
             if len(pair) == 2
         ],
     }
+
+
+def _streets(ssh_map: SSHMap, steps_of: Mapping[int | None, Steps]) -> dict[Pair, int | None]:
+    """Find the streets that the robot travelled, each with its path; None if there is none.
+
+    It went between two places along one path or, in a map without paths, by any action. In a map
+    without places, each link is a street. The order of other places on a path is one of many.
+    """
+    streets: dict[Pair, int | None] = {}
+    for s, _, x in ssh_map.links:
+        a, b = ssh_map.dstates[s], ssh_map.dstates[x]
+        ends = (a.place, b.place) if ssh_map.places else (s, x)
+        is_one_way = not ssh_map.places or (a.path == b.path and a.floor == b.floor)
+        if is_one_way and ends[0] != ends[1] and steps_of.keys() >= {*ends}:
+            pair = frozenset((steps_of[ends[0]], steps_of[ends[1]]))
+            streets[pair] = a.path if ssh_map.places else None
+    return streets
 
 
 def _members(names: Sequence[int | None]) -> dict[int | None, Steps]:

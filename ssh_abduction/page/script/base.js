@@ -13,7 +13,6 @@ const served = data.served;
 const assumed = { same: [], different: [] };
 const state = { mode: "overview", map: 0, other: 1, step: 0, picked: [], replay: 0, region: null };
 let decoded = new Map(),
-  placed = new Map(),
   figures = [];
 
 function element(name, attributes = {}, text = null, parent = null) {

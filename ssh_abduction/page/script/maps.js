@@ -2,13 +2,7 @@
 
 // The place, path and direction of each dstate of a map.
 function whereIn(i) {
-  const number = data.maps[i].places;
-  if (!placed.has(number)) {
-    const first = data.places[0],
-      raw = data.places[number];
-    placed.set(number, Array.isArray(raw) ? raw : first.map((value, k) => raw[k] ?? value));
-  }
-  return placed.get(number);
+  return data.places[data.maps[i].places];
 }
 
 function labelsOf(i) {

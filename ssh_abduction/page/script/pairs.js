@@ -197,7 +197,6 @@ async function assume(kind) {
     Object.assign(assumed, wanted);
     data = told.content;
     decoded = new Map();
-    placed = new Map();
     load(false);
   }
   $("answer").textContent =

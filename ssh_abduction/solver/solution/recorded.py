@@ -139,7 +139,7 @@ def joins_in(
 
     def join(value: Any, name: str) -> Join:
         written = read.mapping(value, name)
-        two_steps = read.exactly(2, read.integer, "two steps")
+        two_steps = read.several(read.integer, "two steps", 2)
         first, second = two_steps(written.get("steps"), f"{name}.steps")
         if not 0 <= first < second < steps:
             expected = f"two steps from 0 to {steps - 1}"

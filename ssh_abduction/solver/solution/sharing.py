@@ -337,8 +337,8 @@ def _read_shared(
         Shared,
         record,
         sort,
-        always=read.exactly(count, read.whole, f"{count} numbers"),
-        sometimes=read.several(read.exactly(2, step, pairs), pairs),
+        always=read.several(read.whole, f"{count} numbers", count),
+        sometimes=read.several(read.several(step, pairs, 2), pairs),
     )
     differing = read.several(step, f"a list of steps from 0 to {steps - 1}")
     return replace(
