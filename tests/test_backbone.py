@@ -18,14 +18,13 @@ from brute_force import Key, minimal_maps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
-from turns import STEPWISE, stepwise, turn_with
+from turns import STEPWISE, stepwise
 from worlds import HEADINGS, QUARTERS, TWO_BLOCKS, Streets, drive, rectangle, written
 
 from benchmarks.instances import maze
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, Odometry, SolverError
-from ssh_abduction.data.words import counted
 from ssh_abduction.rivals import difference
 from ssh_abduction.solver import (
     Search,
@@ -165,8 +164,8 @@ def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
     [pytest.param(60.0, StepEngine, marks=pytest.mark.slow), (0.0, LabelsFirst)],
 )
 def test_each_engine_can_prove_the_backbone_from_one_map(frame_after: float, engine: type) -> None:
-    """32 maps that also differ in dstates. Doubts about a prefix of the readable encodings find
-    some, and the engine that finds dstates first lists all."""
+    """32 maps that also differ in dstates. A prefix of the readable encodings lists them, or the
+    engine that finds dstates first."""
     trace, theory = walk(TWO_BLOCKS, "a1", 50, 1), Theory(boundary="none", prefer=("dstates",))
     with stepwise(frame_after):
         every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
@@ -178,7 +177,6 @@ def test_each_engine_can_prove_the_backbone_from_one_map(frame_after: float, eng
     assert every.backbone is not None
     assert len(every.backbone.dstates.always) == len(trace)
     assert every.backbone.dstates.differing
-    assert engine is LabelsFirst or search._parts.rivals.sharing.maps < 16
     assert (first.effort.prefix < len(trace)) == (engine is StepEngine)
 
 
@@ -212,25 +210,6 @@ def test_interrupted_list_leaves_the_backbone_unproven() -> None:
         "at least 1 minimal map (listing was interrupted): the same dstates, places and paths, as "
         "far as"
     )
-
-
-def test_endless_list_leaves_time_to_prove_the_backbone() -> None:
-    theory = Theory(boundary="none", path_order="partial", prefer=())
-    search = Search(
-        rectangle(14), theory, max_maps=None, time_limit=1000, _start=Start(reasons=True)
-    )
-    with turn_with("backbone", share=0.9995):
-        count = sum(1 for _ in search)
-    solution = search.solution()
-    assert solution.stopped == "time limit"
-    assert solution.backbone is not None
-    assert solution.backbone.proven
-    found = (
-        "the dstates of steps 4–14 differ; the places of steps 4–14 differ; the paths of steps 0 "
-        "and 3–14 differ"
-    )
-    listed = f"at least {counted(count, 'minimal maps')} (listing was stopped by the time limit)"
-    assert summary_of(solution, count, solution.backbone) == f"{listed}: {found}"
 
 
 def test_solution_is_a_plain_value(tmp_path: Path) -> None:

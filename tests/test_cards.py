@@ -108,7 +108,7 @@ def test_card_of_an_unknown_answer_shows_the_map_of_a_prefix() -> None:
 def test_card_of_a_solution_starts_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     solution = aces.solution(max_maps=2)
     monkeypatch.setattr(
-        "ssh_abduction.solver.sources.exact.backbone.prove_backbone",
+        "ssh_abduction.solver.sources.exact.prefixes.prove_backbone",
         lambda *_: pytest.fail("it searched"),
     )
     assert "at least 2 minimal maps" in shown(solution)[1]

@@ -34,7 +34,6 @@ from ssh_abduction.solver.sources.exact.fitting import Fitting
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
 from ssh_abduction.solver.sources.exact.visit_labels import (
-    FramedSides,
     VisitLabels,
     VisitProgram,
     turn_facts,
@@ -221,7 +220,7 @@ def test_framed_mapper_maps_a_maze_step_by_step() -> None:
             search = mapper._keeper.search
             engine = search and search._parts.prefixes.engine
             if isinstance(engine, LabelsFirst):
-                paths.add((engine._labels.program.batch, len(engine._labels._sides._said)))
+                paths.add((engine._labels.program.batch, len(engine._labels.program._said)))
     assert max(paths)[0] > 5
     assert any(told for _, told in paths)
 
@@ -357,7 +356,7 @@ def test_lazy_rules_for_order_and_sides_give_the_same_maps() -> None:
     walk = maze(2, 2, steps=60, seed=1, stars=True)
     expected = solve(walk.trace, Theory.topological(), max_maps=None)
     for off, kind, asked in (
-        ("", FramedSides, "say_of_path"),
+        ("", VisitProgram, "give_sides"),
         ("sides", Fitting, "clashes"),
     ):
         finding = patch.object(kind, asked, autospec=True, side_effect=getattr(kind, asked))
@@ -381,10 +380,11 @@ def test_refused_path_becomes_a_rule_for_clingo() -> None:
     labels = asked._labels.fewest()
     assert isinstance(labels, list)
     contrary, twice = asked._fitting.contrary(labels)
-    standing = asked._labels.program.standing(labels)
+    program = asked._labels.program
+    standing = {labels[node]: program.chart.facing[node] for node in program.place_of}
     assert contrary
     assert asked._labels.give_sides(labels, contrary, twice)
-    (told,) = asked._labels._sides._said
+    (told,) = asked._labels.program._said
     assert told in {("path", standing[dstate]) for dstate in contrary}
 
 
@@ -596,7 +596,7 @@ def framed_engine(trace: Trace, theory: Theory) -> LabelsFirst:
     found = LabelsFirst(engine.Task.of(Problem.of(trace, resolved), watch))
     chart = Chart.framed(trace, found._task.log)
     if chart is not None:
-        found._labels._program = VisitProgram(found._task, found.asker, chart, found._labels._sides)
+        found._labels._program = VisitProgram(found._task, found.asker, chart)
     return found
 
 

@@ -30,10 +30,9 @@ from ssh_abduction.solver.parts import Limits, Start
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
-from ssh_abduction.solver.sources.exact.backbone import prove_backbone
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine, may_name
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.exact.readable import StepEngine
+from ssh_abduction.solver.sources.exact.prefixes import prove_backbone
 from ssh_abduction.solver.values import Progress
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import ALL, Speedups, row
@@ -219,8 +218,7 @@ def find_backbone(
         # A search that needed only a prefix used no engine that finds dstates first.
         is_whole = solution.effort.prefix == solution.steps
         engine = labelling_engine(task, solution.maps[0].dstate_at if is_whole else ())
-        if not isinstance(engine, StepEngine):
-            engine.grow(solution.effort.prefix)
+        engine.grow(solution.effort.prefix)
         judging = Judging(task.problem)
         proven = prove_backbone(task, judging, cost, sharing, engine)
     # The search may have seen more maps than the solution holds.

@@ -20,10 +20,9 @@ from ssh_abduction.solver.geometry.ranking import in_order, noise_warning, units
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.sources.exact import prefixes
-from ssh_abduction.solver.sources.exact.backbone import Rivals
 from ssh_abduction.solver.sources.exact.choosing import NearMinimal, may_name, new_engine
 from ssh_abduction.solver.sources.exact.engine import Engine, GrowingEngine, Task
-from ssh_abduction.solver.sources.exact.prefixes import Prefixes
+from ssh_abduction.solver.sources.exact.prefixes import Prefixes, Rivals
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.solver.steps.certificate import Basis
 from ssh_abduction.solver.values import (

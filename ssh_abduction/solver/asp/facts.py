@@ -419,40 +419,6 @@ def rests_on(axiom: str, t: int, other: str) -> str:
     return f":- {active(axiom, t)}, violation({other},T)."
 
 
-def one_in_doubt(number: int, condition: str | None) -> str:
-    """Return the rule that two things are one if a condition holds; never if it is None."""
-    one = f"one_in_doubt({number})"
-    return f"{one} :- {condition}." if condition else f"#external {one}."
-
-
-def some_doubt(question: int, doubts: Iterable[tuple[int, bool]]) -> str:
-    """Return the rule that some doubt holds while `asked(question)` is true.
-
-    A doubt is the claim that two things, given by their numbers, are one (True) or are not.
-    """
-    none = ", ".join(f"{'not ' if one else ''}one_in_doubt({n})" for n, one in doubts)
-    return f"#external {asked(question)}.\n:- {asked(question)}, {none}."
-
-
-def asked(question: int) -> Symbol:
-    """Return the external atom that is true while this question about doubts is asked."""
-    return Function("asked", number_symbols(question))
-
-
-def steps_are_one(sort: str, i: int, j: int) -> str:
-    """Return the body of a rule that holds if two steps share a dstate, place, path or course.
-
-    `sort` is "dstates", "places", "paths" or "courses", and step `i` the earlier one. For "paths"
-    both may be one step: then the body holds if the step is along a path.
-    """
-    return {
-        "dstates": f"same({i},{j})",
-        "places": f"same_place({i},{j})",
-        "paths": f"along({i},H,_), along({j},H,_)",
-        "courses": f"same_course({i},{j})",
-    }[sort]
-
-
 def exactly(number: int, count: Count) -> str:
     """Return the rule that a map has this many dstates, places or paths, if `of_number` is true."""
     counted = {

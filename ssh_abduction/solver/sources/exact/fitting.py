@@ -58,16 +58,14 @@ PREPARING = (1.6, 2.1)
 # seconds.
 KEPT = 10
 # The parts of paths.lp: SEGMENTS derives which places and segments are different before any two are
-# one. PLACES finds the places and paths that fit labels. EACH also lists answers that differ only
-# in paths.
+# one. PLACES finds the places and paths that fit labels.
 SEGMENTS = ("base", "again", "segments")
 PLACES = ("least", "paths")
-EACH = (*PLACES, "each")
 
 # A path and two of its places, the earlier one first.
 _Ahead: TypeAlias = tuple[int, int, int]
-# The labels of all nodes, the options of clasp, and the parts of the program.
-_Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]
+# The labels of all nodes, and the options of clasp.
+_Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...]]
 
 
 @dataclass(frozen=True)
@@ -128,15 +126,13 @@ class Fitting:
         mode: str,
         conflicts: int = -1,
         options: tuple[str, ...] = (),
-        parts: tuple[str, ...] = EACH,
     ) -> Generator[Found, None, bool]:
         """Yield maps with these dstates. Return whether clingo ended before the limit of conflicts.
 
         `mode` is clingo's opt-mode; "ignore" for a single map. -1 conflicts mean no limit.
-        `options` are those of clasp. With the `parts` PLACES, there is one map for each choice of
-        places.
+        `options` are those of clasp.
         """
-        reader = self._reader(labels, options, parts)
+        reader = self._reader(labels, options)
         most, control = int(mode == "ignore"), reader.control
         answers = self._asker.answers(
             reader.read, mode, most, control=control, conflicts=conflicts, ahead=True
@@ -144,14 +140,12 @@ class Fitting:
         theory = self.task.theory
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), theory), answers))
 
-    def _reader(
-        self, labels: Sequence[int], options: tuple[str, ...], parts: tuple[str, ...]
-    ) -> PathReader:
+    def _reader(self, labels: Sequence[int], options: tuple[str, ...]) -> PathReader:
         """Make a reader of the places and paths that fit these dstates."""
-        question = tuple(labels), options, parts
+        question = tuple(labels), options
         control = self._controls.pop(question, None)
         if control is None:
-            control = self._control(labels, self._members(labels), options, parts, pins=True)
+            control = self._control(labels, self._members(labels), options, pins=True)
             if len(self._controls) == KEPT:
                 del self._controls[next(iter(self._controls))]
         self._controls[question] = control
@@ -208,7 +202,6 @@ class Fitting:
         labels: Sequence[int],
         members: Sequence[Member],
         options: tuple[str, ...] = (),
-        parts: Iterable[str] = PLACES,
         *,
         pins: bool = False,
         single: bool = False,
@@ -226,7 +219,9 @@ class Fitting:
             if pins and self.task.speedups.clique:
                 more += _distinct(control)
             control.add("more", [], "\n".join(more))
-            control.ground([(part, []) for part in ("more", *parts)])
+            # With the last part, answers that differ only in paths are listed, too.
+            parts = ("more", *PLACES, *(["each"] if pins else []))
+            control.ground([(part, []) for part in parts])
         self._asker.watch.check()
         return control
 

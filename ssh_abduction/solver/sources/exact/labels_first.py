@@ -45,7 +45,7 @@ from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Task, in_fixed_order
-from ssh_abduction.solver.sources.exact.fitting import PLACES, Fitting
+from ssh_abduction.solver.sources.exact.fitting import Fitting
 from ssh_abduction.solver.sources.exact.names import NamedLabels
 from ssh_abduction.solver.sources.exact.visit_labels import VisitLabels
 from ssh_abduction.solver.values import Found
@@ -56,9 +56,6 @@ from ssh_abduction.theory.speedups import Speedups
 # First try a prefix of this many steps, then a prefix of AT_ONCE steps. For most traces the first
 # prefix is enough.
 FIRST_PREFIXES = 32
-# With displacements, first list about this many maps whose dstates or places differ. They are kept
-# in memory until all other maps are listed.
-SOONER = 1000
 
 
 class LabelsFirst:
@@ -148,30 +145,10 @@ class LabelsFirst:
         if self._fitting is None:
             yield from map(self._causal, self._labels.all_of(cost[0], enough))
             return
-        listed = self._listed(self._fitting, self._labels_of(cost), _listing(cost))
-        yield from islice(listed, enough or None)
-
-    def _listed(self, fitting: Fitting, every: Iterable[list[int]], mode: str) -> Iterator[Found]:
-        """Yield the maps with each of these labels.
-
-        With displacements, first yield one map for each choice of places, for a few labels.
-        """
-        left, sooner, first = iter(every), list[list[int]](), set[SSHMap]()
-        while (
-            self._task.theory.displacement == "use"
-            and len(first) < SOONER
-            and (labels := next(left, None))
-        ):
-            sooner.append(labels)
-            for found in fitting.maps(labels, mode, parts=PLACES):
-                first.add(found.map)
-                yield found
-        yield from (
-            found
-            for labels in chain(sooner, left)
-            for found in fitting.maps(labels, mode)
-            if found.map not in first
-        )
+        # Given the dstates, list the maps with the fewest other counts.
+        mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
+        maps = (self._fitting.maps(labels, mode) for labels in self._labels_of(cost))
+        yield from islice(chain.from_iterable(maps), enough or None)
 
     def _labels_of(self, cost: tuple[int, ...]) -> Iterable[list[int]]:
         """Return the known labels of maps of this cost; if none are known, search for all."""
@@ -234,11 +211,6 @@ class LabelsFirst:
     def _causal(self, labels: Sequence[int]) -> Found:
         """Make the causal map of labels."""
         return Found.of(facts.causal_map(labels, self._task.trace), self._task.theory)
-
-
-def _listing(cost: tuple[int, ...]) -> str:
-    """Return clingo's opt-mode for listing the maps of this cost, with given dstates."""
-    return f"enum,{','.join(map(str, (0, *cost[1:])))}"
 
 
 def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:

@@ -38,11 +38,16 @@ A map whose replay stops early is no answer. A longer prefix shows how it contin
 determinism; one place, course and heading for each dstate; and axioms that a cut map still
 satisfies. `theory/speedups.py` lists the theories for which this is known. For any other theory,
 the prefix is the whole trace.
+
+*Backbone.* A search lists at most as many minimal maps as the user asks for. Other minimal maps may
+not share what the listed ones share. So the search goes on to list maps, but gives them to nobody.
+When there are no more, the backbone is proven: what all minimal maps share.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 from ssh_abduction.data.gateways import with_allowed_headings
@@ -51,6 +56,7 @@ from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.board import Judging, Known
+from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 from ssh_abduction.solver.sources.exact.engine import Engine, Task
 from ssh_abduction.solver.sources.exact.readable import StepEngine, paths_needed
 from ssh_abduction.solver.steps.log import Outcome, Replay
@@ -67,6 +73,9 @@ HELD_BACK = 1000
 # forbid each rejected set of equalities and list the maps again. After that, only skip rejected
 # maps.
 REMEMBERED = 10_000
+# Without these axioms a dstate may be at several places or along several courses, but a map shows
+# only one.
+SHOWN_ONCE = frozenset({"one_place", "one_course"})
 # The number of names for paths to begin with. Few traces need more.
 FIRST_PATHS = 8
 
@@ -202,6 +211,7 @@ class Prefixes:
         """Yield every minimal map once, after `find_minimum` has proven the minimal cost."""
         streamed: list[int] = []  # sizes of the prefixes whose maps were yielded
         held: list[SSHMap] = []  # maps of this prefix that replay to the end, not yet yielded
+        self._name_more_paths(self._known.cost)
         try:
             while True:
                 held.clear()
@@ -315,3 +325,70 @@ class Prefixes:
         if not self._in_tolerance or len(ssh_map.dstate_at) == len(replayed.labels):
             return whole
         return with_allowed_headings(self._task.trace, whole, self._task.theory.axioms) or whole
+
+
+class Rivals:
+    """The minimal maps of a trace that a search has found so far.
+
+    Attributes:
+        sharing: What these maps share.
+        listed: Whether they are all minimal maps of the trace.
+        engine: The engine that found the maps. None if no proof is needed, or if an error left the
+            engine unusable.
+        reasons: Whether engines can prove what all minimal maps share. They cannot if the maps
+            were found by mending the trace.
+    """
+
+    def __init__(self, task: Task, judging: Judging) -> None:
+        """Start without any known map."""
+        self.sharing = Sharing()
+        self.listed = False
+        self.engine: Engine | None = None
+        self.reasons = True
+        self._task, self._judging = task, judging
+        self._cost: tuple[int, ...] = ()
+        self._proven = False
+
+    def add(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
+        """Add a minimal map, with the counts that the theory minimises."""
+        self._cost = cost
+        self.sharing.absorb(ssh_map)
+
+    def reason(self) -> None:
+        """Prove what all minimal maps share, unless all are listed. A limit ends the proof."""
+        is_known = self.listed or self._proven or not self.sharing.maps
+        if is_known or not self.reasons or self.engine is None:
+            return
+        _log.info("looking for what all minimal maps share, from %d of them", self.sharing.maps)
+        with suppress(LimitError, StageTimeError, KeyboardInterrupt):
+            self._proven = prove_backbone(
+                self._task, self._judging, self._cost, self.sharing, self.engine
+            )
+        _log.info("what all minimal maps share is %s", "proven" if self._proven else "not proven")
+        self.engine = None
+
+    @property
+    def backbone(self) -> Backbone | None:
+        """The backbone as far as it is known; None if no minimal map is known."""
+        return (
+            self.sharing.backbone(proven=self.listed or self._proven) if self.sharing.maps else None
+        )
+
+
+def prove_backbone(
+    task: Task, judging: Judging, cost: tuple[int, ...], sharing: Sharing, engine: Engine
+) -> bool:
+    """Find more minimal maps until `sharing` holds exactly what all minimal maps share.
+
+    Each minimal map is added to `sharing`. `cost` has the preferred counts of minimal maps, the
+    most important one first. The engine has the prefix that proved the minimum. Returns whether the
+    proof is complete. No proof is possible if the theory allows a dstate at several places or along
+    several courses. Raises LimitError if a limit is reached.
+    """
+    if SHOWN_ONCE & task.theory.given_up:
+        return False
+    known = Known(task.theory)
+    known.cost = cost
+    for ssh_map in Prefixes(task, known, judging, engine, 0, lambda: None).minimal_maps():
+        sharing.absorb(ssh_map)
+    return True

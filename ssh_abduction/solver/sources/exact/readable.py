@@ -2,26 +2,18 @@
 
 This engine works for every theory, and finds all minimal maps of the prefix. The other engines are
 faster, but each of them is for certain theories only.
-
-A *doubt* is something on which all known maps agree, but perhaps not all maps. Two steps may share
-a dstate, place, path or course (a path in one direction) in all known maps, but not in some unknown
-map, or the other way round. Clingo is asked for an answer in which at least one doubt of a set
-holds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
-from contextlib import closing
-from typing import Any, TypeAlias, TypeVar
+from collections.abc import Collection, Iterator
+from typing import Any
 
 import clingo
 
-from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.control import Asker, Control
+from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import number_symbols
-from ssh_abduction.solver.solution.sharing import Sort
 from ssh_abduction.solver.sources.exact.engine import Task, in_fixed_order
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory import encodings
@@ -38,53 +30,6 @@ AT_FIRST, FIRST_STEPS = 8, 32
 SLOWER = 4
 # The first call is for one step, too, if there are more names for paths than this.
 FEW_PATHS = 8
-
-
-Answer = TypeVar("Answer")
-# A sort of thing (such as "places"), two steps or dstates, and a claim: they share a thing of this
-# sort (True), or they do not (False).
-Doubt: TypeAlias = tuple[Sort, int, int, bool]
-
-
-class Doubts:
-    """Asks one control of clingo whether a map contradicts what all known maps share."""
-
-    def __init__(
-        self, asker: Asker, control: Control, condition: Callable[[Sort, int, int], str | None]
-    ) -> None:
-        """Begin without any doubt.
-
-        `condition` takes a sort (such as dstate or place) and two steps or dstates. It returns the
-        body of a rule that is true if both are at one thing of this sort; None if they never are.
-        """
-        self._asker, self._control, self._condition = asker, control, condition
-        # The number of each pair of things that clingo has, and the number of questions so far.
-        self._number_of: dict[tuple[Sort, int, int], int] = {}
-        self._questions = 0
-
-    def answer(
-        self, doubts: Collection[Doubt], read: Callable[[clingo.Model], Answer], mode: str
-    ) -> Answer | None:
-        """Return what `read` makes of an answer that confirms a doubt; None if none does."""
-        if not doubts:
-            return None
-        rules: list[str] = []
-        for sort, i, j, _ in doubts:
-            if (sort, i, j) not in self._number_of:
-                number = self._number_of[sort, i, j] = len(self._number_of)
-                rules.append(facts.one_in_doubt(number, self._condition(sort, i, j)))
-        numbers = [(self._number_of[sort, i, j], one) for sort, i, j, one in doubts]
-        rules.append(facts.some_doubt(self._questions, numbers))
-        asked = facts.asked(self._questions)
-        self._questions += 1
-        with self._asker.grounding_timed():
-            self._control.tell("\n".join(rules))
-        self._control.assign_external(asked, True)
-        try:
-            with closing(self._asker.answers(read, mode, 1, control=self._control)) as answers:
-                return next(answers, None)
-        finally:
-            self._control.release_external(asked)
 
 
 class StepEngine:
@@ -106,7 +51,6 @@ class StepEngine:
         # as much, and clingo cannot be stopped meanwhile.
         self._last_step = 0.0, 0.0
         control = self.asker.control
-        self._doubts = Doubts(self.asker, control, facts.steps_are_one)
         for name in facts.encoding_names(task.theory):
             control.load(encodings.path(name))
         control.add("base", [], facts.theory_facts(task.theory, paths))
@@ -183,13 +127,6 @@ class StepEngine:
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         bound = ",".join(map(str, cost))
         return self.asker.answers(self._read, f"enum,{bound}" if bound else "ignore", 0)
-
-    def map_with(self, doubts: Collection[Doubt], cost: tuple[int, ...]) -> SSHMap | None:
-        """Find a map of the first steps, within the cost, in which one of these doubts holds."""
-        found = self._doubts.answer(
-            doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore"
-        )
-        return None if found is None else found.map
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         equalities = in_fixed_order(equalities)

@@ -33,7 +33,6 @@ from collections.abc import (
     Generator,
     Iterable,
     Iterator,
-    Mapping,
     Sequence,
     Set,
 )
@@ -56,7 +55,6 @@ from ssh_abduction.solver.steps.localising import Located, State, faced, located
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.pairs import pairs_in
-from ssh_abduction.theory.theory import Theory
 
 # At first, give clingo only the first visits: those with at most this many pairs that may be at one
 # place. It gets other visits if answers need them.
@@ -98,7 +96,6 @@ class VisitLabels:
         self.clique: list[int] = []
         self.size = 0
         self.task, self._asker = task, asker
-        self._sides = FramedSides(task.theory, asker)
         self._program: VisitProgram | None = None
         self._nodes_at_start = 0  # the number of nodes when the control was made
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
@@ -164,7 +161,7 @@ class VisitLabels:
         fits = fits_in_time(self._asker.watch, chart, visits, known)
         size, self.size = self.size, 0  # an error may leave this prefix incomplete
         if anew:
-            self._program = VisitProgram(self.task, self._asker, chart, self._sides)
+            self._program = VisitProgram(self.task, self._asker, chart)
             self._nodes_at_start = len(chart.seen)
         self.program.give(chart, visits, order, fits)
         self._raise_bound(self.program.least)
@@ -268,7 +265,7 @@ class VisitLabels:
         return (
             self.task.speedups.sides
             and len(self.program.fits) <= MANY_PAIRS
-            and self._sides.say_of_path(contrary, twice, self.program.standing(labels))
+            and self.program.give_sides(contrary, twice, labels)
         )
 
     def forbid(self, labels: Sequence[int], found: Iterable[Iterable[Member]]) -> None:
@@ -345,11 +342,11 @@ class VisitProgram:
             in every answer.
     """
 
-    def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: FramedSides) -> None:
-        """Make a control without visits. `sides` adds axioms to it and to each batch of visits."""
+    def __init__(self, task: Task, asker: Asker, chart: FramedChart) -> None:
+        """Make a control without visits."""
         self.chart = chart
         self.batch = -1
-        self._asker, self._trace, self._sides = asker, task.trace, sides
+        self._asker, self._trace, self._theory = asker, task.trace, task.theory
         self._one, self._together = pairs_in(task.log.pairs.one), task.theory.same_place
         cores = ["--opt-strategy=usc"] if task.speedups.core_guided else []
         asker.control = new_control("visits", "", ["--heuristic=Domain", *cores])
@@ -364,7 +361,8 @@ class VisitProgram:
         self._pairs_said: set[Pair] = set()
         self._places_said: set[tuple[int, int]] = set()
         self._closed = 0  # how often rules of transitivity were given
-        sides.begin()
+        # The grounded program parts of sides_framed.lp, with their arguments.
+        self._said: dict[tuple[str, tuple[int, ...]], None] = {}
 
     def give(
         self, chart: FramedChart, visits: set[int], order: Iterable[int], fits: frozenset[Pair]
@@ -416,7 +414,13 @@ class VisitProgram:
         first = (Function("first", number_symbols(place)) for place, *_ in nodes)
         atoms = control.symbolic_atoms
         self.least += sum(atom.is_fact for one in first if (atom := atoms[one]))
-        self._sides.extend(self.batch)
+        if self._said:  # the axioms of paths also hold for the new visits
+            paths = [
+                (part, number_symbols(*arguments, self.batch))
+                for part, arguments in self._said
+                if part == "path"
+            ]
+            control.ground([("paths", number_symbols(self.batch)), *paths])
 
     def _joined(self) -> set[Pair]:
         """List the pairs of visits with steps that the user says are one dstate."""
@@ -477,10 +481,6 @@ class VisitProgram:
             numbered(faced(everywhere.states[visit], slot) for visit, slot in self.chart.facing)
         )
 
-    def standing(self, labels: Sequence[int]) -> dict[int, tuple[int, int]]:
-        """Return a visit and its slot (direction) for each dstate that has a node in clingo."""
-        return {labels[node]: self.chart.facing[node] for node in self.place_of}
-
     def spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
         """List the pairs of visits that must be at one place if nodes have these dstates."""
         first: dict[int, int] = {}
@@ -494,6 +494,47 @@ class VisitProgram:
         """Return the pair of visits that is at one place if two nodes are at one dstate."""
         (i, s), (j, t) = sorted((self.chart.facing[a], self.chart.facing[b]))
         return i, j, (t - s) % 4
+
+    def give_sides(
+        self, contrary: Iterable[int], twice: Iterable[int], labels: Sequence[int]
+    ) -> bool:
+        """Add the axioms of a path that labels contradict, and return whether there was one.
+
+        `contrary` has a dstate of each path that contradicts the axioms. `twice` has the dstates
+        where two paths cross that meet again.
+        """
+        # For each dstate that has a node in clingo: the visit and the slot of such a node.
+        standing = {labels[node]: self.chart.facing[node] for node in self.place_of}
+        if any(self._say_once("path", *standing[dstate]) for dstate in contrary):
+            return True
+        for visit in (standing[dstate][0] for dstate in twice):
+            said = [
+                self._say_once("path", visit, 0),
+                self._say_once("path", visit, 1),
+                self._say_once("crossing", visit, self.batch),
+            ]
+            if any(said):
+                return True
+        return False
+
+    def _say_once(self, part: str, *arguments: int) -> bool:
+        """Ground a part of sides_framed.lp for these arguments once. Return whether it was new."""
+        if (part, arguments) in self._said:
+            return False
+        control, batches = self._asker.control, range(self.batch + 1)
+        with self._asker.grounding_timed():
+            if not self._said:
+                control.load(encodings.path("sides_framed"))
+                control.add("sides", [], "\n".join(sides(self._theory)))
+                control.ground(
+                    [("sides", []), *(("paths", number_symbols(batch)) for batch in batches)]
+                )
+            self._said[part, arguments] = None
+            if part == "path":
+                control.ground([(part, number_symbols(*arguments, batch)) for batch in batches])
+            else:
+                control.ground([(part, number_symbols(*arguments))])
+        return True
 
 
 def fits_in_time(watch: Watch, chart: FramedChart, visits: set[int], known: int) -> frozenset[Pair]:
@@ -580,72 +621,6 @@ def _in_order(*visits: tuple[int, int]) -> Three:
     """Sort three visits at one place, each with a slot. All slots are one direction there."""
     (i, a), (j, b), (k, c) = sorted(visits)
     return i, j, k, (b - a) % 4, (c - b) % 4
-
-
-class FramedSides:
-    """Adds the axioms of order and sides, path by path, to the control that decides on visits."""
-
-    def __init__(self, theory: Theory, asker: Asker) -> None:
-        self._theory, self._asker = theory, asker
-        # The grounded program parts of sides_framed.lp, with their arguments.
-        self._said: dict[tuple[str, tuple[int, ...]], None] = {}
-        self._batch = -1
-
-    def begin(self) -> None:
-        """Forget which axioms were added, as there is a new control."""
-        self._said = {}
-        self._batch = -1
-
-    def extend(self, batch: int) -> None:
-        """Ground the axioms of all paths added so far for a new batch: the visits of one call."""
-        self._batch = batch
-        if self._said:
-            paths = [
-                (part, number_symbols(*arguments, batch))
-                for part, arguments in self._said
-                if part == "path"
-            ]
-            self._asker.control.ground([("paths", number_symbols(batch)), *paths])
-
-    def say_of_path(
-        self, contrary: Iterable[int], twice: Iterable[int], standing: Mapping[int, tuple[int, int]]
-    ) -> bool:
-        """Add the axioms of a path that labels contradict, and return whether there was one.
-
-        `contrary` has a dstate of each path that contradicts the axioms. `twice` has the dstates
-        where two paths cross that meet again. `standing` has, for each dstate that has a node in
-        clingo, the visit and the slot (direction) of such a node.
-        """
-        if any(self._say_once("path", *standing[dstate]) for dstate in contrary):
-            return True
-        for visit in (standing[dstate][0] for dstate in twice):
-            said = [
-                self._say_once("path", visit, 0),
-                self._say_once("path", visit, 1),
-                self._say_once("crossing", visit, self._batch),
-            ]
-            if any(said):
-                return True
-        return False
-
-    def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides_framed.lp for these arguments once. Return whether it was new."""
-        if (part, arguments) in self._said:
-            return False
-        control, batches = self._asker.control, range(self._batch + 1)
-        with self._asker.grounding_timed():
-            if not self._said:
-                control.load(encodings.path("sides_framed"))
-                control.add("sides", [], "\n".join(sides(self._theory)))
-                control.ground(
-                    [("sides", []), *(("paths", number_symbols(batch)) for batch in batches)]
-                )
-            self._said[part, arguments] = None
-            if part == "path":
-                control.ground([(part, number_symbols(*arguments, batch)) for batch in batches])
-            else:
-                control.ground([(part, number_symbols(*arguments))])
-        return True
 
 
 def visit_facts(

@@ -17,9 +17,6 @@ only one known dstate, with much evidence, are merged first. Then come steps wit
 Steps that fit several known dstates are merged if the evidence for one of these is clearly the
 greatest. A step that fits no known dstate becomes one.
 
-A map is thinned in the same way. The dstates with the fewest nodes are merged first, each with the
-dstate for which there is most evidence, while the result is still a map.
-
 This is evidence-driven state merging (Lang, Pearlmutter, Price 1998, "Results of the Abbadingo One
 DFA Learning Competition"). It is applied to one trace, and it begins at known dstates all over the
 trace instead of at a root.
@@ -78,9 +75,6 @@ DEMANDS = (
     (0, 2),
     (0, 10**9),
 )
-# When a map is thinned, the evidence for a merge of two known dstates has to exceed that for the
-# next best merge by these numbers. They are tried in this order.
-THINNED = 10, 5, 3, 0
 # Compare at most this many pairs of visits. Pairs with the most visits in between are left out.
 MOST_PAIRS = 60_000
 DSTATE = 10  # cost of a dstate, in tenths
@@ -102,45 +96,6 @@ def merged(chart: Chart, clique: Iterable[int] = ()) -> list[int]:
     return numbered(classes.root.tolist())
 
 
-def thinned_map(
-    shows: Sequence[int],
-    links: Sequence[Link],
-    visits: Sequence[int],
-) -> list[int]:
-    """Merge dstates of a map until no two can be one, and return which dstate represents each.
-
-    Dstates with the fewest nodes are merged first, each with the dstate for which there is most
-    evidence. `shows` has the view of each dstate, and `visits` the number of its nodes. Links are
-    triples (dstate, action, dstate). A dstate that was not merged represents itself.
-    """
-    apart = _apart_in_map(np.asarray(shows), links)
-    classes = Classes(apart, links, np.asarray(visits))
-    classes.known[:] = True
-    classes.thin_all()
-    root: list[int] = classes.root.tolist()
-    return root
-
-
-def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link]) -> Matrix:
-    """Find the pairs of dstates of a map that are apart, as a matrix of dstates x dstates.
-
-    Two dstates are apart if they show different views, or if the same action leads from them to
-    dstates that are apart.
-    """
-    leads: dict[int, NDArray[np.int_]] = {}
-    for dstate, action, leads_to in links:
-        leads.setdefault(action, np.full(len(seen), -1))[dstate] = leads_to
-    apart: Matrix = seen[:, None] != seen
-    while True:
-        look_at_clock()
-        before = apart.copy()
-        for there in leads.values():
-            known = np.flatnonzero(there >= 0)
-            apart[np.ix_(known, known)] |= apart[np.ix_(there[known], there[known])]
-        if (apart == before).all():
-            return apart
-
-
 class Classes:
     """Classes of steps that are taken to be one dstate.
 
@@ -153,17 +108,13 @@ class Classes:
         known: For each root, whether its class is a known dstate.
     """
 
-    def __init__(
-        self, apart: Matrix, links: Iterable[Link], nodes: NDArray[np.int_] | None = None
-    ) -> None:
+    def __init__(self, apart: Matrix, links: Iterable[Link]) -> None:
         """Begin with a class for each step.
 
         `apart` flags the pairs of steps that are different dstates, in a matrix of steps x steps.
-        Links are triples (step, action, step). If the "steps" are dstates of a map, `nodes` has the
-        number of nodes at each; None for 1 each.
+        Links are triples (step, action, step).
         """
         steps = len(apart)
-        self._nodes = nodes
         self.root = np.arange(steps)
         self.known = np.zeros(steps, dtype=bool)
         # The row of each root has the steps that are apart from some step of its class.
@@ -182,12 +133,6 @@ class Classes:
         """Merge classes with known dstates, or make them known, until every class is known."""
         for evidence, rivals in DEMANDS:
             while self._settle(evidence, rivals):
-                pass
-
-    def thin_all(self) -> None:
-        """Merge known dstates until no two of them can be one."""
-        for evidence in THINNED:
-            while self._thin(evidence):
                 pass
 
     def _settle(self, evidence: int, rivals: int) -> bool:
@@ -217,25 +162,6 @@ class Classes:
                 has_changed = True
         return has_changed
 
-    def _thin(self, evidence: int) -> bool:
-        """Merge each known dstate with another one, if the evidence for that one is clear enough.
-
-        Dstates with the fewest nodes come first. The evidence for the best dstate has to exceed
-        that for the next by `evidence`. Returns whether any were merged.
-        """
-        has_merged = False
-        nodes = np.bincount(self.root, self._nodes)
-        for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: nodes[root]):
-            look_at_clock()
-            if self.known[root]:  # it was not merged meanwhile
-                ranked = self._ranked(
-                    root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True
-                )
-                if ranked and _is_ahead(ranked, evidence):
-                    self.merge(ranked[0][1], root, forced=True)
-                    has_merged = True
-        return has_merged
-
     def _fitting(self, root: int) -> list[int]:
         """List the known dstates that each step of a root's class may be at."""
         known = np.flatnonzero(self.known)
@@ -244,13 +170,11 @@ class Classes:
         ].tolist()
         return fits
 
-    def _ranked(
-        self, root: int, fits: Sequence[int], *, forced: bool = False
-    ) -> list[tuple[int, int]]:
+    def _ranked(self, root: int, fits: Sequence[int]) -> list[tuple[int, int]]:
         """Rank possible merges of a class with dstates: pairs (evidence, dstate), best first."""
         found = []
         for dstate in fits:
-            evidence = self.merge(dstate, root, forced=forced)
+            evidence = self.merge(dstate, root)
             if evidence is not None:
                 found.append((evidence, dstate))
                 self._take_back()

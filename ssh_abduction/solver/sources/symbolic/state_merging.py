@@ -7,8 +7,7 @@ probable state of each step is its first label, that is, its dstate.
 
 A map is then read off the labels: a dstate shows the majority view of its steps, and an action
 leads where it leads most often. A Viterbi pass (Viterbi 1967) finds new labels with the cheapest
-faults for this map. These two steps are repeated while the cost falls. In between, dstates are
-merged if they can be one.
+faults for this map. These two steps are repeated while the cost falls.
 
 >>> seen = [t % 4 for t in range(60)]
 >>> seen[30] = 0
@@ -29,8 +28,6 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.sources.symbolic.merging import thinned_map
-from ssh_abduction.solver.steps.chart import Link
 
 # The number of states of each view, for each start of EM. With more states than needed, EM finds
 # better optima.
@@ -182,24 +179,8 @@ class Explainer:
         """Find a cheap explanation near these labels, by local search.
 
         Make a machine from the labels, explain the trace by it, and repeat this while the cost
-        falls. Then merge all dstates that can be one, and begin again if that is cheaper.
+        falls.
         """
-        best = self._settled(labels)
-        while True:
-            machine, labels = self.read_off(best.labels), numbered(best.labels)
-            visits = Counter(labels)
-            links: list[Link] = [(s, action, x) for (s, action), x in machine.goes.items()]
-            counts = [visits[s] for s in range(len(machine.shows))]
-            root = thinned_map(machine.shows, links, counts)
-            if len(set(root)) == len(machine.shows):
-                return best
-            better = self._settled([root[label] for label in labels])
-            if better.tenths >= best.tenths:
-                return best
-            best = better
-
-    def _settled(self, labels: Sequence[int]) -> Explained:
-        """Explain the trace by the machine of the labels, and repeat that while the cost falls."""
         best = self.completed(self.read_off(labels))
         while (better := self.completed(self.read_off(best.labels))).tenths < best.tenths:
             best = better
