@@ -33,7 +33,7 @@ from ssh_abduction.solver.sources.symbolic.merging import merged
 from ssh_abduction.solver.steps.apart import Continuations, clique
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
-from ssh_abduction.theory import Speedups
+from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory.settle import settle
 
 NAMES = [f.name for f in fields(Speedups)]
@@ -339,3 +339,17 @@ def test_clingo_gets_links_of_a_long_trace_in_parts() -> None:
     assert check(walk.trace, found.maps[0], Theory.causal()) == ()
     assert given[0] < 100 <= max(given)
     assert all(after - before <= 500 for before, after in pairwise(given))
+
+
+def test_core_encodings_have_the_axioms_that_speedups_were_made_for() -> None:
+    """A further axiom needs a file of its own. Otherwise speed-ups would be taken to keep it."""
+    known = (
+        "functional_view deterministic one_place turn_stays travel_leaves travel_follows_path "
+        "one_course turn_around_reverses turn_changes_path one_dstate_per_course on_path "
+        "travel_orders order_asymmetric order_transitive path_order_total next_place all_on_paths "
+        "course_needs_travel branch_side symmetric_sides side_of_branch sides_disjoint "
+        "path_between_sides star_pattern star_frame one_heading turn_rotates "
+        "one_dstate_per_heading path_goes_straight gateway_frame gateway_heading gateway_turn "
+        "gateway_dstate gateway_path gateway_end"
+    )
+    assert encodings.names_in(*encodings.FIRST) == set(known.split())

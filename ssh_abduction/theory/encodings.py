@@ -139,6 +139,11 @@ def axioms() -> tuple[Axiom, ...]:
     )
 
 
+def names_in(*found: str) -> frozenset[str]:
+    """Return the names of the axioms in these encodings."""
+    return frozenset(axiom.name for axiom in axioms() if axiom.level in found)
+
+
 @cache
 def declared() -> tuple[Field, ...]:
     """Return the fields of `Theory` that encodings declare, in the order of the files."""
