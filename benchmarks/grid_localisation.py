@@ -53,7 +53,7 @@ from simulator.world import World
 from ssh_abduction import Localiser, Trace
 from ssh_abduction.evaluation.paper_experiments import one_to_one
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.online.belief import LOCATED, Chances
+from ssh_abduction.online.localiser import LOCATED, Chances
 
 STEPS = 30  # steps of each of the two drives of a run
 EXPLORED = 2  # exploration tours

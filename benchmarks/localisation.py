@@ -41,7 +41,7 @@ from ssh_abduction.data import Step
 from ssh_abduction.data.maps import DState
 from ssh_abduction.evaluation.figures import draw_beliefs
 from ssh_abduction.online import Belief
-from ssh_abduction.online.belief import BeliefVerdict
+from ssh_abduction.online.localiser import BeliefVerdict
 
 FAMILIES: dict[str, Callable[[int], Walk]] = {
     "machines of 20 states, 6 views": lambda seed: moore(20, 6, steps=1000, seed=seed),

@@ -27,7 +27,7 @@ from perception.readers.scans import RobotLog
 from perception.recognition import recogniser
 from ssh_abduction import Localiser
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.online.belief import BeliefVerdict
+from ssh_abduction.online.localiser import BeliefVerdict
 from ssh_abduction.robot_logs.log_maps import FLOOR, LogMap, map_log
 
 # A dstate is within NEAR metres and TURNED radians of an image that shows it.

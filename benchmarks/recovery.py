@@ -45,7 +45,7 @@ from fault_cases import (
 from instances import Walk
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace
-from ssh_abduction.online.hypotheses import ExtendedMap
+from ssh_abduction.online.keeper import ExtendedMap
 from ssh_abduction.solver import Cost
 from ssh_abduction.solver.asp import facts
 

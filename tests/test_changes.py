@@ -205,12 +205,8 @@ def test_change_of_a_gateway_has_a_sentence_and_a_place(
 def test_explain_names_a_change_and_its_cost(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without changes the stars of place 0 differ, so no two steps are joined."""
     trace, theory = together([MONDAY, TUESDAY]), Theory(changed=1.5)
-    said = (
-        f"{SAID}; this change costs 1.5 dstates",
-        "without changes, the best map has 8 dstates, not 4 and changes for 1.5",
-    )
+    said = (f"{SAID}; this change costs 1.5 dstates",)
     assert explain_pair(trace, 0, 4, theory).changes == said
     assert explain_place(trace, 0, theory=theory).changes == said
     assert explain_pair(trace, 1, 5, theory).changes == ()

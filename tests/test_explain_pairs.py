@@ -13,13 +13,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
 
-from ssh_abduction import Theory, Trace, solve
+from ssh_abduction import SSHMap, Theory, Trace, check, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, Odometry, TraceError
 from ssh_abduction.explain.axioms import Axioms, Piece
 from ssh_abduction.explain.no_map import explain_trace
 from ssh_abduction.explain.pair_reasons import explain_pair
-from ssh_abduction.explain.verdict import Derivation, PairExplanation, Side, Verdict
+from ssh_abduction.explain.verdict import Derivation, Link, PairExplanation, Side, Verdict
 from ssh_abduction.rivals import Listing
 from ssh_abduction.rivals.listing import PairInMap
 from ssh_abduction.solver import Cost, Search, Solution, Start, Status
@@ -43,34 +43,39 @@ def with_axioms(theory: Theory, names: set[str]) -> Theory:
     )
 
 
-def possible(
-    derivation: Derivation, trace: Trace, theory: Theory, links: list[tuple[str, int]]
-) -> bool:
-    """Whether the pair may be otherwise if only these axioms hold at these steps."""
+def map_with(
+    derivation: Derivation, trace: Trace, theory: Theory, links: list[Link]
+) -> SSHMap | None:
+    """A map in which the pair is otherwise, if only these axioms hold at these steps."""
     piece = Piece.of(settle(trace, theory), derivation.steps)
     pair = piece.steps.index(derivation.first), piece.steps.index(derivation.second)
     active = [facts.active(axiom, piece.steps.index(step)) for axiom, step in links]
-    return Axioms(piece, never, relaxed=True).consistent(
+    return Axioms(piece, never, relaxed=True).map_with(
         active, [(facts.are_one(*pair), not derivation.one)]
     )
 
 
+def maps_without_a_link(derivation: Derivation, trace: Trace, theory: Theory) -> list[SSHMap]:
+    """A map for each link in which all other links hold, but not the conclusion."""
+    links = [*derivation.links]
+    found = [
+        map_with(derivation, trace, theory, [other for other in links if other != link])
+        for link in links
+    ]
+    assert None not in found
+    return [ssh_map for ssh_map in found if ssh_map]
+
+
 def check_derivation(derivation: Derivation, trace: Trace, theory: Theory) -> None:
-    """The links suffice and are minimal, the checker sees each broken, and the lines name all."""
-    links = [(link.axiom, link.step) for link in derivation.links]
-    assert not possible(derivation, trace, theory, links)
+    """The links suffice and are minimal, and the lines name all."""
+    links = [*derivation.links]
+    assert map_with(derivation, trace, theory, links) is None
     first, second = (
         derivation.steps.index(derivation.first),
         derivation.steps.index(derivation.second),
     )
-    for link in derivation.links:
-        assert possible(
-            derivation,
-            trace,
-            theory,
-            [other for other in links if other != (link.axiom, link.step)],
-        )
-        assert (link.without.labels[first] == link.without.labels[second]) != derivation.one
+    for ssh_map in maps_without_a_link(derivation, trace, theory):
+        assert (ssh_map.labels[first] == ssh_map.labels[second]) != derivation.one
     told = {
         (clash.axiom, step)
         for line in derivation.inferences
@@ -109,7 +114,10 @@ def test_explain_pair_gives_the_argument_of_the_paper() -> None:
         derivation.axioms
     )
     check_derivation(derivation, RECTANGLE, Theory())
-    assert all(link.violations for link in derivation.links)
+    piece = Piece.of(settle(RECTANGLE, Theory()), derivation.steps)
+    of_argument = with_axioms(piece.theory, {*derivation.axioms})
+    for ssh_map in maps_without_a_link(derivation, RECTANGLE, Theory()):
+        assert check(piece.trace, ssh_map, of_argument)
 
 
 def test_each_axiom_of_the_argument_is_needed() -> None:

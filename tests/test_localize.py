@@ -26,7 +26,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Action, LocaliserError, MapError, Step, TraceError
 from ssh_abduction.data.map_parts import DState, Fit, Pose
 from ssh_abduction.online import Belief, Chances
-from ssh_abduction.online.belief import COLLAPSED, BeliefVerdict
+from ssh_abduction.online.localiser import COLLAPSED, BeliefVerdict
 
 Array = np.ndarray[Any, Any]
 

@@ -20,7 +20,8 @@ from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
-from ssh_abduction.online.hypotheses import ExtendedMap, shares_of_rivals
+from ssh_abduction.online.keeper import ExtendedMap
+from ssh_abduction.online.recovery import shares_of_rivals
 from ssh_abduction.solver import Solution, Status
 from ssh_abduction.theory.encodings import Rules
 

@@ -135,8 +135,7 @@ def _localiser(options: argparse.Namespace) -> tuple[Localiser, Trace]:
 
     Raises AbductionError, which names the file.
     """
-    from ssh_abduction.online.belief import Chances
-    from ssh_abduction.online.localiser import Localiser
+    from ssh_abduction.online.localiser import Chances, Localiser
 
     data = read_maps(options.maps)
     maps = named_maps(some_maps(data, options.maps, "localise in"), data, options.maps)

@@ -15,9 +15,7 @@ from dataclasses import dataclass
 
 import clingo
 
-from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS
-from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import match_in_words
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Assumption, Axioms, Piece
@@ -30,9 +28,6 @@ from ssh_abduction.theory.fields import EXCUSED
 # In a piece of at most this many steps, an argument may mention all steps. In a longer piece it
 # mentions only the steps of its links, to keep the number of conclusions small.
 FEW_STEPS = 14
-# Axioms that allow only one place, course, heading or view per dstate, or one end per dstate and
-# action. A map lists only one, so a map that the checker gets should satisfy these axioms.
-SHOWN = ("one_place", "one_course", "one_heading", "functional_view", "deterministic")
 # If one of several conclusions suffices as a premise, conclusions earlier in this list are
 # preferred.
 _PREFERRED = (
@@ -154,7 +149,10 @@ class Argument:
         if any(inference.supposed for inference in inferences):
             what = "different dstates" if self._one else "one dstate"
             supposition = f"steps {first} and {second} are {what}"
-        links = tuple(self._checked_links())
+        drawn = [link for line in self._lines for link in line.group]
+        links = tuple(
+            Link(axiom, self._piece.steps[t]) for axiom, t in dict.fromkeys([*drawn, *self._links])
+        )
         return Derivation(
             self._piece.steps, first, second, self._one, links, inferences, supposition, summary
         )
@@ -360,48 +358,6 @@ class Argument:
             for axiom, t in links[conclusion]
         ]
         return that_path("; ".join(dict.fromkeys([*clauses, *reasons])))
-
-    # Is each link needed?
-
-    def _checked_links(self) -> Iterable[Link]:
-        """Yield the links (an axiom at a step) in the order of the argument.
-
-        Each link comes with a map that satisfies all other links, but not the conclusion of the
-        argument. The map shows that the link is needed.
-        """
-        theory = self._piece.theory
-        names = {axiom for axiom, _ in self._links} | set(unchecked(theory))
-        names |= {axiom.name for rules in theory.rules for axiom in rules.axioms}
-        left_out = [axiom for axiom in theory.axioms if axiom not in names]
-        of_argument = theory.replace(without=[*dict.fromkeys([*theory.without, *left_out])])
-        ordered = [link for line in self._lines for link in line.group]
-        for axiom, t in dict.fromkeys([*ordered, *self._links]):
-            found = self._map_without((axiom, t))
-            violations = check(self._piece.trace, found, of_argument)
-            yield Link(axiom, self._piece.steps[t], found, violations)
-
-    def _map_without(self, link: tuple[str, int]) -> SSHMap:
-        """Find a map that satisfies the supposition and all links but this one.
-
-        The map also keeps the axioms SHOWN, at all steps or at as many as possible.
-        """
-        supposed = [self._supposed]
-        active = _active(other for other in self._links if other != link)
-        for axiom in SHOWN:
-            several = [
-                symbol
-                for symbol in self._axioms.instances
-                if str(symbol.arguments[0]) == axiom and symbol != facts.active(*link)
-            ]
-            for some in ([several], [[symbol] for symbol in several]):
-                for more in some:
-                    if not set(more) <= set(active) and self._axioms.consistent(
-                        [*active, *more], supposed
-                    ):
-                        active += more
-        found = self._axioms.map_with(active, supposed)
-        assert found is not None
-        return found
 
 
 def _active(links: Iterable[tuple[str, int]]) -> list[clingo.Symbol]:

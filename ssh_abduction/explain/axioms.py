@@ -10,6 +10,7 @@ import clingo
 
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, named_steps
+from ssh_abduction.data.groups import minimal_part
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import closures_among
 from ssh_abduction.data.trace import Action, Step, Trace
@@ -93,9 +94,7 @@ class Axioms:
         self._refusals = 0  # constraints added so far, because evidence rejected a map
         self._conclusions: list[clingo.Symbol] = []
         self._picked = frozenset[clingo.Symbol]()  # in a query, one of these has to fail
-        self._literals: dict[clingo.Symbol, int] = {}  # clingo's literals of atoms
         self._seen: list[_ArgumentModel] = []
-        self._last_core: tuple[int, ...] = ()  # clingo's literals of the last unsat core
         self._control = Control(["--heuristic=Domain"] if relaxed else [])
         self._ground(piece, relaxed=relaxed)
         last = len(trace) - 1
@@ -138,11 +137,6 @@ class Axioms:
             self._control.ground(parts[start : start + AT_A_TIME])
         self._control.assign_external(facts.query(last), True)
         self._control.assign_external(facts.run_by_steps(), True)
-
-    @property
-    def instances(self) -> tuple[clingo.Symbol, ...]:
-        """The `active` atom of each axiom at each step; empty unless the axioms are relaxed."""
-        return tuple(self._pairs)
 
     def consistent(
         self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()
@@ -224,41 +218,11 @@ class Axioms:
 
         Arguments are as in `consistent`. Early assumptions are preferred to late ones.
         """
-        # Bisect for the shortest prefix of the assumptions that, with the assumptions in `needed`,
-        # contradicts the axioms. Its last assumption is needed. Unsat cores shorten the prefix.
-        needed: list[Assumption] = []
-        rest = list(assumed)
-
-        def shorter(some: list[Assumption]) -> int:
-            """Count the assumptions up to the last one that is in the last unsat core."""
-            return 1 + max((some.index(a) for a in self._of_last_core(some)), default=-1)
-
-        while self._solve(_forget, active, needed):
-            # the first `most` assumptions of the rest suffice, the first `least` do not
-            if self._solve(_forget, active, [*rest, *needed]):
-                return None
-            least, most = 0, shorter(rest)
-            while most - least > 1:
-                middle = (least + most) // 2
-                if self._solve(_forget, active, [*rest[:middle], *needed]):
-                    least = middle
-                else:
-                    most = max(shorter(rest[:middle]), least + 1)
-            needed.append(rest[most - 1])
-            rest = rest[: most - 1]
-        return needed
-
-    def _of_last_core(self, assumed: Sequence[Assumption]) -> list[Assumption]:
-        """List those of the given assumptions that are in the last unsat core."""
-        core = set(self._last_core)
-        for symbol in {symbol for symbol, _ in assumed} - self._literals.keys():
-            if (atom := self._control.symbolic_atoms[symbol]) is not None:
-                self._literals[symbol] = atom.literal
-        return [
-            (symbol, true)
-            for symbol, true in assumed
-            if symbol not in self._literals or self._literals[symbol] * (1 if true else -1) in core
-        ]
+        if self._solve(_forget, active, assumed):
+            return None
+        if not self._solve(_forget, active, []):
+            return []
+        return minimal_part(lambda some: not self._solve(_forget, active, some), [*assumed])
 
     def _answer(
         self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption] = ()
@@ -286,9 +250,7 @@ class Axioms:
             while not handle.wait(POLL):
                 if self._stop():
                     raise Interrupted
-            satisfiable = bool(handle.get().satisfiable)
-            self._last_core = () if satisfiable else tuple(handle.core())
-            return satisfiable
+            return bool(handle.get().satisfiable)
 
     def _refused(
         self, answer: _ModelMap, active: Collection[tuple[str, int]]
@@ -378,7 +340,7 @@ class Axioms:
         steps, once in the order of the axioms and once in reverse. The smaller result is returned.
         """
         found = [
-            self._shrunk(list(order), assumed) for order in (self._pairs, reversed(self._pairs))
+            self._shrunk(list(order), assumed) for order in (reversed(self._pairs), self._pairs)
         ]
         shortest = min(
             found, key=lambda pairs: (len({self._pairs[p][0] for p in pairs}), len(pairs))
@@ -386,29 +348,19 @@ class Axioms:
         return [self._pairs[symbol] for symbol in shortest]
 
     def _shrunk(
-        self, kept: list[clingo.Symbol], assumed: Sequence[Assumption]
+        self, order: list[clingo.Symbol], assumed: Sequence[Assumption]
     ) -> list[clingo.Symbol]:
-        """Drop unneeded pairs (axiom, step) in order, whole axioms first; return the others."""
-        # the last unsat core: as long as all of it is kept, there is no map
-        core: set[clingo.Symbol] | None = None
+        """Drop unneeded pairs (axiom, step), whole axioms first. Earlier pairs rather stay."""
 
         def clash(some: list[clingo.Symbol]) -> bool:
-            nonlocal core
-            if core is None or not core <= set(some):
-                if self.consistent(some, assumed):
-                    return False
-                core = {symbol for symbol, _ in self._of_last_core([(s, True) for s in some])}
-            return True
+            return not self.consistent(some, assumed)
 
-        for axiom in dict.fromkeys(self._pairs[symbol][0] for symbol in kept):
-            fewer = [symbol for symbol in kept if self._pairs[symbol][0] != axiom]
-            if clash(fewer):
-                kept = fewer
-        for symbol in tuple(kept):
-            fewer = [other for other in kept if other != symbol]
-            if clash(fewer):
-                kept = fewer
-        return kept
+        def of_axioms(axioms: list[str]) -> list[clingo.Symbol]:
+            return [symbol for symbol in order if self._pairs[symbol][0] in axioms]
+
+        names = [*dict.fromkeys(self._pairs[symbol][0] for symbol in order)]
+        needed = minimal_part(lambda some: clash(of_axioms(some)), names)
+        return minimal_part(clash, of_axioms(needed))
 
 
 def _last_step(refusal: Refusal) -> int:

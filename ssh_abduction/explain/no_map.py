@@ -16,7 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, count
+from itertools import chain, count, groupby
+from operator import itemgetter
 from typing import Any
 
 from ssh_abduction.data.checks import a_whole_number
@@ -322,8 +323,8 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
         if self._clash is None:
             return
         stretch = range(self._clash.first, self._clash.last + 1)
-        for step, kind, seen, changes in self._observations(stretch):
-            for instead, trace, theory in changes:
+        for (step, kind, seen), changed in groupby(self._changes(stretch), key=itemgetter(0)):
+            for _, instead, trace, theory in changed:
                 if self._over():
                     return
                 try:
@@ -336,7 +337,7 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
                     continue
                 found = self._has_map(trace, theory)
                 if found is not False:
-                    self._mends += (Mend(step, kind, seen, instead, proven=bool(found)),)
+                    self._mends += (Mend(step, kind, seen, instead, bool(found)),)
                     break
         self._complete = True
 
@@ -349,78 +350,66 @@ class TraceQuestion(LimitedQuestion[TraceExplanation]):
             return True
         return False if search.status is Status.UNSATISFIABLE else None
 
-    def _observations(
+    def _changes(
         self, stretch: range
-    ) -> Iterator[tuple[int, str, str, Iterable[tuple[str | None, Trace, Theory]]]]:
-        """Yield the step, kind, value and alternatives of each observation of a stretch.
+    ) -> Iterator[tuple[tuple[int, str, str], str | None, Trace, Theory]]:
+        """Yield changes of single observations of a stretch.
 
-        An alternative is the other value in words (None if the observation is dropped), the changed
-        trace, and the changed theory.
+        Each has the step, kind and value of the observation, the other value in words (None if the
+        observation is dropped), the changed trace, and the changed theory. A view may be another
+        one or a new one, a star another one of the trace. An action may be another one, or unknown.
         """
         trace, theory = self.trace, self.theory
         names = named_steps(drives_of(trace), len(trace))
+        views = [view for view in dict.fromkeys(trace.views) if view is not None]
+        new_views = chain(["new view"], (f"new view {number}" for number in count(2)))
+        new = next(name for name in new_views if name not in views)
+        stars = [s for s in dict.fromkeys(step.star for step in trace.steps) if s is not None]
         for t in names[stretch.start : stretch.stop]:
             step = trace.steps[t]
-            yield t, "view", repr(step.view), self._with_views(t)
+            # The kind, the value, and for each other value its words and the changed step.
+            others: dict[tuple[str, str], list[tuple[str | None, Step]]] = {}
+            others["view", repr(step.view)] = [
+                *((repr(v), replace(step, view=v)) for v in views if v != step.view),
+                (NEW_VIEW, replace(step, view=new)),
+            ]
             if step.star is not None and theory.star != "none":
-                yield t, "star", _star(step), self._with_stars(t)
+                starred = [replace(step, star=star) for star in stars if star != step.star]
+                others["star", _star(step)] = [(_star(other), other) for other in starred]
             if t < stretch[-1] and step.action is not None and not step.action.starts:
-                yield t, "action", repr(step.action.name), self._with_actions(t)
+                others["action", repr(step.action.name)] = [
+                    *((repr(a.name), replace(step, action=a)) for a in self._other_actions(t)),
+                    (None, replace(step, action=Action.that_slipped(t))),
+                ]
+            for (kind, seen), listed in others.items():
+                for instead, other in listed:
+                    steps = (*trace.steps[:t], other, *trace.steps[t + 1 :])
+                    yield (t, kind, seen), instead, replace(trace, steps=steps), theory
             if t > stretch[0] and step.displacement is not None and theory.displacement == "use":
+                moved = str(tuple(round(x, 3) for x in step.displacement))
                 unknown = trace.without_displacements_at([t])
-                moved = tuple(round(x, 3) for x in step.displacement)
-                yield t, "displacement", str(moved), [(None, unknown, theory)]
+                yield (t, "displacement", moved), None, unknown, theory
         for name in ASSERTIONS:
             pairs = getattr(theory, name)
             for pair in pairs:
                 if set(pair) <= set(stretch):
                     left = theory.replace(**{name: tuple(p for p in pairs if p != pair)})
                     first, second = (names[t] for t in pair)
-                    yield second, name, f"{first} and {second}", [(None, trace, left)]
+                    yield (second, name, f"{first} and {second}"), None, trace, left
 
-    def _with_views(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
-        """Yield alternatives to the view of a step: all other views, and a new one."""
-        views = dict.fromkeys(self.trace.views, "")
-        others = [view for view in views if view not in (None, self.trace.steps[t].view)]
-        names = chain(["new view"], (f"new view {number}" for number in count(2)))
-        for view in others:
-            yield repr(view), self._changed(t, view=view), self.theory
-        new = next(name for name in names if name not in views)
-        yield NEW_VIEW, self._changed(t, view=new), self.theory
-
-    def _with_stars(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
-        """Yield alternatives to the star of a step: all other stars of the trace."""
-        for star in dict.fromkeys(step.star for step in self.trace.steps):
-            if star is not None and star != self.trace.steps[t].star:
-                changed = self._changed(t, star=star)
-                yield _star(changed.steps[t]), changed, self.theory
-
-    def _with_actions(self, t: int) -> Iterator[tuple[str | None, Trace, Theory]]:
-        """Yield alternatives to the action of a step: other actions, and an unknown one.
+    def _other_actions(self, t: int) -> list[Action]:
+        """List other actions of the trace and, with paths, one of each standard kind.
 
         A lift is no alternative if the next step has a displacement: a lift has none.
         """
-        step = self.trace.steps[t]
         moves = self.trace.steps[t + 1].displacement is not None
         known = {action.name: action for action in self.trace.actions if not action.starts}
         if self.theory.level == "topological":
             kinds = {(action.kind, action.turn) for action in known.values()}
-            known |= {
-                a.name: a
-                for a in STANDARD_ACTIONS.values()
-                if (a.kind, a.turn) not in kinds and a.name not in known
-            }
-        for action in known.values():
-            is_other = step.action is not None and action.name != step.action.name
-            if is_other and not (moves and action.breaks_frame):
-                yield repr(action.name), self._changed(t, action=action), self.theory
-        yield None, self._changed(t, action=Action.that_slipped(t)), self.theory
-
-    def _changed(self, t: int, **fields: Any) -> Trace:
-        """Return the trace with other fields at step t."""
-        steps = self.trace.steps
-        step = replace(steps[t], **fields)
-        return replace(self.trace, steps=(*steps[:t], step, *steps[t + 1 :]))
+            standard = (a for a in STANDARD_ACTIONS.values() if (a.kind, a.turn) not in kinds)
+            known |= {a.name: a for a in standard if a.name not in known}
+        done = self.trace.steps[t].action
+        return [a for a in known.values() if a != done and not (moves and a.breaks_frame)]
 
 
 def _star(step: Step) -> str:

@@ -31,7 +31,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.argument import Argument
 from ssh_abduction.explain.axioms import Axioms, Piece
 from ssh_abduction.explain.no_map import Explanation, check_two_steps, explain
-from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
+from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits, changes_in_words
 from ssh_abduction.explain.verdict import Derivation, PairExplanation, Side, Verdict
 from ssh_abduction.solver import EQUAL, Cost, Judging, Status, Stop, facts
 from ssh_abduction.theory.settle import displacement_of
@@ -120,18 +120,18 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         self.first, self.second = names[min(first, second)], names[max(first, second)]
         self._maps = max_maps
         self._sides = {True: Side(), False: Side()}
-        self._minimal = {True: False, False: False}  # whether the side has a minimal map
-        self._minimum: Cost | None = None
-        self._least_nats: float | None = None  # of the best map, if maps are weighed
         self._listed = False
         self._derivation: Derivation | None = None
         self._clash: Explanation | None = None
         self._best: tuple[SSHMap, Side] | None = None  # the best map that was found
-        self._changes: tuple[str, ...] = ()
         self._ruling_out: dict[bool, Piece] = {}  # a piece of the trace without a map of the side
 
     def known(self, why: Stop | None = None) -> PairExplanation:
         """Return what is known so far. `why` is the limit that is about to end the search."""
+        changes: tuple[str, ...] = ()
+        if self._best:
+            places = [self._best[0].place_of(step) for step in (self.first, self.second)]
+            changes = changes_in_words(self._best[0], places)
         return PairExplanation(
             self.first,
             self.second,
@@ -145,7 +145,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             theory=self.theory,
             loop=self._loop(),
             matches=self._matches(),
-            changes=self._changes,
+            changes=changes,
         )
 
     def _loop(self) -> str | None:
@@ -183,31 +183,25 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             if one.possible is two.possible:
                 return Verdict.NO_MAP
             return Verdict.SAME if two.possible is False else Verdict.DIFFERENT
-        if self._minimal[True] and self._minimal[False]:
+        minimal = {True: self._is_minimal(one, two), False: self._is_minimal(two, one)}
+        if all(minimal.values()):
             return Verdict.DISAGREE
-        for here, there, verdict in (
-            (True, False, Verdict.SAME_IN_MINIMAL),
-            (False, True, Verdict.DIFFERENT_IN_MINIMAL),
+        for here, verdict in (
+            (True, Verdict.SAME_IN_MINIMAL),
+            (False, Verdict.DIFFERENT_IN_MINIMAL),
         ):
-            if self._minimal[here] and (self._listed or self._is_dearer(self._sides[there])):
+            lost = self._sides[not here]
+            if minimal[here] and self._listed:
                 return verdict
-            if self._is_beaten(self._sides[there], self._sides[here]):
+            if lost.proven and self._is_cheaper(self._sides[here], lost):
                 return verdict
         return Verdict.UNKNOWN
 
-    def _is_dearer(self, side: Side) -> bool:
-        """Tell whether all maps of this side are known to cost more than the minimum."""
-        if self._minimum is None or side.cost is None or not side.proven:
-            return False
-        least = self._least_nats
-        if side.nats is not None and least is not None:
-            return side.nats > least + EQUAL
-        return side.cost.preferred_by(self.theory) > self._minimum.preferred_by(self.theory)
-
-    def _is_beaten(self, side: Side, by: Side) -> bool:
-        """Tell whether all maps of this side are known to cost more than a map of the side `by`."""
-        here, there = side.dearness(self.theory), by.dearness(self.theory)
-        return side.proven and here is not None and there is not None and here > there
+    def _is_minimal(self, side: Side, other: Side) -> bool:
+        """Tell whether a side has a minimal map: one was listed, or both best maps are proven."""
+        return side.maps > 0 or (
+            side.proven and other.proven and not self._is_cheaper(other, side) and bool(side.cost)
+        )
 
     def _find_out(self) -> None:
         self._begin_with_known_maps()
@@ -220,7 +214,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         self._list_minimal_maps(settled)
         if not settled and self._verdict() not in (Verdict.NO_MAP, Verdict.DISAGREE):
             for one in (True, False):
-                if not self._minimal[one] and not self._over():
+                if not self._sides[one].maps and not self._over():
                     self._find_best(one)
         if self._verdict() is Verdict.NO_MAP:
             self._clash = explain(self.trace, self.theory, self._over)
@@ -232,10 +226,6 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
                 piece, pair = self._shrunk(self._ruling_out[one], one), (self.first, self.second)
                 argument = Argument(piece, self.trace, pair, one=not one, stop=self._over)
                 self._derivation = argument.derivation()
-        if self._best:
-            ssh_map, side = self._best
-            places = [ssh_map.place_of(step) for step in (self.first, self.second)]
-            self._changes = self._changes_in_words(ssh_map, places, side.cost, side.nats)
 
     def _begin_with_known_maps(self) -> None:
         """Take over the known maps that satisfy the theory, with their costs.
@@ -278,8 +268,10 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             self._best = ssh_map, side
 
     def _is_cheaper(self, side: Side, other: Side) -> bool:
-        """Tell whether the map of a side costs less than the map of another. Both have a map."""
-        if (side.nats is None) is not (other.nats is None):  # a limit came before the price
+        """Tell whether the map of a side costs less than the map of another."""
+        if side.nats is not None and other.nats is not None:
+            return side.nats < other.nats - EQUAL
+        if side.nats is not None or other.nats is not None:  # a limit came before the price
             return side.nats is not None
         here, there = side.dearness(self.theory), other.dearness(self.theory)
         return here is not None and there is not None and here < there
@@ -358,9 +350,6 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             self._keep(found, search.cost, search.nats, proven=is_minimal)
             if is_minimal:
                 one = found.dstate_at[self.first] == found.dstate_at[self.second]
-                self._minimum = search.cost
-                self._minimal[one] = True
-                self._least_nats = search.nats
                 self._sides[one] = replace(self._sides[one], maps=self._sides[one].maps + 1)
         if search.status is Status.UNSATISFIABLE:
             self._sides = {True: Side(possible=False), False: Side(possible=False)}
@@ -371,31 +360,16 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         """Find the best map of the side `one`."""
         name = "same" if one else "different"
         pairs = (*getattr(self.theory, name), (self.first, self.second))
-        seconds = self._watch.left() * (SHARE if self._minimum is None else 2 * SHARE)
+        is_last = any(side.maps for side in self._sides.values())
+        seconds = self._watch.left() * (2 * SHARE if is_last else SHARE)
         search = self._solved(self.trace, self.theory.replace(**{name: pairs}), 1, seconds)
         for found in search:
             proven = search.status is Status.OPTIMAL
             self._keep(found, search.cost, search.nats, proven=proven)
-        side = self._sides[one]
         if search.status is Status.UNSATISFIABLE:
             self._sides[one] = Side(possible=False)
-        elif side.cost and self._minimum and side.proven and not self._is_dearer(side):
-            self._minimal[one] = True
-            self._sides[one] = replace(side, maps=max(1, side.maps))
-        # the best maps of both sides are known, although minimal maps were not listed in time
-        elif self._minimum is None and all(
-            side.proven and side.cost for side in self._sides.values()
-        ):
-            self._settle_minimum()
+        for side, other in ((True, False), (False, True)):
+            if self._is_minimal(self._sides[side], self._sides[other]):
+                maps = max(1, self._sides[side].maps)
+                self._sides[side] = replace(self._sides[side], maps=maps)
         self._ended(search)
-
-    def _settle_minimum(self) -> None:
-        """Store the minimal cost, and which sides have it, once both best maps are known."""
-        costs = {
-            one: side.cost.preferred_by(self.theory)
-            for one, side in self._sides.items()
-            if side.cost
-        }
-        least = min(costs, key=lambda one: costs[one])
-        self._minimum = self._sides[least].cost
-        self._minimal = {one: cost == costs[least] for one, cost in costs.items()}

@@ -24,8 +24,8 @@ from ssh_abduction.data.map_parts import course_named, list_in_words, regions_at
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import PlainData
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits
-from ssh_abduction.solver import Cost, Judging, Stop, with_regions
+from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits, changes_in_words
+from ssh_abduction.solver import Judging, Stop, with_regions
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # The side of a path on which a place is known to lie; "on" if it is on the path.
@@ -89,8 +89,8 @@ class PlaceExplanation(PlainData):
         place: The id of the place.
         sides: The side of the path that was given; else the known sides of all paths.
         regions: A sentence for each region that contains the place; empty if a path was given.
-        changes: Sentences about the gateways of the place that changed between drives, and what a
-            map costs without changes; empty if a path was given.
+        changes: Sentences about the gateways of the place that changed between drives; empty if a
+            path was given.
         maps: The number of listed minimal maps; 0 if no map was found.
         possible: Whether the trace has a map; None if a limit ended the search before.
         stopped: The limit that ended the search; None if it ended by itself.
@@ -146,33 +146,26 @@ class PlaceQuestion(LimitedQuestion[PlaceExplanation]):
         self._place, self._path = place, path
         self._maps: tuple[SSHMap, ...] = ()
         self._possible: bool | None = None
-        self._changes: tuple[str, ...] = ()
 
     def _find_out(self) -> None:
         accepts = Judging(self.problem).accepts
         if self._known_maps and accepts(self._known_maps[0]):
-            maps = self._maps = tuple(filter(accepts, self._known_maps))
+            self._maps = tuple(filter(accepts, self._known_maps))
             self._possible = True
-            cost: Cost | None = Cost.of(maps[0])
-            nats = None
-            if self.theory.weigh == "cost":
-                from ssh_abduction.solver import Misfit  # loads numpy
-
-                nats = Misfit(self.problem).nats_of(maps[0])
         else:
             search = self._solved(self.trace, self.theory, LISTED, self._watch.left())
             solution = search.solution(tuple(search))
             self._ended(search)
-            maps = self._maps = solution.minimal_maps or solution.maps
-            self._possible = bool(maps) or (None if search.stopped else False)
-            cost, nats = search.cost, search.nats
-        if maps and self._path is None:
-            self._changes = self._changes_in_words(maps[0], [self._place], cost, nats)
+            self._maps = solution.minimal_maps or solution.maps
+            self._possible = bool(self._maps) or (None if search.stopped else False)
 
     def known(self, why: Stop | None = None) -> PlaceExplanation:
         """Return what is known so far. Raises MapError if the map has no such place or path."""
         sides, regions = self._sides_and_regions() if self._maps else ((), ())
-        found = self._place, sides, regions, self._changes, len(self._maps), self._possible
+        changes: tuple[str, ...] = ()
+        if self._maps and self._path is None:
+            changes = changes_in_words(self._maps[0], [self._place])
+        found = self._place, sides, regions, changes, len(self._maps), self._possible
         return PlaceExplanation(*found, stopped=why or self.stopped)
 
     def _sides_and_regions(self) -> tuple[tuple[PathSide, ...], tuple[str, ...]]:

@@ -9,15 +9,12 @@ from typing import Generic, TypedDict, TypeVar
 
 from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_maps
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import counted
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.solver import (
-    Cost,
     LimitError,
     Progress,
     Search,
     Start,
-    Status,
     Stop,
     Watch,
     check_limit,
@@ -120,36 +117,15 @@ class LimitedQuestion(ABC, Generic[_Answer]):
         )
         return search
 
-    def _changes_in_words(
-        self, ssh_map: SSHMap, places: Collection[int | None], cost: Cost | None, nats: float | None
-    ) -> tuple[str, ...]:
-        """Say which gateways at these places changed between drives, and what the changes cost.
-
-        The last sentence says what the best map without changes costs. `cost` and `nats` are the
-        costs of the map with changes; `nats` is None if maps are not weighed.
-        """
-        changes = [f for f in ssh_map.faults if f.kind == "changed" and f.place in places]
-        if not changes or cost is None:
-            return ()
-        without = self._solved(self.trace, self.theory.replace(changed=0.0), 1, self._watch.left())
-        for _ in without:
-            pass
-        self._ended(without)
-        said = [f"{change}; this change costs {change.cost:g} dstates" for change in changes]
-        if without.status is Status.UNSATISFIABLE:
-            return (*said, "without changes there is no map")
-        if without.cost is None:
-            return (*said, "no map without changes was found in time")
-        best = "the best map" if without.status is Status.OPTIMAL else "the best map found"
-        changed = f"{cost.dstates} and changes for {cost.faults:g}"
-        more = f"has {counted(without.cost.dstates, 'dstates')}, not {changed}"
-        if nats is not None and without.nats is not None:
-            more = f"costs {without.nats:.1f} nats, not {nats:.1f}"
-        return (*said, f"without changes, {best} {more}")
-
     def _ended(self, search: Search) -> None:
         """Store in `stopped` why a search ended early, if a limit of this question was reached."""
         self._search = None
         if search.stopped in ("interrupted", "memory limit"):
             self.stopped = search.stopped
         self._over()
+
+
+def changes_in_words(ssh_map: SSHMap, places: Collection[int | None]) -> tuple[str, ...]:
+    """Say which gateways at these places changed between drives, and what each change costs."""
+    changes = (f for f in ssh_map.faults if f.kind == "changed" and f.place in places)
+    return tuple(f"{change}; this change costs {change.cost:g} dstates" for change in changes)

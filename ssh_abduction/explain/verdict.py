@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
-from ssh_abduction.checker.checker import Violation
-from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.no_map import ClashingAxiom, Explanation, clashes_of, steps_listed
@@ -84,7 +82,7 @@ class PairExplanation:
         loop: The closing error of the loop between the steps, in words; None if unknown.
         matches: Sentences about the closures between the visits of the two steps.
         changes: Sentences about the gateways at the places of the steps that changed between drives
-            in the best map, and what a map costs without changes.
+            in the best map.
     """
 
     first: int
@@ -285,17 +283,16 @@ def _difference(lost: Cost, won: Cost, theory: Theory) -> str:
     return f"{_in_words(lost, theory.priorities)}, as many as the minimal maps"
 
 
-@dataclass(frozen=True, slots=True)
-class Link:
-    """An axiom at one step that an argument needs."""
+class Link(NamedTuple):
+    """An axiom at one step that an argument needs.
+
+    There is a map of the steps of the argument in which all other links hold, but not the
+    conclusion.
+    """
 
     axiom: str  # the name of the axiom
     # The step. If the axiom is about several steps at once, this is the last of them.
     step: int
-    # A map of the steps of the argument in which all other links hold, but not the conclusion.
-    without: SSHMap
-    # The violations of axioms of the argument that the checker finds in this map.
-    violations: tuple[Violation, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,7 +336,7 @@ class Derivation:
     @property
     def clashes(self) -> tuple[ClashingAxiom, ...]:
         """The axioms of the links in the order of the argument, each with all its steps."""
-        return clashes_of((link.axiom, link.step) for link in self.links)
+        return clashes_of(self.links)
 
     @property
     def axioms(self) -> tuple[str, ...]:
@@ -358,7 +355,7 @@ class Derivation:
         return "\n".join([*lines, f"in short: {self.summary}"] if len(parts) <= BRIEF else lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the argument as plain data, without the maps of the links."""
+        """Return the argument as plain data, as `explain --json` prints it."""
         return attributes_of(self, "steps", "clashes", "supposition", "inferences", "summary")
 
 

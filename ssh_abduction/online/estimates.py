@@ -16,10 +16,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,7 @@ from ssh_abduction.data.trace import Action, Trace, View
 Array: TypeAlias = NDArray[np.float64]
 # A move of the robot: the name of an action, or a turn by whole degrees clockwise.
 Move: TypeAlias = str | int
+Fact = TypeVar("Fact", bound=tuple[Any, ...])
 
 # A turn leads to dstates that face within FACING standard deviations of the direction after it.
 FACING = 3.0
@@ -167,17 +169,10 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
     The trace that was mapped serves to estimate f by counting (equation 3). The map says what a
     dstate shows if no step of the trace is at it, or if the trace is None (equation 4).
     """
-    # Count the steps at each dstate that show each view.
-    counts = Counter[tuple[int, View]]()
-    if trace is not None:
-        counts.update(
-            (x, step.view)
-            for x, step in zip(ssh_map.dstate_at, trace, strict=True)
-            if step.view is not None
-        )
-    seen = {x for x, _ in counts}
-    counts.update(
-        (s.id, s.view) for s in ssh_map.dstates if s.id not in seen and s.view is not None
+    steps = zip(ssh_map.dstate_at, trace or (), strict=False)
+    counts = _counted(
+        ((x, step.view) for x, step in steps if step.view is not None),
+        ((s.id, s.view) for s in ssh_map.dstates if s.view is not None),
     )
     visits = Counter[int]()
     for (x, _), n in counts.items():
@@ -245,23 +240,23 @@ def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
     The trace that was mapped serves to estimate probabilities by counting (equation 3). The links
     of the map say where an action leads if the trace lacks it there, or is None (equation 4).
     """
-    # Count how often each action led from one dstate to another.
-    counts = Counter[tuple[int, str, int]]()
     labels = ssh_map.dstate_at
-    if trace is not None:
-        counts.update(
-            (x, action.name, y)
-            for x, action, y in zip(labels, trace.actions, labels[1:], strict=False)
-            if not action.starts
-        )
-    tried = {(x, action) for x, action, _ in counts}
-    counts.update({link for link in ssh_map.links if link[:2] not in tried})
+    steps = zip(labels, trace.actions if trace else (), labels[1:], strict=False)
+    counts = _counted(((x, a.name, y) for x, a, y in steps if not a.starts), ssh_map.links)
     entries = gathered((action, (x, y, n)) for (x, action, y), n in counts.items())
     links: dict[str, Links] = {}
     for action, listed in entries.items():
         sources, targets, tries = np.array(listed).T
         links[action] = _links_of(sources, targets, tries, len(ssh_map.dstates))
     return links
+
+
+def _counted(of_trace: Iterable[Fact], of_map: Iterable[Fact]) -> Counter[Fact]:
+    """Count facts (dstate, …, result) of a trace; where it has none, take those of the map."""
+    counts = Counter(of_trace)
+    known = {fact[:-1] for fact in counts}
+    counts.update({fact for fact in of_map if fact[:-1] not in known})
+    return counts
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,24 +3,22 @@
 A fault is a step that a map treats as wrong. A minimal map is kept by replaying it: following its
 links along the steps of the trace, as long as it predicts what the robot sees.
 
-A *sketch* (`solver/sources/symbolic/sketch.py`) is made without a search: a step gets a new dstate
-(a place and a heading) unless the axioms imply at which known dstate it is. A *draft* is a sketch
-that begins with a good map of the first steps. It is used if finding a minimal map takes too long.
-A sketch that begins at the first step is mostly larger. It is used if there is no draft.
+A *draft* is a map that is made without a search from a good map of the first steps: each further
+step gets a new dstate (a place and a heading) unless the axioms imply at which known dstate it is
+(`solver/sources/symbolic/sketch.py`). It is used if finding a minimal map takes too long.
 """
 
 from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from ssh_abduction.checker.checker import check, unchecked
-from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.groups import firsts, gathered
+from ssh_abduction.data.maps import DState, Fault, SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.online.hypotheses import ExtendedMap
 from ssh_abduction.solver import (
     Cost,
     Effort,
@@ -33,7 +31,6 @@ from ssh_abduction.solver import (
     Stop,
     observation,
     sketch_beyond,
-    sketches_of,
 )
 from ssh_abduction.theory.evidence import said_by
 from ssh_abduction.theory.pairs import Pairs
@@ -49,6 +46,10 @@ PAUSE = 2
 # Keep at most this many drafts, as each takes time at every step. Mostly at least one of the best
 # drafts remains consistent for long.
 DRAFTS = 3
+# As `observation` returns it: the view, and the star (the openings seen) or None.
+Seen = tuple[object, object]
+# What a dstate costs, in tenths of dstates.
+DSTATE = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +134,15 @@ class MapKeeper(Keeper):
         self, problem: Problem, options: StepOptions, before: MapKeeper | None = None
     ) -> None:
         super().__init__(problem, options, before)
-        self.minimal = MinimalMaps(problem.trace, problem.theory, self._judging)
-        self.drafts = Drafts(problem, self._judging)  # maps that were made without a search
+        # The minimal maps. If maps are not replayed, the maps that clingo found last, which may not
+        # be proven minimal.
+        self._maps: list[ExtendedMap] = []
+        self._status = Status.UNKNOWN  # UNKNOWN until clingo has proven which maps are minimal
+        self._complete = False  # whether these are all minimal maps
+        self._cost: Cost | None = None  # the counts of a minimal map; None if they are unknown
+        # Whether the claim in `mapper.py` holds for the theory, so that maps are replayed.
+        self._replays = row("prefixes").holds_for(problem.theory)
+        self._drafts = Drafts(problem, self._judging)  # maps that were made without a search
         # The last search, which the next one continues; None before the first.
         self.search: Search | None = None
         self._found: Solution | None = None  # the solution of this search, without its maps
@@ -147,93 +155,104 @@ class MapKeeper(Keeper):
         """
         keeper = MapKeeper(problem, self._options, before=self)
         if self._problem.theory.displacement == "use":
-            for ssh_map in [m.explained() for m in self.minimal.maps[:DRAFTS]] + self.drafts.maps():
-                keeper.drafts.add(ssh_map, problem.trace)
+            for ssh_map in [m.explained() for m in self._maps[:DRAFTS]] + self._drafts.maps():
+                keeper._drafts.add(ssh_map, problem.trace)
         return keeper
 
     def _follow(self) -> bool:
-        problem, trace = self._problem, self._problem.trace
+        """Keep the maps that predict the last step. If none does, those without a link are drafts.
+
+        A map without a link for the action may be extended to further minimal maps.
+        """
+        trace, pairs = self._problem.trace, self._problem.pairs
         action = trace.steps[-2].action
         assert action
-        if self.minimal.is_impossible:
+        if self._is_impossible:
             return False
-        was_proven = self.minimal.status is Status.OPTIMAL
-        untried = self.minimal.follow(action, trace, problem.pairs)
-        self.drafts.follow(action, trace.steps[-1])
+        was_proven, seen = self._is_proven, observation(trace.steps[-1], self._problem.theory)
+        untried = [m for m in self._maps if m.is_unknown(action.name)]
+        longer = (m.predicting(action.name, seen) for m in self._maps if self._replays)
+        self._maps = [m for m in longer if m and m.is_allowed(trace, pairs, self._judging)]
+        self._complete = self._complete and not untried
+        self._drafts.follow(action, trace.steps[-1])
+        if self._maps:
+            return False
+        self._status, self._complete = Status.UNKNOWN, False
         for rival in untried[:DRAFTS]:
-            self.drafts.add(rival.explained(), trace)
-        return was_proven and self.minimal.status is Status.UNKNOWN
+            self._drafts.add(rival.explained(), trace)
+        return was_proven or not self._drafts.maps()
+
+    @property
+    def _is_proven(self) -> bool:
+        """Whether the maps are proven minimal."""
+        return self._status is Status.OPTIMAL
+
+    @property
+    def _is_impossible(self) -> bool:
+        """Whether it is proven that these steps have no map, however the trace goes on."""
+        return self._status is Status.UNSATISFIABLE and self._replays
 
     @property
     def _is_settled(self) -> bool:
-        minimal = self.minimal
-        is_complete = minimal.complete or len(minimal.maps) == self._options.max_maps
-        return minimal.is_impossible or (minimal.status is Status.OPTIMAL and is_complete)
+        is_complete = self._complete or len(self._maps) == self._options.max_maps
+        return self._is_impossible or (self._is_proven and is_complete)
 
     def _ask(self) -> Stop | None:
         """Search for minimal maps with clingo and keep them.
 
-        If a minimal map is known, only the others are searched for.
-        If maps are replayed, maps without a proof do not replace the known ones. The best of them
-        becomes a draft, which later steps extend.
+        If a minimal map is known, only the others are searched for. Known minimal maps stay if the
+        search listed fewer. If maps are replayed, maps without a proof do not replace the known
+        ones. The best of them becomes a draft, which later steps extend.
         """
-        trace, options = self._problem.trace, self._options
-        is_proven = self.minimal.status is Status.OPTIMAL
+        trace, theory, options = self._problem.trace, self._problem.theory, self._options
         search = Search.continuing(
             self.search,
             trace,
-            self._problem.theory,
+            theory,
             time_limit=options.time_limit,
             work_limit=options.work_limit,
             max_maps=options.max_maps,
             speedups=options.speedups,
-            minimal=self.minimal.maps[0].explained() if is_proven else None,
+            minimal=self._maps[0].explained() if self._is_proven else None,
         )
         # The maps are not ranked, as ranking takes longer than a step may.
         found = tuple(search.unranked())
         said = search.solution()
         self.search, self._found = search, said
-        proves = said.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
-        if proves or not self.minimal.replays:
-            self.minimal.replace(found, said.status, said.complete, said.cost)
-            self.drafts.clear()
+        if said.status in (Status.OPTIMAL, Status.UNSATISFIABLE) or not self._replays:
+            if len(found) >= len(self._maps) or not self._is_proven:
+                self._maps = [ExtendedMap.of(m, trace, theory) for m in found]
+            self._status, self._complete, self._cost = said.status, said.complete, said.cost
+            self._drafts.clear()
         elif found:
-            self.drafts.add(found[0], trace)
+            self._drafts.add(found[0], trace)
         return search.stopped
 
     def _solution(self, began: float) -> Solution:
         asked = self._found
         assert asked is not None
-        minimal, trace, steps = self.minimal, self._problem.trace, len(self._problem.trace)
-        status, cost = minimal.status, minimal.cost
-        maps = tuple(m.explained() for m in minimal.maps)
-        if status is Status.UNKNOWN and (best := self.drafts.best(trace, self._problem.pairs)):
+        problem, steps = self._problem, len(self._problem.trace)
+        status, cost = self._status, self._cost
+        maps = tuple(m.explained() for m in self._maps)
+        if status is Status.UNKNOWN and (best := self._drafts.best(problem.trace, problem.pairs)):
             maps, status, cost = (best,), Status.FEASIBLE, Cost.of(best)
         self._judge(maps, began)
-        was_asked = asked.steps == steps  # at this step
+        searched = asked.seconds if asked.steps == steps else Seconds(0.0, 0.0, 0.0)
+        refused = {name: said["refused"] for name, said in asked.effort.evidence.items()}
         return Solution(
             status=status,
             maps=maps,
             cost=cost if maps else None,
             bound=asked.bound,
-            complete=minimal.complete,
-            theory=self._problem.theory,
+            complete=self._complete,
+            theory=problem.theory,
             steps=steps,
             effort=Effort(
                 prefix=asked.effort.prefix,
-                seconds=Seconds(
-                    time.perf_counter() - began,
-                    asked.seconds.ground if was_asked else 0.0,
-                    asked.seconds.solve if was_asked else 0.0,
-                ),
-                evidence=said_by(
-                    self._problem.evidence,
-                    trace,
-                    self._problem.theory,
-                    {name: said["refused"] for name, said in asked.effort.evidence.items()},
-                ),
+                seconds=replace(searched, total=time.perf_counter() - began),
+                evidence=said_by(problem.evidence, problem.trace, problem.theory, refused),
             ),
-            stopped=None if minimal.complete else asked.stopped,
+            stopped=None if self._complete else asked.stopped,
             support=asked.support,
         )
 
@@ -247,10 +266,10 @@ class Draft:
 
 
 class Drafts:
-    """Keeps drafts and sketches: maps of the steps so far that were made without a search."""
+    """Keeps drafts: maps of the steps so far that were made without a search, the best first."""
 
     def __init__(self, problem: Problem, judging: Judging) -> None:
-        trace, theory, evidence = problem.trace, problem.theory, problem.evidence
+        theory, evidence = problem.theory, problem.evidence
         self._theory, self._judging = theory, judging
         self._has_evidence = bool(evidence)
         # Evidence judges a sketch as it grows. The other axioms hold by construction, or the
@@ -260,22 +279,15 @@ class Drafts:
         )
         self._may_sketch = row("prefixes").holds_for(theory) and not unchecked(theory)
         self._trusts_sketches = row("certain sketches").holds_for(self._other_axioms)
-        self._drafts: list[Draft] = []  # the best first
-        self._sketches = [Draft(sketch) for sketch in sketches_of(trace.steps[0], theory)]
-        for before, step in pairwise(trace.steps):
-            assert before.action
-            self._sketches = [
-                draft for draft in self._sketches if draft.sketch.extend(before.action, step)
-            ]
+        self._drafts: list[Draft] = []
 
     def maps(self) -> list[SSHMap]:
         """Return the maps of all drafts, the best first. These maps need not be consistent."""
         return [draft.sketch.map() for draft in self._drafts]
 
     def follow(self, action: Action, step: Step) -> None:
-        """Extend drafts and sketches by a step, and drop those that the step contradicts."""
+        """Extend drafts by a step, and drop those that the step contradicts."""
         self._drafts = [draft for draft in self._drafts if draft.sketch.extend(action, step)]
-        self._sketches = [draft for draft in self._sketches if draft.sketch.extend(action, step)]
 
     def add(self, ssh_map: SSHMap, trace: Trace) -> None:
         """Extend a map of the first steps to a draft of all steps, unless a step contradicts it."""
@@ -288,11 +300,11 @@ class Drafts:
             self._drafts = sorted([*self._drafts, Draft(sketch)], key=self._cost)[:DRAFTS]
 
     def clear(self) -> None:
-        """Drop all drafts. The sketches stay."""
+        """Drop all drafts."""
         self._drafts = []
 
     def best(self, trace: Trace, pairs: Pairs) -> SSHMap | None:
-        """Return the map of the best consistent draft, else of a consistent sketch, else None.
+        """Return the map of the best consistent draft; None if there is none.
 
         `pairs` is what the evidence says about pairs of these steps. Drafts that turn out
         to be inconsistent are dropped.
@@ -301,10 +313,6 @@ class Drafts:
             if self._is_consistent(self._drafts[0], trace, pairs):
                 return self._drafts[0].sketch.map()
             del self._drafts[0]
-        if self._may_sketch:
-            for draft in self._sketches:
-                if self._is_consistent(draft, trace, pairs):
-                    return draft.sketch.map()
         return None
 
     def _cost(self, draft: Draft) -> tuple[int, ...]:
@@ -328,53 +336,169 @@ class Drafts:
         return sketch.certain
 
 
-class MinimalMaps:
-    """The minimal maps of the steps so far, with how much is proven about them."""
+@dataclass(frozen=True, slots=True)
+class ExtendedMap:
+    """A rival: a map of all steps so far, and how it was extended.
 
-    def __init__(self, trace: Trace, theory: Theory, judging: Judging) -> None:
-        # The minimal maps. If `replays` is false, the maps that clingo found last, which may not be
-        # proven minimal.
-        self.maps: list[ExtendedMap] = []
-        self.status = Status.UNKNOWN  # UNKNOWN until clingo has proven which maps are minimal
-        self.complete = False  # whether `maps` are all minimal maps
-        self.cost: Cost | None = None  # the counts of a minimal map; None if they are unknown
-        # Whether the claim in `mapper.py` holds for the theory, so that maps are replayed.
-        self.replays = row("prefixes").holds_for(theory)
-        self._trace, self._theory, self._judging = trace, theory, judging
+    When a new step comes, a map that predicts it is extended in one way. If the theory allows
+    faults, any other map is extended in each of these ways:
 
-    def follow(self, action: Action, trace: Trace, pairs: Pairs) -> list[ExtendedMap]:
-        """Keep the maps that predict the last step. If none does, reset the status to UNKNOWN.
+        contradicted  The observation is misread, and the robot is where the link leads. Or the
+                      action slipped, and the robot is at one of the dstates that look like this,
+                      or at a new dstate.
+        unknown       A new link leads to one of the dstates that look like this, or to a new
+                      dstate.
 
-        `trace` has this step, and `action` led to it. If no map is kept, return the maps
-        that have no link for the action, else an empty list.
-        """
-        self._trace, seen = trace, observation(trace.steps[-1], self._theory)
-        untried = [m for m in self.maps if m.is_unknown(action.name)]
-        longer = (m.predicting(action.name, seen) for m in self.maps)
-        self.maps = [m for m in longer if m and m.is_allowed(trace, pairs, self._judging)]
-        # A map without a link for the action may be extended to further minimal maps.
-        self.complete = self.complete and not untried
-        if not self.replays:
-            self.maps = []
-        if self.maps:
-            return []
-        self.status, self.complete = Status.UNKNOWN, False
-        return untried
+    New links and new dstates are for the causal theory alone. In a theory with places and paths,
+    only the axioms say where a new link may lead.
+    """
 
-    def replace(
-        self, found: Iterable[SSHMap], status: Status, complete: bool, cost: Cost | None
-    ) -> None:
-        """Take the result of a search. Keep the known minimal maps if the search listed fewer.
+    map: SSHMap  # the map that the solver found, of the first steps or of all
+    labels: tuple[int, ...]  # the dstate of each step so far
+    shows: tuple[Seen, ...]  # the view and star of each dstate
+    # For each dstate and name of an action, the dstate that the action leads to.
+    links: Mapping[tuple[int, str], int]
+    faults: tuple[Fault, ...]  # the observations and actions that are treated as wrong
+    # The counts that the theory minimises, the most important first. Dstates, with the price of
+    # faults, count in tenths.
+    cost: tuple[int, ...]
 
-        `complete` says whether these are all minimal maps. `cost` has the counts of a minimal map,
-        if there is one.
-        """
-        maps, was_proven = list(found), self.status is Status.OPTIMAL
-        self.status, self.complete, self.cost = status, complete, cost
-        if len(maps) >= len(self.maps) or not was_proven:
-            self.maps = [ExtendedMap.of(m, self._trace, self._theory) for m in maps]
+    @classmethod
+    def of(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> ExtendedMap:
+        """Make the hypothesis that a map of the trace, or of its first steps, is true."""
+        wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
+        first = firsts((s, t) for t, s in enumerate(ssh_map.dstate_at) if t not in wrong)
+        shows = tuple(
+            observation(trace.steps[first[s.id]], theory) if s.id in first else (s.view, None)
+            for s in ssh_map.dstates
+        )
+        links = {(s, action): x for s, action, x in ssh_map.links}
+        cost = Cost.of(ssh_map).preferred_by(theory)
+        return cls(ssh_map, ssh_map.dstate_at, shows, links, ssh_map.faults, cost)
 
     @property
-    def is_impossible(self) -> bool:
-        """Whether it is proven that these steps have no map, however the trace goes on."""
-        return self.status is Status.UNSATISFIABLE and self.replays
+    def here(self) -> int:
+        """The id of the dstate where the robot is after the last step."""
+        return self.labels[-1]
+
+    @property
+    def places(self) -> list[int | None]:
+        """The place of each dstate; None for a dstate without a place."""
+        known = self.map.dstates
+        return [s.place for s in known] + [None] * (len(self.shows) - len(known))
+
+    def explained(self) -> SSHMap:
+        """Make the map of all steps so far, with its faults."""
+        if len(self.map.dstate_at) == len(self.labels):
+            return self.map
+        known = self.map.dstates
+        new = (DState(s, self.shows[s][0]) for s in range(len(known), len(self.shows)))  # type: ignore[arg-type]
+        links = self.map.links
+        if len(links) < len(self.links):
+            links = tuple(sorted((s, action, x) for (s, action), x in self.links.items()))
+        faults = tuple(sorted(self.faults, key=lambda fault: (fault.step, fault.kind)))
+        labels, dstates = self.labels, (*known, *new)
+        return replace(
+            self.map, dstate_at=labels, dstates=dstates, links=links, faults=faults, fit=None
+        )
+
+    def contradiction(self, action: str, seen: Seen) -> int | None:
+        """Return the dstate that an action leads to, if it shows something else than `seen`.
+
+        None if it shows that, or if the map has no link for the action.
+        """
+        there = self.links.get((self.here, action))
+        return None if there is None or self.shows[there] == seen else there
+
+    def predicting(self, action: str, seen: Seen) -> ExtendedMap | None:
+        """Extend this map by a step that it predicts; None if it does not predict the step."""
+        there = self.links.get((self.here, action))
+        return None if there is None or self.shows[there] != seen else self._to(there)
+
+    def is_allowed(self, trace: Trace, pairs: Pairs, judging: Judging) -> bool:
+        """Whether the evidence allows the last step of a trace, as it allowed the earlier ones."""
+        t = len(trace) - 1
+        return pairs.allow(t, self.labels, self.places) and judging.allows_grown(
+            trace, self.explained(), t
+        )
+
+    def is_unknown(self, action: str) -> bool:
+        """Whether the map has no link for an action at the dstate where the robot is."""
+        return (self.here, action) not in self.links
+
+    def future(self) -> tuple[object, ...]:
+        """Summarise what the map predicts from here on, as a value that can be compared.
+
+        Two maps have equal values if they have the same dstates, the same links, and the robot at
+        the same dstate, up to renaming. The past does not count. For dstates that cannot be
+        reached from here, only their number counts.
+        """
+        ends = gathered((s, (action, x)) for (s, action), x in self.links.items())
+        # Number the dstates in the order in which a breadth-first search from here reaches them.
+        number, reached = {self.here: 0}, [self.here]
+        links = []
+        for s in reached:
+            for action, x in sorted(ends.get(s, [])):
+                if x not in number:
+                    number[x] = len(reached)
+                    reached.append(x)
+                links.append((number[s], action, number[x]))
+        return tuple(self.shows[s] for s in reached), tuple(links), len(self.shows)
+
+    def ways_on(self, action: str, step: Step, seen: Seen, theory: Theory) -> Iterator[ExtendedMap]:
+        """Yield the extensions of this rival by one step. Those without extra cost come first.
+
+        `action` is the name of the action before the step. In the theory no field is "auto".
+        """
+        t, there = len(self.labels), self.links.get((self.here, action))
+        alike = [s for s, shown in enumerate(self.shows) if shown == seen]
+        is_causal = theory.level == "causal"
+        if there is None:
+            if is_causal:
+                for s in alike:
+                    yield self._to(s, link=action)
+                yield self._to(len(self.shows), link=action, new=seen)
+            return
+        if longer := self.predicting(action, seen):
+            yield longer
+            return
+        if theory.misread:
+            view, star = self.shows[there]
+            tenths = theory.fault_tenths("misread", step)
+            doubted = []
+            if view != seen[0]:
+                doubted += [Fault(t, "misread", step.view, view, tenths / 10)]  # type: ignore[arg-type]
+            if star != seen[1]:
+                doubted += [Fault(t, "misseen", cost=tenths / 10)]
+            yield self._to(there, faults=doubted, tenths=tenths * len(doubted))
+        if theory.slipped:
+            tenths = theory.fault_tenths("slipped", step)
+            slipped = [Fault(t - 1, "slipped", action, cost=tenths / 10)]
+            for s in alike:
+                yield self._to(s, faults=slipped, tenths=tenths)
+            if is_causal:
+                yield self._to(len(self.shows), new=seen, faults=slipped, tenths=tenths)
+
+    def _to(
+        self,
+        there: int,
+        *,
+        link: str | None = None,
+        new: Seen | None = None,
+        faults: Sequence[Fault] = (),
+        tenths: int = 0,
+    ) -> ExtendedMap:
+        """Extend this rival by a step at the dstate `there`.
+
+        `link` names the action if the step adds a link. `new` is the view and star of a new dstate.
+        `tenths` is the cost of the faults that the step adds; 10 is the cost of one dstate.
+        """
+        tenths += DSTATE if new else 0
+        return ExtendedMap(
+            self.map,
+            (*self.labels, there),
+            (*self.shows, new) if new else self.shows,
+            {**self.links, (self.here, link): there} if link else self.links,
+            (*self.faults, *faults),
+            (self.cost[0] + tenths, *self.cost[1:]) if tenths else self.cost,
+        )

@@ -68,7 +68,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.data.errors import TheoryError, TraceError, brief
+from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
 from ssh_abduction.data.words import counted
@@ -137,8 +137,6 @@ class OnlineMapper:
         check_limit("work_limit", "units of work", work_limit)
         checked_speedups(speedups)
         self._odometry = None if odometry is None else Odometry.of(odometry)
-        self._steps = [first]
-        self._actions: dict[str, Action] = {}
         self.trace = Trace((first,), odometry=self._odometry)
         self._settler = TheorySettler(theory, self.trace)
         self._problem = self._settler.settled(self.trace)
@@ -181,7 +179,7 @@ class OnlineMapper:
 
     def __repr__(self) -> str:
         cost = self.solution.cost
-        steps = counted(len(self._steps), "steps")
+        steps = counted(len(self.trace), "steps")
         dstates = counted(cost.dstates, "dstates") if cost else "no map"
         status = self.solution.status.value
         return f"<OnlineMapper: {steps}, {status}, {dstates}>"
@@ -212,7 +210,7 @@ class OnlineMapper:
             TraceError: The step does not fit the theory or the trace. The mapper is unchanged then.
         """
         began = time.perf_counter()
-        done, number = Action.of(action), len(self._steps)
+        done, number = Action.of(action), len(self.trace)
         step = Step.of(
             _known(view, number),
             star,
@@ -233,25 +231,17 @@ class OnlineMapper:
 
     def _append(self, action: Action, step: Step) -> None:
         """Append a step to the trace. Raises TraceError if it does not fit."""
-        last, number = replace(self._steps[-1], action=action), len(self._steps)
+        last, number = replace(self.trace.steps[-1], action=action), len(self.trace)
         if action.starts:
             raise TraceError(
                 f"step {number - 1}: action: expected an action of the robot, got the start "
                 "of a drive; a mapper takes one drive, so solve the traces of all drives together"
             )
-        known = self._actions.get(action.name, action)
-        if known != action:
-            raise TraceError(
-                f"step {number - 1}: action: {brief(action.name)} has kind {action.kind}, "
-                f"turn {action.turn} here but kind {known.kind}, turn {known.turn} before; "
-                "give the two different names, or the same kind"
-            )
+        trace = Trace((*self.trace.steps[:-1], last, step), odometry=self._odometry)
         self.theory.require(last, f"step {number - 1}")
         self.theory.require(step, f"step {number}")
         self._settler.check_star(step, number)
-        self._actions[action.name] = action
-        self._steps[-1:] = [last, step]
-        self.trace = Trace(tuple(self._steps), odometry=self._odometry)
+        self.trace = trace
 
 
 def _known(view: View, step: int) -> View:

@@ -28,7 +28,7 @@ the logical representation can be restored" (Kuipers & Beeson 2002). This module
   cost nothing, and all others cost more. If no minimal map predicts the step, the trace
   is solved again, within the time of a step.
 * **Rivals** (`RivalMaps`): besides the minimal maps, explanations that cost a little more,
-  each with its probability (`hypotheses.py`).
+  each with its probability (`shares_of_rivals`).
 * **Where the robot is** (`Confidence`), by Markov localisation in the best map. It begins just
   before the first step that contradicted the map. The robot may be at no dstate of the map.
 
@@ -39,19 +39,20 @@ and localisation finds the robot where this map has it.
 
 from __future__ import annotations
 
+import math
 import time
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.online.belief import Belief, Chances
-from ssh_abduction.online.hypotheses import ExtendedMap, Seen, shares_of_rivals
-from ssh_abduction.online.keeper import Keeper, StepOptions
-from ssh_abduction.online.localiser import Localiser
+from ssh_abduction.online.keeper import ExtendedMap, Keeper, Seen, StepOptions
+from ssh_abduction.online.localiser import Belief, Chances, Localiser
 from ssh_abduction.solver import (
     Bound,
     Effort,
@@ -225,16 +226,6 @@ def chances_of(theory: Theory) -> Chances:
     return Chances(misread=misread, slipped=slipped)
 
 
-@dataclass(frozen=True, slots=True)
-class _LocatedBelief:
-    """The belief in a map after the first steps, and the localiser that continues it."""
-
-    map_key: object
-    localiser: Localiser
-    belief: Belief
-    steps: int
-
-
 class Confidence:
     """Computes how sure the mapper is after each step, for a theory that allows faults."""
 
@@ -244,7 +235,6 @@ class Confidence:
         self._chances = chances_of(theory)
         # Each step that contradicted the best map since it was certain, with a sentence.
         self.broke: list[tuple[int, str]] = []
-        self._located: _LocatedBelief | None = None
 
     def standing(self, maps: RivalMaps, trace: Trace, listed: Sequence[SSHMap]) -> Standing:
         """Compute how sure the mapper is now, by the rivals and the maps listed, best first."""
@@ -263,7 +253,7 @@ class Confidence:
         standing = Standing(certain, broke, self._hypotheses(rivals, shares), where)
         # From here on only later faults are reported.
         if certain:
-            self.known, self._located = listed[0], None
+            self.known = listed[0]
             self.broke.clear()
         return standing
 
@@ -303,22 +293,13 @@ class Confidence:
         Begin where this map has the robot just before the first step that contradicted the best
         map since the mapper was certain, but at most REPLAYED steps back.
         """
-        t = len(trace) - 1
-        key = (lead.shows, frozenset(lead.links.items()))
-        if self._located is not None and self._located.map_key == key:
-            localiser, belief = self._located.localiser, self._located.belief
-            after = self._located.steps
-        else:  # another map than at the last step
-            localiser = Localiser(lead.explained(), chances=self._chances)
-            after = max(self.broke[0][0] - 1, t - REPLAYED, 0)
-            there = np.zeros(len(lead.shows))
-            there[lead.labels[after]] = 1.0
-            belief = Belief(there, 0.0)
-        for i in range(after, t):
-            done = trace.steps[i].action
-            assert done
-            belief = localiser.update(belief, done, trace.steps[i + 1].view)
-        self._located = _LocatedBelief(key, localiser, belief, t)
+        last = len(trace) - 1
+        first = max(self.broke[0][0] - 1, last - REPLAYED, 0)
+        localiser = Localiser(lead.explained(), chances=self._chances)
+        belief = Belief(np.eye(len(lead.shows))[lead.labels[first]], 0.0)
+        for before, after in pairwise(trace.steps[first:]):
+            assert before.action
+            belief = localiser.update(belief, before.action, after.view)
         return belief
 
 
@@ -354,7 +335,8 @@ class RivalMaps:
         # Whether it is proven that the cheapest rivals are minimal, that all minimal maps are
         # listed, and that no map satisfies the axioms.
         self.is_proven = self.is_complete = self.is_impossible = False
-        self._problem, self._max_maps, self._judging = problem, max_maps, judging
+        self._problem, self._theory = problem, theory
+        self._max_maps, self._judging = max_maps, judging
         self._views = {step.view for step in trace.steps}
         self._least: tuple[int, ...] = ()  # what a minimal map costs, while proven
         self._replays = row("prefixes").holds_for(theory.replace(misread=0, slipped=0))
@@ -366,14 +348,6 @@ class RivalMaps:
             and not theory.rules
             and not theory.without
         )
-
-    @property
-    def _trace(self) -> Trace:
-        return self._problem.trace
-
-    @property
-    def _theory(self) -> Theory:
-        return self._problem.theory
 
     @property
     def lead(self) -> ExtendedMap | None:
@@ -434,7 +408,9 @@ class RivalMaps:
         if found.status is Status.UNSATISFIABLE:
             self.is_impossible, self.rivals = True, []
             return
-        rivals = [ExtendedMap.of(ssh_map, self._trace, self._theory) for ssh_map in found.maps]
+        rivals = [
+            ExtendedMap.of(ssh_map, self._problem.trace, self._theory) for ssh_map in found.maps
+        ]
         if found.status is Status.OPTIMAL and rivals:
             self.is_proven, self.is_complete, self._least = True, found.complete, rivals[0].cost
         # Keep the other rivals. But if all minimal maps are listed, no other rival can be as cheap.
@@ -454,8 +430,8 @@ class RivalMaps:
         """
         if self.is_proven or self._lists_links:
             return
-        theory = self._theory.of_steps(0, len(self._trace))
-        while self.rivals and check(self._trace, self.rivals[0].explained(), theory):
+        theory = self._theory.of_steps(0, len(self._problem.trace))
+        while self.rivals and check(self._problem.trace, self.rivals[0].explained(), theory):
             del self.rivals[0]
 
     def undecided(self) -> tuple[list[ExtendedMap], list[float]]:
@@ -473,7 +449,7 @@ class RivalMaps:
 
     def _gone_on(self, rivals: Iterable[ExtendedMap], t: int) -> list[ExtendedMap]:
         """Extend rivals of the steps before `t` by step `t`, and rank the results."""
-        done, step = self._trace.steps[t - 1].action, self._trace.steps[t]
+        done, step = self._problem.trace.steps[t - 1].action, self._problem.trace.steps[t]
         assert done
         seen = observation(step, self._theory)
         new = [
@@ -481,7 +457,7 @@ class RivalMaps:
         ]
         # Evidence tests only the new step, as it has already tested the earlier ones.
         if self._has_evidence:
-            trace = self._trace.prefix(t + 1)
+            trace = self._problem.trace.prefix(t + 1)
             pairs = self._problem.changed(trace, self._theory.of_steps(0, t + 1)).pairs
             new = [rival for rival in new if rival.is_allowed(trace, pairs, self._judging)]
         return self._ranked(new)
@@ -523,3 +499,34 @@ class RivalMaps:
             else "seen another star than expected"
         )
         return f"step {t}: {what} at dstate {there}: {', '.join(kinds)}, or the map is wrong"
+
+
+def shares_of_rivals(
+    rivals: Sequence[ExtendedMap], theory: Theory, chance: float, dstates: int, views: int
+) -> list[float]:
+    """Compute the probability of each rival, given that one of them is true.
+
+    The theory gives the price of a fault in dstates, and the cheapest kind of fault has the
+    probability `chance` at each step. A price does not count alternatives: a new link, or an action
+    that slipped, leads to one of N dstates, and a misread view is one of V views. Let λ be the
+    logarithm of the odds that correspond to the price of one dstate. Then
+
+        weight = exp(-λ cost) N^-(links and slips) V^-(misreadings)
+
+    What happens after a fault decides between its explanations. If one explanation has to assume a
+    link that another one predicts, the weight of the first one falls. N and V count as at least 2.
+    """
+    cheapest = min(round(10 * price) for price in (theory.misread, theory.slipped) if price)
+    per_dstate, per_view = math.log(max(dstates, 2)), math.log(max(views, 2))
+    improbable = []  # the negative logarithm of each weight
+    for rival in rivals:
+        kinds = Counter(fault.kind for fault in rival.faults)
+        improbable.append(
+            -math.log(chance) * rival.cost[0] / cheapest
+            + (len(rival.links) + kinds["slipped"]) * per_dstate
+            + (kinds["misread"] + kinds["misseen"]) * per_view
+        )
+    least = min(improbable, default=0.0)
+    weights = [math.exp(least - nats) for nats in improbable]
+    total = sum(weights)
+    return [weight / total for weight in weights]

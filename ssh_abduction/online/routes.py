@@ -51,7 +51,7 @@ from ssh_abduction.data.map_parts import (
     thing_named,
 )
 from ssh_abduction.data.maps import DState, SSHMap
-from ssh_abduction.data.schema import attributes_of, only_known
+from ssh_abduction.data.schema import SparseData, attributes_of
 from ssh_abduction.data.trace import View
 from ssh_abduction.data.words import counted, meant
 from ssh_abduction.output.layout import drawable_poses
@@ -615,7 +615,7 @@ def _closed_gateways(ssh_map: SSHMap) -> list[tuple[int | None, int | None, int 
 
 
 @dataclass(frozen=True, slots=True)
-class Leg:
+class Leg(SparseData):
     """A part of a coarse route.
 
     Attributes:
@@ -645,10 +645,6 @@ class Leg:
         assert self.path is not None
         ends = "left" if self.starts == "right" else "right"
         return f"pass from {self.starts} to {ends} of {course_named((self.path, 1))}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the leg as plain data, without fields that are None."""
-        return only_known(**{name: getattr(self, name) for name in self.__slots__})
 
 
 def coarse_route(ssh_map: SSHMap, start: int, goal: int) -> tuple[Leg, ...]:

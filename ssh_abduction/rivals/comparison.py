@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import MapError, printable
-from ssh_abduction.data.groups import indices_of
+from ssh_abduction.data.groups import first_index_of, indices_of
 from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.words import counted
 from ssh_abduction.rivals.differences import Difference, difference
@@ -259,7 +259,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
         for choice in independent([asked[i].column for i in order])
     ]
     options = [options_of([a.column for a in choice], len(table)) for choice in choices]
-    of_choice, together = _depending(asked, options)
+    *of_choice, together = _depending(asked, options)
     # Count what the maps have.
     fits = [ssh_map.fit.chi2 for ssh_map in listing.maps if ssh_map.fit]
     sizes = Counter((len(m.dstates), len(m.places), len(m.paths)) for m in listing.maps)
@@ -301,27 +301,20 @@ def _backbones(listing: Listing) -> tuple[Backbone, Backbone]:
 
 def _depending(
     asked: Sequence[AnsweredQuestion], options: Sequence[NDArray[np.intp]]
-) -> tuple[list[dict[Matter, tuple[int, ...]]], dict[Matter, tuple[int, ...]]]:
-    """Find the steps whose grouping depends on each choice alone, and on several choices."""
-    of_choice: list[dict[Matter, set[int]]] = [{} for _ in options]
-    together: dict[Matter, set[int]] = {}
-    sizes = [np.bincount(option) for option in options]
+) -> list[dict[Matter, tuple[int, ...]]]:
+    """Find the steps whose grouping depends on each choice alone and, last, on several choices."""
+    found: list[dict[Matter, set[int]]] = [{} for _ in range(len(options) + 1)]
     for question in asked:
-        for k, option in enumerate(options):
-            yes = np.bincount(option, weights=question.column)
-            if ((yes == 0) | (yes == sizes[k])).all():
-                whose = of_choice[k]
-                break
-        else:
-            whose = together
+        whose = next((k for k, one in enumerate(options) if _settles(one, question.column)), -1)
         for sort, steps in question.steps.items():
-            whose.setdefault(sort, set()).update(steps)
-    return [_in_order(steps) for steps in of_choice], _in_order(together)
+            found[whose].setdefault(sort, set()).update(steps)
+    return [{sort: tuple(sorted(of[sort])) for sort in MATTERS if sort in of} for of in found]
 
 
-def _in_order(steps: dict[Matter, set[int]]) -> dict[Matter, tuple[int, ...]]:
-    """Sort the steps of each sort, and put the sorts in the order of `MATTERS`."""
-    return {sort: tuple(sorted(steps[sort])) for sort in MATTERS if sort in steps}
+def _settles(option: NDArray[np.intp], column: NDArray[np.bool_]) -> bool:
+    """Tell whether maps with the same option give the same answer."""
+    yes = np.bincount(option, weights=column)
+    return bool(((yes == 0) | (yes == np.bincount(option))).all())
 
 
 def _choice(
@@ -330,27 +323,26 @@ def _choice(
     differing: dict[Matter, tuple[int, ...]],
 ) -> Choice:
     """Make a choice from the questions `asked`. `option` numbers the option of each map."""
-    members = indices_of(option.tolist())
     options = [
         Option(tuple(bool(a.column[maps[0]]) for a in asked), tuple(i + 1 for i in maps))
-        for maps in members.values()
+        for maps in indices_of(option.tolist()).values()
     ]
     return Choice(tuple(a.question for a in asked), tuple(options), differing)
 
 
 def _others(here: Listing, there: Listing) -> Others:
     """Compare two lists of maps of one trace."""
-    number = {ssh_map.renumbered(): i for i, ssh_map in reversed(list(enumerate(there.maps, 1)))}
-    both = {i: number.get(ssh_map.renumbered()) for i, ssh_map in enumerate(here.maps, 1)}
-    pairs = tuple((i, j) for i, j in both.items() if j)
-    shared = {here.maps[i - 1].renumbered() for i, _ in pairs}
+    ours, theirs = ([ssh_map.renumbered() for ssh_map in some.maps] for some in (here, there))
+    number, known = first_index_of(theirs), {*ours}
     names = "map 1", f"map 1 of {there.source}"
-    best = difference(here.maps[0], there.maps[0], names, drives=here.drives)
-    only_there = tuple(
-        j for j, ssh_map in enumerate(there.maps, 1) if ssh_map.renumbered() not in shared
+    return Others(
+        count=len(theirs),
+        both=tuple((i, number[m] + 1) for i, m in enumerate(ours, 1) if m in number),
+        here=tuple(i for i, m in enumerate(ours, 1) if m not in number),
+        there=tuple(j for j, m in enumerate(theirs, 1) if m not in known),
+        best=difference(here.maps[0], there.maps[0], names, drives=here.drives),
+        source=there.source,
     )
-    only_here = tuple(i for i, j in both.items() if not j)
-    return Others(len(there.maps), pairs, only_here, only_there, best, there.source)
 
 
 def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> None:

@@ -273,30 +273,19 @@ def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
 def _links_only_in(
     first: SSHMap, other: SSHMap, steps: Sequence[int]
 ) -> tuple[tuple[Link, ...], tuple[Link, ...]]:
-    """Find the links that only one map has, between dstates that have the same steps in both."""
-    unmoved = _unmoved(first, other)
+    """Find the links that only one map has, between dstates that have the same steps in both.
+
+    Each dstate is named by its first step.
+    """
+    maps = (first, other)
+    groups = [{s: tuple(at) for s, at in indices_of(m.dstate_at).items()} for m in maps]
+    unmoved = {*groups[0].values()} & {*groups[1].values()}
+    named = [{s: steps[at[0]] for s, at in of.items() if at in unmoved} for of in groups]
     here, there = (
-        {(s, action, x) for s, action, x in _named_links(m, steps) if {s, x} <= unmoved}
-        for m in (first, other)
+        {(name[s], action, name[x]) for s, action, x in m.links if s in name and x in name}
+        for m, name in zip(maps, named, strict=True)
     )
     return tuple(sorted(here - there)), tuple(sorted(there - here))
-
-
-def _named_links(ssh_map: SSHMap, steps: Sequence[int]) -> set[Link]:
-    """Return the links of a map. Each dstate is named by its first step."""
-    first = firsts((label, t) for t, label in zip(steps, ssh_map.dstate_at, strict=True))
-    return {
-        (first[s], action, first[x]) for s, action, x in ssh_map.links if s in first and x in first
-    }
-
-
-def _unmoved(first: SSHMap, other: SSHMap) -> set[int]:
-    """Find the dstates that have the same steps in both maps, each named by its first step."""
-    sets = [
-        {tuple(some) for some in indices_of(ssh_map.dstate_at).values()}
-        for ssh_map in (first, other)
-    ]
-    return {some[0] for some in sets[0] & sets[1]}
 
 
 def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
@@ -419,42 +408,34 @@ def _sides(
 
     A key is the first step at the place and the first step along the path.
     """
-    courses_of = [[(path.id, d) for path in m.paths for d in (1, -1)] for m in maps]
-    beside = [
-        {course: {*right_of(m.regions or (), *course)} for course in listed}
-        for m, listed in zip(maps, courses_of, strict=True)
+    right = [
+        {
+            (path.id, way): {*right_of(m.regions or (), path.id, way)}
+            for path in m.paths
+            for way in (1, -1)
+        }
+        for m in maps
     ]
     states = [[m.dstates[label] for label in m.dstate_at] for m in maps]
     # Places and courses that coincide in all maps are asked about once, by their first steps.
-    places: dict[tuple[int | None, ...], int] = {}
+    places = firsts((tuple(of[t].place for of in states), t) for t in steps)
     courses: dict[tuple[tuple[int, int] | None, ...], int] = {}
     for t in steps:
-        places.setdefault(tuple(of[t].place for of in states), t)
         here = tuple(course_of(of[t]) for of in states)
         back = tuple(course and (course[0], -course[1]) for course in here)
         if back not in courses:
             courses.setdefault(here, t)
-    found: dict[tuple[int, int], list[_Side | None]] = {}
-    for at, i in places.items():
-        for along, j in courses.items():
-            sides = [
-                _side(right, place, course)
-                for right, place, course in zip(beside, at, along, strict=True)
-            ]
-            if any(sides):
-                found[i, j] = sides
-    return found
 
+    def side(k: int, place: int | None, course: tuple[int, int] | None) -> _Side | None:
+        if course is None:
+            return None
+        if place in right[k][course]:
+            return "right"
+        return "left" if place in right[k][course[0], -course[1]] else None
 
-def _side(
-    right: dict[tuple[int, int], set[int]], place: int | None, course: tuple[int, int] | None
-) -> _Side | None:
-    """The side of a course on which a place lies; None if unknown.
-
-    `right` has the places to the right of each course (path and direction).
-    """
-    if course is None:
-        return None
-    if place in right[course]:
-        return "right"
-    return "left" if place in right[course[0], -course[1]] else None
+    found = {
+        (i, j): [side(k, *both) for k, both in enumerate(zip(at, along, strict=True))]
+        for at, i in places.items()
+        for along, j in courses.items()
+    }
+    return {steps: sides for steps, sides in found.items() if any(sides)}

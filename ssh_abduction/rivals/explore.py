@@ -46,7 +46,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -141,14 +141,6 @@ class ExperimentPlan:
         """The greatest number of actions along any branch of the plan, without untried actions."""
         return len(self.actions) + max((branch.plan.longest for branch in self.branches), default=0)
 
-    @property
-    def leaves(self) -> Iterator[ExperimentPlan]:
-        """The plans without branches at the ends of the tree, one after the other."""
-        if not self.branches:
-            yield self
-        for branch in self.branches:
-            yield from branch.plan.leaves
-
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as plain data, as `next --json` prints it."""
         own = attributes_of(self, "rivals")
@@ -202,15 +194,6 @@ class Experiment:
     def worst(self) -> int:
         """The number of rivals that the plan leaves in the worst case."""
         return self.plan.worst
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether there is nothing left to try.
-
-        This is so if no known links distinguish the rivals, the robot cannot reach any untried
-        action, and no limit ended the search.
-        """
-        return not self.actions and self.stopped is None
 
     @property
     def sentence(self) -> str:

@@ -25,9 +25,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import compress
+from itertools import combinations, compress
 from typing import Any, Literal, NamedTuple, TypeAlias
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -169,16 +170,15 @@ def _classes(trace: Trace, steps: Sequence[int]) -> dict[int, int]:
     Steps with the same view are in one group if their stars could be equal, directly or through the
     stars of other steps.
     """
-    stars = {t: trace.steps[t].gateways or Star(()) for t in steps}
-    groups: dict[object, list[list[int]]] = {}  # for each view
-    for t in steps:
-        known = groups.setdefault(trace.steps[t].view, [])
-        near = [
-            group for group in known if any(are_alike(stars[t], stars[other]) for other in group)
-        ]
-        joined = [other for group in near for other in group]
-        known[:] = [*(group for group in known if group not in near), [*joined, t]]
-    return {t: group[0] for known in groups.values() for group in known for t in group}
+    seen = [(t, trace.steps[t].view, trace.steps[t].gateways or Star(())) for t in steps]
+    alike: nx.Graph[int] = nx.Graph()
+    alike.add_nodes_from(steps)
+    alike.add_edges_from(
+        (i, j)
+        for (i, view, star), (j, other_view, other) in combinations(seen, 2)
+        if view == other_view and are_alike(star, other)
+    )
+    return {t: min(group) for group in nx.connected_components(alike) for t in group}
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,10 +51,11 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.groups import indices_of
+from ssh_abduction.data.groups import indices_of, minimal_part
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.words import noun_of
@@ -86,7 +87,7 @@ class Question:
     there: tuple[int, ...]  # the steps that all maps group with `later`, by this sort
     # The places of the steps in `here`, and of the steps in `there`. Only for questions about paths
     # or courses, if all maps have the same places; otherwise None.
-    places: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+    places: tuple[tuple[int, ...], ...] | None = None
     # The fault of the maps that answer yes; None if the question is not about faults.
     fault: Fault | None = None
 
@@ -146,36 +147,23 @@ def questions_of(
     """
     found = _about_faults(maps)
     places = [maps[0].dstates[label].place for label in maps[0].dstate_at] if same_places else []
-    steps_by_class = {
-        number: [table.steps[t] for t in steps]
-        for number, steps in indices_of(table.classes.tolist()).items()
-    }
     for sort in table.ones:
         heads = table.heads(sort).tolist()
         together = indices_of(heads)
         for c, d, column in table.questions(sort):
-            key = _key(column)
             # of questions with equal or opposite answers, keep the one about the earliest steps
-            if key not in found:
-                sides = [
-                    sorted(t for k in together[heads[side]] for t in steps_by_class[k])
-                    for side in (c, d)
-                ]
-                stand = [
-                    tuple(sorted({p for t in side if (p := places[t]) is not None}))
-                    for side in (sides if places else ())
-                ]
-                question = Question(
-                    sort,
-                    first=int(table.firsts[c]),
-                    later=int(table.firsts[d]),
-                    yes=int(column.sum()),
-                    here=tuple(sides[0]),
-                    there=tuple(sides[1]),
-                    places=(stand[0], stand[1]) if stand and sort in ("paths", "courses") else None,
-                )
+            if (key := _key(column)) not in found:
+                here, there = (table.steps_of(together[heads[side]]) for side in (c, d))
+                at = None
+                if places and sort in ("paths", "courses"):
+                    at = tuple(
+                        tuple(sorted({p for t in side if (p := places[t]) is not None}))
+                        for side in (here, there)
+                    )
+                first, later = int(table.firsts[c]), int(table.firsts[d])
+                question = Question(sort, first, later, int(column.sum()), here, there, at)
                 found[key] = AnsweredQuestion(question, column, {})
-            found[key].steps.setdefault(sort, set()).update(steps_by_class[d])
+            found[key].steps.setdefault(sort, set()).update(table.steps_of([d]))
     return sorted(
         found.values(),
         key=lambda a: (MATTERS.index(a.question.sort), a.question.later, a.question.first),
@@ -377,33 +365,17 @@ def _linked(table: Bools) -> list[list[int]]:
     shares that answer yes to each.
     """
     counts = table.astype(np.int64)
-    yes, maps = counts.sum(axis=1), table.shape[1]
-    waiting = np.arange(len(table))
-    choices = []
-    while len(waiting):
-        choice, frontier, waiting = [int(waiting[0])], [int(waiting[0])], waiting[1:]
-        while frontier and len(waiting):
-            i = frontier.pop()
-            both = counts[waiting] @ counts[i]
-            depends = both * maps != yes[waiting] * yes[i]
-            found = waiting[depends].tolist()
-            choice, frontier, waiting = choice + found, frontier + found, waiting[~depends]
-        choices.append(sorted(choice))
-    return choices
+    yes = counts.sum(axis=1)
+    depends = (counts @ counts.T) * table.shape[1] != np.outer(yes, yes)
+    return [*indices_of(connected_components(depends)[1].tolist()).values()]
 
 
-def _dependent(options: Sequence[NDArray[np.intp]]) -> set[int] | None:
+def _dependent(options: Sequence[NDArray[np.intp]]) -> list[int] | None:
     """Find a minimal set of dependent choices, as indices; None if all are independent."""
 
-    def are_independent(which: Sequence[int]) -> bool:
-        together = np.unique(np.stack([options[k] for k in which]), axis=1).shape[1] if which else 1
-        return together == prod(int(options[k].max()) + 1 for k in which)
+    def are_dependent(which: list[int]) -> bool:
+        together = np.unique(np.stack([options[k] for k in which]), axis=1).shape[1]
+        return bool(together != prod(int(options[k].max()) + 1 for k in which))
 
-    which = list(range(len(options)))
-    if are_independent(which):
-        return None
-    for k in list(which):
-        without = [other for other in which if other != k]
-        if not are_independent(without):
-            which = without
-    return set(which)
+    everything = list(range(len(options)))
+    return minimal_part(are_dependent, everything) if are_dependent(everything) else None
