@@ -18,6 +18,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -202,10 +204,6 @@ class Odometer:
         scaled = {kind: getattr(usual, kind) * share for kind in ("across", "heading", "turning")}
         return replace(self, along=along, **scaled)
 
-    def parameters(self) -> dict[str, float]:
-        """Return all attributes as a dict from name to value, for logs."""
-        return asdict(self)
-
     def reading(self, poses: Array, rng: np.random.Generator) -> Array:
         """Compute what the odometer reads along true poses, (n, 3) in metres and radians.
 
@@ -305,9 +303,11 @@ class Laser:
         """
         poses = np.atleast_2d(poses)
         rows = max(1, _BLOCK // (BEAMS * len(world.segments)))
-        return np.vstack(
-            [self._cast(world.segments, poses[i : i + rows]) for i in range(0, len(poses), rows)]
-        )
+        found = []
+        for part in np.split(poses, range(rows, len(poses), rows)):
+            near = _near(world.segments, part, self.reach)
+            found.append(meetings(near, part, BEARINGS).min(axis=2, initial=self.reach))
+        return np.vstack(found)
 
     def scan(self, world: World, poses: Array, rng: np.random.Generator) -> Array:
         """Compute the ranges with noise at some poses, as `exact`."""
@@ -315,11 +315,6 @@ class Laser:
         ranges = ranges + rng.normal(0, self.noise, ranges.shape) * (ranges < self.reach)
         ranges[rng.random(ranges.shape) < self.dropouts] = self.reach
         return np.clip(ranges, 0.01, self.reach)
-
-    def _cast(self, segments: Array, poses: Array) -> Array:
-        """The distance from each pose to the nearest wall along each beam: (m, 180), metres."""
-        near = _near(segments, poses, self.reach)
-        return np.asarray(meetings(near, poses, BEARINGS).min(axis=2, initial=self.reach))
 
 
 def _near(segments: Array, poses: Array, reach: float) -> Array:
@@ -380,19 +375,18 @@ class RecordedDrive:
         `places` has (x, y) in metres of each place, by name, and `scans` the name of the
         place of each scan; None between places.
         """
-        visits: list[dict[str, Any]] = []
         # Consecutive scans at a place form a visit.
-        for number, place in enumerate(scans):
-            if place is not None:
-                if not visits or visits[-1]["place"] != place:
-                    visits.append({"place": place, "first": number, "last": number})
-                visits[-1]["last"] = number
+        at = [(number, place) for number, place in enumerate(scans) if place is not None]
+        stays = [(place, list(found)) for place, found in groupby(at, itemgetter(1))]
+        visits = [
+            {"place": place, "first": stay[0][0], "last": stay[-1][0]} for place, stay in stays
+        ]
         truth = {
             "format": "ssh-drive",
             "version": 1,
             "name": self.name,
             "metres": round(self.metres, 2),
-            "odometer": self.odometer.parameters(),
+            "odometer": asdict(self.odometer),
             "places": {name: [round(x, 4), round(y, 4)] for name, (x, y) in places.items()},
             "visits": visits,
             **more,

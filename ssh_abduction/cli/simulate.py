@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -161,7 +161,7 @@ def _write_log(options: argparse.Namespace, drive: RecordedDrive) -> int:
 
     target = Path(options.output)
     if options.format == "carmen":
-        numbers = drive.odometer.parameters().items()
+        numbers = asdict(drive.odometer).items()
         noise = {f"simulator_odometry_{name}": value for name, value in numbers}
         write_carmen(target, scans_of(drive), noise)
     else:

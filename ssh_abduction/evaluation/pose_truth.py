@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
@@ -61,6 +61,7 @@ Verdicts: TypeAlias = NDArray[np.uint8]
 # not away in between.
 UNKNOWN, APART, RETURN, STAYED = range(4)
 JUDGED = APART, RETURN
+UNKNOWN_POSE = (math.nan,) * 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,15 +201,13 @@ def evaluate_visits(
     if relations is not None:
         mend = "make them with Relations.load, or leave them out"
         an_instance("relations", relations, Relations, TraceError, mend=mend)
-    truth: _PoseTruth | _Related = (
-        _PoseTruth(trace) if relations is None else _Related(trace, relations)
-    )
+    truth = _by_poses(trace) if relations is None else _by_relations(trace, relations)
     # A travel begins a new visit.
     visit = np.cumsum([0, *(action.kind != "turn" for action in trace.actions)])
     places, dstates = _verdicts(truth, visit, near, turned)
     by_both = None
     if relations is not None and any(told_poses(trace)):
-        other, _ = _verdicts(_PoseTruth(trace), visit, near, turned)
+        other, _ = _verdicts(_by_poses(trace), visit, near, turned)
         judged = np.isin(places, JUDGED) & np.isin(other, JUDGED)
         by_both = int(judged.sum()), int((judged & (places == other)).sum())
     return VisitsEvaluation(
@@ -240,72 +239,64 @@ def told_poses(trace: Trace) -> list[Pose | None]:
     ]
 
 
+@dataclass(frozen=True)
 class _PoseTruth:
-    """The truth by poses. `known` flags the steps with a true pose, in an array of shape (n,)."""
+    """The truth about where the robot was."""
 
-    name = "poses"
+    name: str  # "poses" or "relations"
+    known: NDArray[np.bool_]  # (n,) flags of the steps whose pose is known
+    # Compares all n steps with one step. Returns (n,) distances in metres, differences of headings
+    # in degrees, and possible errors of the distances in metres; NaN if a pose is unknown.
+    seen_from: Callable[[int], tuple[Array, Array, Array]]
 
-    def __init__(self, trace: Trace) -> None:
-        poses = told_poses(trace)
-        self.known = np.array([pose is not None for pose in poses])
-        if not self.known.any():
-            raise TraceError(
-                f"{named(trace.source or 'trace')}: truth.pose: expected the true pose of some "
-                'step, got none; write "truth": {"pose": [x, y, heading]} on the steps, '
-                "as import does where a log has corrected poses"
-            )
-        self._poses = np.array([(math.nan,) * 3 if pose is None else pose for pose in poses])
 
-    def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """Compare the poses of all steps with the pose of one step.
+def _by_poses(trace: Trace) -> _PoseTruth:
+    """The truth by the poses of a trace. Raises TraceError if it has none."""
+    told = told_poses(trace)
+    if not any(told):
+        raise TraceError(
+            f"{named(trace.source or 'trace')}: truth.pose: expected the true pose of some "
+            'step, got none; write "truth": {"pose": [x, y, heading]} on the steps, '
+            "as import does where a log has corrected poses"
+        )
+    poses = np.array([pose or UNKNOWN_POSE for pose in told])
 
-        The result is three arrays of shape (n,): distances in metres, differences of headings in
-        degrees, and possible errors of the distances in metres. Values are NaN if a pose is
-        unknown.
-        """
-        dx, dy, turned = (self._poses - self._poses[step]).T
+    def seen_from(step: int) -> tuple[Array, Array, Array]:
+        dx, dy, turned = (poses - poses[step]).T
         return np.hypot(dx, dy), _degrees(turned), np.zeros(len(dx))
 
+    return _PoseTruth("poses", ~np.isnan(poses[:, 0]), seen_from)
 
-class _Related:
-    """The truth by relative poses. `known`, (n,), flags the steps at times with a relation."""
 
-    name = "relations"
+def _by_relations(trace: Trace, relations: Relations) -> _PoseTruth:
+    """The truth by relative poses. Raises TraceError if no step has a time near those of relations.
 
-    def __init__(self, trace: Trace, relations: Relations) -> None:
-        self._relations = relations
-        self._times = [
-            checked_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)
+    The relations give the pose of the robot. `seen` of a step gives the pose of the dstate as the
+    robot saw it.
+    """
+    steps = [(step.extra, trace.at(t)) for t, step in enumerate(trace.steps)]
+    times = [checked_time(extra.get("time"), where) for extra, where in steps]
+    sights = [checked_pose(extra.get("seen"), where) for extra, where in steps]
+    known = np.array([relations.covers(time) for time in times])
+    if not known.any():
+        began, ended = relations.times[0], relations.times[-1]
+        raise TraceError(
+            f"{named(trace.source or 'trace')}: time: expected steps between {began:g} and "
+            f"{ended:g} s, as the relations have, got none; import the trace from the log of "
+            "the relations"
+        )
+
+    def seen_from(step: int) -> tuple[Array, Array, Array]:
+        found = [
+            (*UNKNOWN_POSE, math.nan)
+            if robot is None
+            else (*displacement_between(sights[step], moved(robot[0], seen)), robot[1])
+            for robot, seen in zip(relations.between(times, step), sights, strict=True)
         ]
-        self._seen = [
-            checked_pose(step.extra.get("seen"), trace.at(t)) for t, step in enumerate(trace.steps)
-        ]
-        self.known = np.array([relations.covers(time) for time in self._times])
-        if not self.known.any():
-            began, ended = relations.times[0], relations.times[-1]
-            raise TraceError(
-                f"{named(trace.source or 'trace')}: time: expected steps between {began:g} and "
-                f"{ended:g} s, as the relations have, got none; import the trace from the log of "
-                "the relations"
-            )
-
-    def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """Compare all steps with one step, as `_PoseTruth.seen_from` does.
-
-        The relations give the pose of the robot. `seen` of a step gives the pose of the dstate as
-        the robot saw it.
-        """
-        robots = self._relations.between(self._times, step)
-        origin = self._seen[step]
-        dx, dy, turned, way = np.array(
-            [
-                (math.nan,) * 4
-                if robot is None
-                else (*displacement_between(origin, moved(robot[0], seen)), robot[1])
-                for robot, seen in zip(robots, self._seen, strict=True)
-            ]
-        ).T
+        dx, dy, turned, way = np.array(found).T
         return np.hypot(dx, dy), _degrees(turned), DOUBT + DOUBT_OF_WAY * way
+
+    return _PoseTruth("relations", known, seen_from)
 
 
 def _degrees(radians: Array) -> Array:
@@ -314,7 +305,7 @@ def _degrees(radians: Array) -> Array:
 
 
 def _verdicts(
-    truth: _PoseTruth | _Related, visit: Steps, near: float, turned: float
+    truth: _PoseTruth, visit: Steps, near: float, turned: float
 ) -> tuple[Verdicts, Verdicts]:
     """Judge each pair of v visits, and each pair of n steps of different visits.
 
