@@ -13,7 +13,7 @@ from modules import parsed
 
 from ssh_abduction import cli
 from ssh_abduction.cli import parser
-from ssh_abduction.cli.options import helps
+from ssh_abduction.cli.shared import helps
 from ssh_abduction.theory.theory import Theory
 
 ROOT = Path(cli.__file__).parents[2]
@@ -39,8 +39,8 @@ SAID_BY = {
     "ssh_abduction/cli/import_log.py": ("import", "map"),
     "ssh_abduction/cli/solve.py": ("solve",),
     "ssh_abduction/cli/mapping.py": ("map",),
-    "ssh_abduction/cli/options.py": (*WITH_MAP, *WITH_THEORY),
-    "ssh_abduction/cli/text.py": ("solve", "compare"),
+    "ssh_abduction/cli/shared.py": (*WITH_MAP, *WITH_THEORY),
+    "ssh_abduction/cli/text.py": ("solve",),
     "ssh_abduction/evaluation/paper_report.py": ("reproduce",),
     "ssh_abduction/evaluation": ("evaluate",),
     "ssh_abduction/explain/no_map.py": WITH_THEORY,
@@ -57,7 +57,7 @@ SAID_BY = {
 # The verbs of modules of the command line that have several. Each has some of the options that the
 # module names without a verb.
 SEVERAL = {
-    "ssh_abduction/cli/options.py": SAID_BY["ssh_abduction/cli/options.py"],
+    "ssh_abduction/cli/shared.py": SAID_BY["ssh_abduction/cli/shared.py"],
     "ssh_abduction/cli/about.py": ("theory", "facts", "completion"),
     "ssh_abduction/cli/compare.py": ("compare", "next", "evaluate", "ladder"),
     "ssh_abduction/cli/correct.py": ("correct", "name", "solve"),

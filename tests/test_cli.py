@@ -191,14 +191,14 @@ def test_ctrl_c_prints_the_maps_found_so_far(tmp_path: Path) -> None:
 def test_ctrl_c_during_output_leaves_it_complete(
     room: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ssh_abduction.cli import solve as verb
+    from ssh_abduction.cli import outcome
 
     def ending(*args: Any) -> dict[str, Any]:
         signal.raise_signal(signal.SIGINT)
         return end(*args)
 
-    end = verb.answer_ending
-    monkeypatch.setattr(verb, "answer_ending", ending)
+    end = outcome.answer_ending
+    monkeypatch.setattr(outcome, "answer_ending", ending)
     assert main(["solve", room, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["complete"]
 

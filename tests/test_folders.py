@@ -7,7 +7,6 @@ import gzip
 import itertools
 import json
 import os
-import tempfile
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ import pytest
 from ssh_abduction.cli import import_log, jobs, main
 from ssh_abduction.cli.import_log import (
     FILES,
+    UnwrittenError,
     digest,
     folders_of,
     is_done,
@@ -190,9 +190,9 @@ def test_run_that_cannot_be_written_is_not_done(
         path.write_bytes(data)
 
     monkeypatch.setattr(import_log, "write_file", write)
-    with pytest.raises(OSError, match="No space left on device") as error:
+    with pytest.raises(UnwrittenError, match="No space left on device") as error:
         write_run(tmp_path, files)
-    assert error.value.filename == str(written[-1])
+    assert str(error.value).startswith(f"{written[-1]}: cannot be written: ")
     assert not (tmp_path / RUN).exists()
     assert not (tmp_path / "page.html").exists()
     assert written[-1].name == ["trace.jsonl", "maps.json", "report.html", RUN][at - 1]
@@ -221,9 +221,7 @@ def test_run_that_cannot_be_written_does_not_stop_other_logs(
 
     monkeypatch.setattr(jobs, "answers_here", here)
     monkeypatch.setattr(import_log, "write_file", write)
-    monkeypatch.setattr(tempfile, "mkdtemp", lambda prefix: str(tmp_path / prefix))
     assert main(["map", *logs, "-o", str(tmp_path / "runs")]) == 1
-    assert (tmp_path / "ssh-abduction-" / "maps.json").read_bytes() == b"maps"
     told = capsys.readouterr()
     runs = tmp_path / "runs"
     assert told.out.splitlines() == [
@@ -231,7 +229,7 @@ def test_run_that_cannot_be_written_does_not_stop_other_logs(
         f"{runs / 'taken'}; name another one",
         f"{logs[0]}: mapped → {runs / 'good'}",
         f"{logs[2]}: error: {runs / 'full' / 'maps.json'}: cannot be written: No space left on "
-        f"device; make room; until then the files of this run are in {tmp_path / 'ssh-abduction-'}",
+        "device; make room",
         f"{logs[3]}: mapped → {runs / 'fine'}",
     ]
     assert asked == [logs[0], logs[2], logs[3]]

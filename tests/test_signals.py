@@ -39,7 +39,7 @@ SOON = 60  # seconds, enough on a slow and busy machine
 PROGRAM = """
 import sys, time
 from ssh_abduction import __main__
-from ssh_abduction.cli import batch, guard, jobs, judge, solve
+from ssh_abduction.cli import guard, jobs, judge, outcome, solve
 guard.DEAF = 0.2
 exec(sys.argv.pop(1))
 __main__.run()
@@ -75,8 +75,8 @@ def send(number: int = signal.SIGTERM) -> None:
     "change",
     [
         "waits = iter([0, 100])  # the second call may follow a long search\n"
-        "solve.warn = lambda _: next(waits) and (print(file=sys.stderr) or time.sleep(100))",
-        "solve.save_solution = lambda *_: print(file=sys.stderr) or time.sleep(0.6)",
+        "outcome.warn = lambda _: next(waits) and (print(file=sys.stderr) or time.sleep(100))",
+        "outcome.save_solution = lambda *_: print(file=sys.stderr) or time.sleep(0.6)",
     ],
     ids=["warnings", "saving"],
 )
@@ -99,7 +99,7 @@ def test_ctrl_c_ends_a_program_that_writes_into_an_unread_pipe(room: str, tmp_pa
         assert process.wait(SOON) == 143
 
 
-LONG = "lambda *_: iter([batch.FileAnswer(0, 'much' * 10**5, 0)])"
+LONG = "lambda *_: iter([jobs.FileAnswer(0, 'much' * 10**5, 0)])"
 
 
 def test_ctrl_c_ends_many_solutions_that_nobody_reads(room: str) -> None:

@@ -38,9 +38,9 @@ from ssh_abduction.cli import (
     use,
 )
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import check_inputs_are_kept
 from ssh_abduction.cli.outcome import EXIT_ERROR, add_verbosity, telling, unwritten, warn
 from ssh_abduction.cli.parsing import Parser, Verb
+from ssh_abduction.cli.shared import check_inputs_are_kept
 from ssh_abduction.data.errors import AbductionError, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.runtime import program
@@ -112,9 +112,9 @@ def parser() -> Parser:
         ),
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
-    verbs = top.add_subparsers(metavar="VERB", dest="verb", required=True)
+    said = "one of the verbs below; ssh-abduction VERB --help describes it"
+    verbs = top.add_subparsers(metavar="VERB", dest="verb", required=True, help=said)
     for title, members in VERBS.items():
-        top.groups[title] = tuple(verb.name for verb in members)
         for verb in members:
             added = verbs.add_parser(
                 verb.name, help=verb.summary, description=verb.help, epilog=SEE_WORDS
@@ -122,6 +122,8 @@ def parser() -> Parser:
             added.set_defaults(act=verb.run)
             added.add_rows(verb.rows)
             add_verbosity(added)
+        listed = top.add_argument_group(title)
+        listed._group_actions += verbs._choices_actions[-len(members) :]
     add_verbosity(top)
     return top
 

@@ -6,8 +6,8 @@ import argparse
 import re
 import sys
 
-from ssh_abduction.cli.options import TRACE_SAID, theory_of, theory_rows
 from ssh_abduction.cli.parsing import verb
+from ssh_abduction.cli.shared import TRACE_SAID, theory_of, theory_rows
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError, printable

@@ -17,21 +17,9 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
+from ssh_abduction.cli import jobs, outcome
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, answers_of, final_code, in_a_line
-from ssh_abduction.cli.options import check_jobs, theory_of
-from ssh_abduction.cli.outcome import (
-    EXIT_ERROR,
-    StopFlag,
-    Warnings,
-    all_given,
-    answer_ending,
-    exit_code,
-    on_ctrl_c,
-    progress_bar,
-    warn,
-    why_no_map,
-)
+from ssh_abduction.cli.shared import check_jobs, theory_of
 from ssh_abduction.cli.text import headline
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import json_line
@@ -64,11 +52,11 @@ class HandedOver(NamedTuple):
         cls, search: Search, solution: Solution, explanation: Explanation | None = None
     ) -> HandedOver:
         """Collect what is known from a search and its solution."""
-        return cls(solution, explanation, Warnings(search).of(solution))
+        return cls(solution, explanation, outcome.Warnings(search).of(solution))
 
 
 @dataclass(frozen=True, slots=True)
-class SolveQuestion(FileQuestion):
+class SolveQuestion(jobs.FileQuestion):
     """The settings for solving each of many traces."""
 
     theory: Theory
@@ -101,7 +89,7 @@ class SolveQuestion(FileQuestion):
         path: str,
         trace: Trace | None = None,
         given_up: Callable[[], bool] = lambda: False,
-    ) -> FileAnswer:
+    ) -> jobs.FileAnswer:
         """Implement `FileQuestion.answer`: solve one trace. If that fails, the answer says why."""
         try:
             return self._solved(number, path, trace or Trace.load(path), given_up)
@@ -110,7 +98,7 @@ class SolveQuestion(FileQuestion):
 
     def _solved(
         self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]
-    ) -> FileAnswer:
+    ) -> jobs.FileAnswer:
         """Solve one trace as `answer` does, but raise errors."""
         self.theory.check_steps(trace)
         if self.memory is not None:
@@ -136,7 +124,7 @@ class SolveQuestion(FileQuestion):
         with self._guarded(number, path, search, kept, given_up):
             for ssh_map in search:
                 kept += [ssh_map] if self.json else []
-            explanation = why_no_map(search)
+            explanation = outcome.why_no_map(search)
             known = HandedOver.of(search, search.solution(tuple(kept)), explanation)
             return self._answer(number, path, known)
 
@@ -158,7 +146,7 @@ class SolveQuestion(FileQuestion):
             except Exception as error:  # without an answer, the process would seem to be killed
                 answer = self.failed(number, path, error)
             # Nobody reads the exit code of this process.
-            return "", EXIT_ERROR, partial(workers.reply, answer)
+            return "", outcome.EXIT_ERROR, partial(workers.reply, answer)
 
         if not workers.serves():
             return contextlib.nullcontext()
@@ -172,7 +160,7 @@ class SolveQuestion(FileQuestion):
             hand_over=lambda: workers.hand_over(HandedOver.of(search, search.so_far("time limit"))),
         )
 
-    def rescued(self, lost: workers.Lost, path: str, *, stopped: bool) -> FileAnswer | None:
+    def rescued(self, lost: workers.Lost, path: str, *, stopped: bool) -> jobs.FileAnswer | None:
         """Implement `FileQuestion.rescued`: answer with the best map so far."""
         if lost.known is None:
             return None
@@ -180,41 +168,36 @@ class SolveQuestion(FileQuestion):
         why: Stop = "interrupted" if stopped else "time limit" if lost.late else "memory limit"
         known = known._replace(solution=replace(known.solution, stopped=why))
         answer = self._answer(lost.number, path, known)
-        return answer if stopped else self.warned(answer, path, self.warning_of(lost))
+        return answer if stopped else self.warned(answer, lost)
 
     def hurried(self, known: HandedOver | None) -> SolveQuestion:
         """Implement `FileQuestion.hurried`: give the search little time."""
         return replace(self, limit=min(self.limit or HURRY, HURRY), work=None)
 
-    def warned(self, answer: FileAnswer, path: str, warning: str) -> FileAnswer:
-        return replace(answer, warnings=(*answer.warnings, f"{named(path)}: {warning}"))
-
-    def _answer(self, number: int, path: str, known: HandedOver) -> FileAnswer:
+    def _answer(self, number: int, path: str, known: HandedOver) -> jobs.FileAnswer:
         """Make the answer for a solution: its line, exit code and warnings."""
         solution, explanation, found = known
         if self.json:
-            written = [written_map(*given) for given in all_given(solution)]
+            written = [written_map(*given) for given in outcome.all_given(solution)]
             head = opening(solution.theory, solution.steps, solution.within)
-            end = answer_ending(solution, explanation, len(written), found)
+            end = outcome.answer_ending(solution, explanation, len(written), found)
             line = json_line({"trace": path, **head, "maps": written, **end})
         else:
             line = f"{named(path)}: {headline(solution, explanation)}"
-        where = f"{named(path)}:"
-        warnings = tuple(text if text.startswith(where) else f"{where} {text}" for text in found)
-        return FileAnswer(number, line, exit_code(solution), warnings)
+        return jobs.FileAnswer(number, line, outcome.exit_code(solution), tuple(found))
 
     @property
     def overdue(self) -> float | None:
         """The seconds after which a process without an answer is given up; None for no limit."""
         return None if self.limit is None else GUARDED * self.limit + OVERDUE
 
-    def failed(self, number: int, path: str, error: Exception) -> FileAnswer:
+    def failed(self, number: int, path: str, error: Exception) -> jobs.FileAnswer:
         """Make the answer for a trace that could not be solved because of an error."""
-        message = in_a_line(error)
+        message = jobs.in_a_line(error)
         line = f"{named(path)}: error: {message}"
         if self.json:
             line = json_line({"trace": path, "status": "error", "error": message})
-        return FileAnswer(number, line, EXIT_ERROR)
+        return jobs.FileAnswer(number, line, outcome.EXIT_ERROR)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -235,22 +218,24 @@ def run(options: argparse.Namespace) -> int:
         json=options.json,
         within=options.within,
     )
-    stop = StopFlag()
-    codes = _printed(answers_of(question, paths, options, stop), len(paths), stop)
-    return final_code(codes, len(paths), stop, "traces")
+    stop = outcome.StopFlag()
+    codes = _printed(jobs.answers_of(question, paths, options, stop), paths, stop)
+    return jobs.final_code(codes, len(paths), stop, "traces")
 
 
-def _printed(answers: Generator[FileAnswer], total: int, stop: StopFlag) -> list[int]:
+def _printed(
+    answers: Generator[jobs.FileAnswer], paths: Sequence[str], stop: outcome.StopFlag
+) -> list[int]:
     """Print all lines in the order of the traces, and return the exit codes of the answers."""
     lines: dict[int, str] = {}  # the lines that wait for an earlier trace
     codes: list[int] = []
     turn = 0
-    with _progress(total) as (pausing, advance), contextlib.closing(answers):
+    with _progress(len(paths)) as (pausing, advance), contextlib.closing(answers):
         try:
             for answer in answers:
                 with _whole_lines(stop, pausing) as say:
                     lines[answer.number] = answer.line
-                    warn(answer.warnings)
+                    jobs.warn_of(answer, paths[answer.number])
                     codes.append(answer.code)
                     advance()
                     while turn in lines:
@@ -268,7 +253,7 @@ def _printed(answers: Generator[FileAnswer], total: int, stop: StopFlag) -> list
 
 @contextlib.contextmanager
 def _whole_lines(
-    stop: StopFlag, pausing: Callable[[], contextlib.AbstractContextManager[object]]
+    stop: outcome.StopFlag, pausing: Callable[[], contextlib.AbstractContextManager[object]]
 ) -> Iterator[Callable[[str], None]]:
     """Yield a function that prints a line. Ctrl-C neither loses a line nor cuts it in two.
 
@@ -280,7 +265,7 @@ def _whole_lines(
         with pausing():
             guard.say(lambda: f"{line}\n")
 
-    with on_ctrl_c(stop.set), guard:
+    with outcome.on_ctrl_c(stop.set), guard:
         yield say
 
 
@@ -301,7 +286,7 @@ def _progress(
     if not sys.stderr.isatty():
         yield contextlib.nullcontext, lambda: None
         return
-    with progress_bar() as progress:
+    with outcome.progress_bar() as progress:
         task = progress.add_task("traces", total=total)
 
         @contextlib.contextmanager

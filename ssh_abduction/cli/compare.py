@@ -10,22 +10,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ssh_abduction.cli import shared
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import (
-    JSON,
-    MAPS_SAID,
-    TRACE_SAID,
-    limits,
-    maps_and_trace,
-    max_maps,
-    read_maps,
-    solved_trace,
-    some_maps,
-    theory_of,
-    theory_rows,
-    trace_of,
-    written_theory,
-)
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.parsing import maps_path, verb
 from ssh_abduction.cli.text import compared, counted, depending, table
@@ -35,6 +21,7 @@ from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import noun_of
+from ssh_abduction.rivals.listing import DrivePair, Listing, joins_of_drives
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, Watch, check_limit, stretches
 from ssh_abduction.theory.theory import Theory
@@ -45,7 +32,6 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison
     from ssh_abduction.rivals.differences import SharedSides
     from ssh_abduction.rivals.explore import Experiment, ExperimentPlan, Untried
-    from ssh_abduction.rivals.listing import DrivePair, Listing
     from ssh_abduction.rivals.machines import Consequence
 
 
@@ -55,7 +41,7 @@ UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
 
 @verb(
     {
-        "maps": (MAPS_SAID, {"type": str}),
+        "maps": (shared.MAPS_SAID, {"type": str}),
         "[other]": (
             "other maps of the same trace; shows which maps are in both files, and how the first "
             "maps of the files differ"
@@ -64,7 +50,7 @@ UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
             "only describe how maps I and J differ. Give each by its number, from 1, or its id. "
             "With OTHER, map J is in that file"
         ),
-        **JSON,
+        **shared.JSON,
     }
 )
 def run_compare(options: argparse.Namespace) -> int:
@@ -78,7 +64,6 @@ def run_compare(options: argparse.Namespace) -> int:
     """
     from ssh_abduction.rivals.comparison import compare  # loads numpy
     from ssh_abduction.rivals.differences import difference, shared_sides
-    from ssh_abduction.rivals.listing import Listing, joins_of_drives
 
     maps = maps_path(options.maps)
     others = None if options.other is None else maps_path(options.other)
@@ -203,10 +188,10 @@ EXIT_CUT_SHORT, EXIT_NOTHING = 10, 30
 
 @verb(
     {
-        **maps_and_trace(),
-        **limits("the best plan so far"),
-        **JSON,
-        **theory_rows("the theory in the file of maps"),
+        **shared.maps_and_trace(),
+        **shared.limits("the best plan so far"),
+        **shared.JSON,
+        **shared.theory_rows("the theory in the file of maps"),
     }
 )
 def run_next(options: argparse.Namespace) -> int:
@@ -225,15 +210,14 @@ def run_next(options: argparse.Namespace) -> int:
     time.
     """
     from ssh_abduction.rivals.explore import next_experiment  # loads numpy
-    from ssh_abduction.rivals.listing import Listing
 
     check_limit("--time-limit", "seconds", options.time_limit)
     check_limit("--memory-limit", "MiB", options.memory_limit)
-    trace = solved_trace(options)
+    trace = shared.solved_trace(options)
     data = read_json(options.maps)
     listing = Listing.from_dict(data, named(options.maps))
-    found = written_theory(data)
-    theory: Theory | None = theory_of(options, found)
+    found = shared.written_theory(data)
+    theory: Theory | None = shared.theory_of(options, found)
     if found is None and options.theory is None and theory == Theory.topological():
         theory = None  # a saved map does not contain its theory
     watch = Watch(options.time_limit, options.memory_limit)
@@ -344,7 +328,7 @@ HEAD = ("map", "isomorphic", *THINGS, "accuracy", "same place", "edges", "links"
 
 @verb(
     {
-        **maps_and_trace(" with truth"),
+        **shared.maps_and_trace(" with truth"),
         "--set near METRES": (
             "judge by true poses, too: visits within this distance count as one place (if no step "
             "names its true place, this is done anyway, with 2 metres)"
@@ -357,7 +341,7 @@ HEAD = ("map", "isomorphic", *THINGS, "accuracy", "same place", "edges", "links"
             "judge by the robot's true trajectory in this file, in TUM format: lines of timestamp "
             "tx ty tz qx qy qz qw"
         ),
-        **JSON,
+        **shared.JSON,
     }
 )
 def run_evaluate(options: argparse.Namespace) -> int:
@@ -381,9 +365,9 @@ def run_evaluate(options: argparse.Namespace) -> int:
     )
     from ssh_abduction.evaluation.pose_truth import NEAR
 
-    file = trace_of(options)
-    data = read_maps(options.maps)
-    maps = some_maps(data, options.maps, "evaluate")
+    file = shared.trace_of(options)
+    data = shared.read_maps(options.maps)
+    maps = shared.some_maps(data, options.maps, "evaluate")
     trace = Trace.load(file)
     if options.truth is not None:
         trace = Trajectory.load(options.truth).told_to(trace)
@@ -527,11 +511,11 @@ RUNG_HEAD = (
 
 @verb(
     {
-        "trace": TRACE_SAID,
-        **max_maps("maps on each rung"),
+        "trace": shared.TRACE_SAID,
+        **shared.max_maps("maps on each rung"),
         "--time-limit S": "stop each search after S seconds",
         "--json": "print one JSON object for each rung",
-        **theory_rows(),
+        **shared.theory_rows(),
     }
 )
 def run_ladder(options: argparse.Namespace) -> int:
@@ -545,7 +529,7 @@ def run_ladder(options: argparse.Namespace) -> int:
     """
     from ssh_abduction.evaluation.rungs import UnderWay, ladder  # loads scipy
 
-    trace, theory = Trace.load(options.trace), theory_of(options)
+    trace, theory = Trace.load(options.trace), shared.theory_of(options)
     rungs: list[Rung] = []
     under_way = UnderWay()
 

@@ -12,20 +12,13 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.cli.options import (
-    MAPS_SAID,
-    ONE_MAP,
-    at_comma,
-    read_maps,
-    trace_beside,
-    trace_of_maps,
-)
+from ssh_abduction.cli import shared
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import maps_path, verb
 from ssh_abduction.data.corrections import (
@@ -166,32 +159,16 @@ class Obeying:
         """
         if solution.maps or not self.corrections:
             return []
-        said = self.corrections.known_in(drives_of(self.trace))
-        source = named(said.source or "corrections")
-        if explanation is None:
-            sure = [
-                f"{source}: {pair}: it contradicts the trace{seen_at(pair, self.trace)}"
-                for pair in said.pairs
-                if clash_alone(pair, self.trace, self.without)
-            ]
-            if sure or solution.status is not Status.UNSATISFIABLE:
-                return sure
-            return [
-                f"{source}: {sentence}: perhaps it contradicts the trace"
-                for sentence in (*said.pairs, *said.gateways)
-            ]
-        # Drop corrections one by one, as long as there is still no map. Those left clash.
-        stretch = range(explanation.first, explanation.last + 1)
-        kept = replace(said, pairs=(), gateways=())
-        if self._has_no_map(kept, stretch):
-            return []
-        kept = said
+        said, source = self._said, named(self.corrections.source or "corrections")
         sentences: list[Said | Passage] = [*said.pairs, *said.gateways]
-        for sentence in sentences:
-            fewer = kept.without(sentence)
-            kept = fewer if self._has_no_map(fewer, stretch) else kept
-        wrong = [one for one in sentences if one in kept.pairs or one in kept.gateways]
-        others = ", or another correction that is named here" if len(wrong) > 1 else ""
+        others = ""
+        if explanation is None:
+            wrong = self._unlike(self.without)
+            if not wrong and solution.status is Status.UNSATISFIABLE:
+                return [f"{source}: {one}: perhaps it contradicts the trace" for one in sentences]
+        else:
+            wrong = self._clashing(sentences, explanation)
+            others = ", or another correction that is named here" if len(wrong) > 1 else ""
         return [
             f"{source}: {sentence}: it contradicts the trace{seen_at(sentence, self.trace)}{others}"
             for sentence in wrong
@@ -201,26 +178,48 @@ class Obeying:
         """Yield a line that says how to mend the corrections of `blamed`, if there are any."""
         if not blamed:
             return
-        said = self.corrections.known_in(drives_of(self.trace))
         lenient = misreading(self.without)
         if lenient is None:
             helps = False
         elif explanation is None:
-            pairs = [p for p in said.pairs if clash_alone(p, self.trace, self.without)]
-            helps = bool(pairs) and not any(clash_alone(p, self.trace, lenient) for p in pairs)
+            helps = bool(self._unlike(self.without)) and not self._unlike(lenient)
         else:
-            stretch = range(explanation.first, explanation.last + 1)
-            helps = not self._has_no_map(said, stretch, lenient)
+            helps = not self._has_no_map(self._said, explanation, lenient)
         them = "this correction" if len(blamed) == 1 else "one of these corrections"
         also = ", or let views and stars be misread: solve with --set misread=4" if helps else ""
         yield f"say the opposite of {them} (ssh-abduction correct), or delete it{also}"
 
-    def _has_no_map(self, said: Corrections, stretch: range, without: Theory | None = None) -> bool:
+    @property
+    def _said(self) -> Corrections:
+        """The corrections about drives of this trace."""
+        return self.corrections.known_in(drives_of(self.trace))
+
+    def _unlike(self, theory: Theory) -> list[Said | Passage]:
+        """The pairs of steps that are said to be one, but cannot be so by themselves."""
+        return [pair for pair in self._said.pairs if clash_alone(pair, self.trace, theory)]
+
+    def _clashing(
+        self, sentences: Sequence[Said | Passage], explanation: Explanation
+    ) -> list[Said | Passage]:
+        """The corrections without which the steps of an explanation would have a map."""
+        kept = self._said
+        if self._has_no_map(replace(kept, pairs=(), gateways=()), explanation):
+            return []
+        # Drop corrections one by one, as long as there is still no map. Those left clash.
+        for sentence in sentences:
+            fewer = kept.without(sentence)
+            kept = fewer if self._has_no_map(fewer, explanation) else kept
+        return [one for one in sentences if one in kept.pairs or one in kept.gateways]
+
+    def _has_no_map(
+        self, said: Corrections, explanation: Explanation, without: Theory | None = None
+    ) -> bool:
+        """Whether the steps of an explanation have no map that obeys these corrections."""
         trace, theory = obeyed(said, self.as_seen, without or self.without)
-        part = theory.of_steps(stretch.start, len(stretch))
+        first, end = explanation.first, explanation.last + 1
         # In these steps, every view may be unknown.
-        part = part.replace(unknown_views=None in trace.views)
-        return explain(trace[stretch.start : stretch.stop], part) is not None
+        part = theory.of_steps(first, end - first).replace(unknown_views=None in trace.views)
+        return explain(trace[first:end], part) is not None
 
 
 def misreading(theory: Theory) -> Theory | None:
@@ -291,7 +290,7 @@ class _InOrder(argparse.Action):
 
 @verb(
     {
-        "maps": MAPS_SAID,
+        "maps": shared.MAPS_SAID,
         **{
             f"--{name.replace('_', '-')} {'I,J' if name in ASSERTIONS else 'GATEWAY'}": (
                 said,
@@ -303,7 +302,7 @@ class _InOrder(argparse.Action):
             "name or rename a place, path or region (p4, path2, kitchen), or the place of a step",
             {"action": _InOrder},
         ),
-        **ONE_MAP,
+        **shared.ONE_MAP,
     }
 )
 def run_correct(options: argparse.Namespace) -> int:
@@ -334,7 +333,8 @@ def run_correct(options: argparse.Namespace) -> int:
         return 0
     file = saved.save(said)
     warn(_unlike(saved, said, [pair for pair in said.pairs if pair not in before.pairs]))
-    if saved.theory.get("star") == "none" and {"open", "closed"} & {kind for kind, _ in given}:
+    about_gateways = any(kind in ("open", "closed") for kind, _ in given)
+    if about_gateways and saved.theory is not None and saved.theory.star == "none":
         without = "this map was made without stars, so a gateway that is open or closed changes no"
         warn([f"{without} map; to use stars, set star=auto when you map or solve again"])
     sentences = counted(sum(1 for _ in sentences_of(said)), "corrections")
@@ -344,7 +344,7 @@ def run_correct(options: argparse.Namespace) -> int:
 
 def _how_to_obey(maps: Path) -> str:
     """Write the command that solves again and obeys the corrections beside a file of maps."""
-    if trace_beside(str(maps)) is None:
+    if shared.trace_beside(str(maps)) is None:
         return f"solve again with -o {shlex.quote(str(maps))}"
     folder = shlex.quote(str(maps.parent))
     return f"to obey: ssh-abduction solve --theory {folder} {folder} -o {shlex.quote(str(maps))}"
@@ -352,9 +352,9 @@ def _how_to_obey(maps: Path) -> str:
 
 def _unlike(saved: SavedMap, corrections: Corrections, new: Sequence[Said]) -> Iterator[str]:
     """Yield a warning for each two steps that are newly said to be one, but do not look alike."""
-    if saved.trace is None or not (new and saved.theory):
+    if saved.trace is None or not new or saved.theory is None:
         return
-    trace, theory = corrections.corrected(saved.trace), Theory.from_dict(saved.theory)
+    trace, theory = corrections.corrected(saved.trace), saved.theory
     for said in new:
         if not clash_alone(said, trace, theory.without_faults()):
             continue
@@ -377,7 +377,7 @@ def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
     about_places = kind in ("elsewhere", "same_place")
     flag = f"--{kind.replace('_', '-')}"
     try:
-        steps = at_comma(pair, saved.step_at_place if about_places else saved.step)
+        steps = shared.at_comma(pair, saved.step_at_place if about_places else saved.step)
     except MapError as error:
         hint = "" if about_places else "; places are for --elsewhere and --same-place"
         raise MapError(f"{flag}: {error}{hint}") from None
@@ -390,13 +390,13 @@ def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
 
 @verb(
     {
-        "maps": MAPS_SAID,
+        "maps": shared.MAPS_SAID,
         "what": (
             "a place such as p4, a path such as path2, a region such as region3, or its name so "
             "far; or a step such as monday:12, for its place"
         ),
         "name": 'the name, such as "kitchen"; write -- before a name that begins with -',
-        **ONE_MAP,
+        **shared.ONE_MAP,
     }
 )
 def run_name(options: argparse.Namespace) -> int:
@@ -425,7 +425,7 @@ class SavedMap:
     drives: tuple[Drive, ...]
     file: Path  # the file of maps
     corrections: Corrections  # what a person said about it
-    theory: Mapping[str, Any]  # the theory of the map, as data; empty if the file does not say
+    theory: Theory | None  # the theory of the map; None if the file does not say
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], number: int | str = 1) -> SavedMap:
@@ -435,7 +435,7 @@ class SavedMap:
         corrections are of another map.
         """
         file = Path(maps_path(str(path)))
-        data = read_maps(str(file), "give a file that solve -o wrote")
+        data = shared.read_maps(str(file), "give a file that solve -o wrote")
         listing = Listing.from_dict(data, named(file))
         known = {drive.name: drive.fingerprint for drive in listing.drives}
         if not known or None in known.values():
@@ -444,15 +444,14 @@ class SavedMap:
                 "fingerprint, got none; solve again, with -o"
             )
         ssh_map = listing.maps[listing.number(str(number))]
-        if (corrections := beside(file)) is not None:
-            said = load_corrections(corrections)
+        if (own := beside(file)) is not None:
+            said = load_corrections(own)
             said.check_drives(known)
         else:  # keep the names that the map has
             said = Corrections.of_names(ssh_map, listing.drives)
         drives = {**said.drives, **{name: str(mark) for name, mark in known.items()}}
-        theory = data.get("theory") if isinstance(data, dict) else None
-        theory = theory if isinstance(theory, dict) else {}
-        found = cls(ssh_map, listing.drives, file, replace(said, drives=drives), theory)
+        corrections = replace(said, drives=drives)
+        found = cls(ssh_map, listing.drives, file, corrections, shared.written_theory(data))
         return found.named(found.corrections)
 
     def named(self, said: Corrections) -> SavedMap:
@@ -462,13 +461,12 @@ class SavedMap:
     @cached_property
     def trace(self) -> Trace | None:
         """The trace of the map; None if it is not beside the map, nor in its file."""
-        own = trace_beside(str(self.file))
-        return Trace.load(own) if own else trace_of_maps(str(self.file))
+        return shared.mapped_trace(str(self.file))
 
     @property
     def in_quarters(self) -> bool:
         """Whether stars have four directions."""
-        return self.theory.get("star") == "frame"
+        return self.theory is not None and self.theory.star == "frame"
 
     def save(self, corrections: Corrections) -> Path:
         """Write the corrections beside the map, after a check. Returns their file.

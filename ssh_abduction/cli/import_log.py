@@ -10,9 +10,7 @@ import argparse
 import hashlib
 import json
 import os
-import shutil
 import sys
-import tempfile
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -22,9 +20,9 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ssh_abduction.cli.options import OUTPUT_TRACE, check_output, write_trace
-from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c, warn
+from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c, unwritten, warn
 from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, verb
+from ssh_abduction.cli.shared import OUTPUT_TRACE, check_output, write_trace
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import write_file
@@ -83,6 +81,10 @@ def _laser_value(field: str, text: str) -> Any:
     return value
 
 
+LOG_SAID = (
+    "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be compressed "
+    "by gzip, bzip2, xz or zstd"
+)
 # How to read a log, and how wide the robot is.
 READING: Rows = {
     "# reading logs": "",
@@ -136,9 +138,8 @@ def reading_of(options: argparse.Namespace) -> dict[str, Any]:
 @verb(
     {
         "log": (
-            "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
-            "compressed by gzip, bzip2, xz or zstd. '-' reads a CARMEN log from standard input, "
-            "with little memory, and shows each place when it is final"
+            f"{LOG_SAID}. '-' reads a CARMEN log from standard input, with little memory, and "
+            "shows each place when it is final"
         ),
         **OUTPUT_TRACE,
         **READING,
@@ -255,40 +256,29 @@ LONGEST = 255  # the most bytes of the name of a folder
 DIGITS = 8  # of a log's digest, appended to its name if another log has the same name
 
 
+class UnwrittenError(AbductionError):
+    """The files of a run cannot be written."""
+
+
 def write_run(folder: Path, files: Sequence[tuple[str, bytes]]) -> None:
     """Write the files of a run into its folder, and make the folder if it is missing.
 
     run.json is removed first and written last, so it never lies beside files of another run.
-    Raises an OSError that names the file.
+    Raises UnwrittenError, which names the file.
     """
     if not files:
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    given = dict(files)
-    for name in (RUN, *(name for name in FILES if name not in given)):
-        (folder / name).unlink(missing_ok=True)
-    for name in sorted(given, key=lambda name: name == RUN):
-        try:
-            write_file(folder / name, given[name])
-        except OSError as error:
-            error.filename = str(folder / name)  # the error may name the draft, or no file
-            raise
-
-
-def written_elsewhere(files: Sequence[tuple[str, bytes]]) -> str:
-    """Write the files of a run into a temporary folder, as its own has no room. Say in words where.
-
-    Returns "" if they cannot be written there, either.
-    """
-    with suppress(OSError):
-        spare = tempfile.mkdtemp(prefix="ssh-abduction-")
-        try:
-            write_run(Path(spare), files)
-        except OSError:
-            shutil.rmtree(spare, ignore_errors=True)
-        else:
-            return f"; until then the files of this run are in {named(spare)}"
-    return ""
+    given, file = dict(files), folder
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (RUN, *(name for name in FILES if name not in given)):
+            (folder / name).unlink(missing_ok=True)
+        for name in sorted(given, key=lambda name: name == RUN):
+            file = folder / name
+            write_file(file, given[name])
+    except OSError as error:
+        error.filename = str(file)  # the error may name the draft, or no file
+        raise UnwrittenError(unwritten(error, file)) from None
 
 
 def check_folder(folder: Path) -> None:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
 from ssh_abduction.cli.outcome import EXIT_ERROR, StopFlag, on_ctrl_c, warn
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.checks import needed
-from ssh_abduction.data.errors import AbductionError, SolverError, brief, printable
+from ssh_abduction.data.errors import AbductionError, SolverError, brief, named, printable
 from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
 from ssh_abduction.solver import POLL, workers
 
@@ -48,6 +48,12 @@ class FileAnswer:
     code: int  # the exit code
     warnings: tuple[str, ...] = ()  # the warnings to print
     files: tuple[tuple[str, bytes], ...] = ()  # names and contents of the files to write
+
+
+def warn_of(answer: FileAnswer, path: str) -> None:
+    """Print the warnings of an answer, each with the name of its file."""
+    where = f"{named(path)}:"
+    warn(text if text.startswith(where) else f"{where} {text}" for text in answer.warnings)
 
 
 class FileQuestion(Protocol):
@@ -84,9 +90,10 @@ class FileQuestion(Protocol):
         """Say why a process ended without an answer."""
         return self.late if lost.late else self.killed
 
-    def warning_of(self, lost: workers.Lost) -> str:
-        """Say why the map of a file is only the best one until its process ended."""
-        return f"{self.why_lost(lost)}; its map is the best one until then"
+    def warned(self, answer: Any, lost: workers.Lost) -> Any:
+        """Return an answer with a warning: its map is only the best one until a process ended."""
+        warning = f"{self.why_lost(lost)}; its map is the best one until then"
+        return replace(answer, warnings=(*answer.warnings, warning))
 
     def rescued(self, lost: workers.Lost, path: str, *, stopped: bool) -> Any:
         """Make an answer of what a process handed over before it ended; None if that is too little.
@@ -101,10 +108,6 @@ class FileQuestion(Protocol):
         `known` is what a process handed over before it ended; None if it handed nothing over.
         """
         return self
-
-    def warned(self, answer: Any, path: str, warning: str) -> Any:
-        """Return an answer with one more warning."""
-        return replace(answer, warnings=(*answer.warnings, warning))
 
     def lost(self, lost: workers.Lost, path: str) -> Any:
         """Make the answer for a file whose process ended without an answer."""
@@ -168,7 +171,7 @@ def hurried_answer(
     limits = hurried.overdue, hurried.patience
     for answer in workers.answers(hurried.answer, [task], 1, stopped, *limits):
         if not isinstance(answer, workers.Lost):
-            yield question.warned(answer, path, question.warning_of(lost))
+            yield question.warned(answer, lost)
         elif not stopped():
             yield question.lost(lost, path)
 

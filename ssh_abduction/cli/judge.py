@@ -14,28 +14,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 from ssh_abduction.checker.checker import Violation, check, unchecked
 from ssh_abduction.checker.claims import ProvenBound, check_bound, false_claims
+from ssh_abduction.cli import shared
 from ssh_abduction.cli.correct import as_corrected
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import (
-    JSON,
-    TRACE_SAID,
-    limits,
-    maps_and_trace,
-    max_maps,
-    number_steps,
-    solved_trace,
-    some_maps,
-    theory_of,
-    theory_of_maps,
-    theory_rows,
-    trace_beside,
-    trace_of_maps,
-    written_theory,
-)
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.parsing import maps_path, trace_path, verb
 from ssh_abduction.cli.text import counted
@@ -50,30 +35,30 @@ from ssh_abduction.explain.no_map import TraceExplanation, TraceQuestion, steps_
 from ssh_abduction.explain.pair_reasons import PairQuestion
 from ssh_abduction.explain.place_reasons import PlaceExplanation, PlaceQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
+from ssh_abduction.rivals.listing import Listing, PairInMap
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import RESTS_ON, Ranking, Sharing, Solution, Stop, summary_of
 from ssh_abduction.theory.fields import AUTO
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
-if TYPE_CHECKING:
-    from ssh_abduction.rivals.listing import Listing, PairInMap
-
-
 EXIT_VIOLATED = 20
 ROUNDED = 1e-4  # a claimed probability may be wrong by this much, as costs in files are rounded
 SHOWN = 20  # violations that are printed for each map
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Judgement:
-    """What `check` found."""
+    """What `check` found about the maps in a file."""
 
-    violations: Sequence[Sequence[Violation]]  # the violations of each map
+    trace: Trace
+    data: Any  # the content of the file
+    maps: Sequence[SSHMap]
     theory: Theory  # the theory, in which no field is "auto"
-    # Sentences about everything else that was checked, such as bounds and costs.
-    said: Sequence[str]
+    violations: Sequence[Sequence[Violation]]  # the violations of each map
     holds: bool  # whether all maps and claims hold
+    # Sentences about everything else that was checked, such as bounds and costs.
+    said: list[str]
 
     @property
     def not_checked(self) -> list[str]:
@@ -97,7 +82,7 @@ class _Judgement:
                 for v in some
             ],
             "not_checked": self.not_checked,
-            "sentences": list(self.said),
+            "sentences": [*map(printable, self.said)],
         }
 
     def lines(self) -> Iterator[str]:
@@ -115,18 +100,83 @@ class _Judgement:
         if self.not_checked:
             names = printable(", ".join(self.not_checked))
             yield f"not checked, as they come from a user's own rules: {names}"
-        yield from self.said
+        yield from map(printable, self.said)
+
+    def check_costs(self, where: str) -> None:
+        """Recompute the costs of the maps in nats. `where` is the file, for errors."""
+        # This loads numpy.
+        from ssh_abduction.checker.cost_claims import LONGEST, count_checked_rivals, false_costs
+
+        trace, data, theory = self.trace, self.data, self.theory
+        weighed = Solution.from_dict(data, where, trace).weighed  # the fields have the right form
+        false = list(false_costs(trace, data, self.maps, theory))
+        for name in ("confidence", "place_confidence") if weighed else ():
+            right: float | None = getattr(weighed, name)
+            claimed = data["weighed"].get(name)
+            if right is None:
+                is_right, expected = claimed is None, "null, as the search did not finish"
+            else:
+                is_right = is_finite(claimed) and abs(claimed - right) <= ROUNDED
+                expected = f"{right:.6f}, by the costs of the rivals"
+            if not is_right:
+                false.append(f"weighed.{name}: expected {expected}, got {brief(claimed)}")
+        self.said += false
+        self.holds &= not false
+        rivals = len(data["weighed"]["rivals"])  # the first one is map 1
+        checked = max(count_checked_rivals(len(trace), rivals, theory), 1)
+        if len(trace) > LONGEST:
+            why = f"as the trace has more than {LONGEST} steps"
+            self.said.append(f"costs in nats are not checked, {why}")
+            return
+        if not false:
+            others = f" and {counted(checked - 1, 'rivals')}" * (checked > 1)
+            self.said.append(
+                f"the costs in nats of map 1{others} are right: they were computed anew"
+            )
+        if rivals > checked:
+            why = "as paths have a price" if theory.prices[2] else "as that would take long"
+            more = counted(rivals - checked, "more rivals")
+            self.said.append(f"the costs of {more} are not checked, {why}")
+
+    def check_bound(self, doubt: str | None, solved: Theory, unproven: str | None) -> None:
+        """Check the lower bound and the other claims in the file of maps.
+
+        `doubt` says why clingo's proofs may not hold for this trace and theory, `unproven` why the
+        file has no proof of the bound. `solved` is the theory of the file.
+        """
+        trace, data, maps = self.trace, self.data, self.maps
+        bound = None if unproven else check_bound(trace, data["certificate"])
+        self.said += [f"bound: {fault}" for fault in bound.faults] if bound else []
+        proven = bound.dstates + len(bound.refuted) if bound else sys.maxsize
+        false = [
+            *false_claims(data, maps, len(trace), solved, proven),
+            *_false_of_maps(data, maps, trace),
+        ]
+        if not false and self.holds and "theory" in data:
+            false += _false_of_all(data, trace)
+        self.said += false
+        self.holds &= not false
+        if bound is None:
+            self.said += [] if false else ["the other claims of the file agree with its maps"]
+            self.said.append(f"that no better map exists is not checked: {unproven}")
+        elif bound.faults:
+            self.holds = False
+        else:
+            fewest = min((len(m.dstates) for m in maps), default=sys.maxsize)
+            total = bound.dstates + (0 if doubt else len(bound.refuted))
+            self.said += _bound_in_words(bound, total, fewest if maps else None, doubt)
+            self.holds &= fewest >= total
 
 
 @verb(
     {
-        **maps_and_trace(),
+        **shared.maps_and_trace(),
         "--bound": (
             "also check the other claims of the file: the proof that no map has fewer dstates, the "
             "fits of maps, and what all maps share"
         ),
-        **JSON,
-        **theory_rows("the theory of the maps, or topological"),
+        **shared.JSON,
+        **shared.theory_rows("the theory of the maps, or topological"),
     }
 )
 def run_check(options: argparse.Namespace) -> int:
@@ -139,19 +189,19 @@ def run_check(options: argparse.Namespace) -> int:
     of it. Corrections in corrections.yaml beside the maps are obeyed. docs/reference/formats.md
     describes the JSON.
     """
-    trace = solved_trace(options)
+    trace = shared.solved_trace(options)
     data = read_json(options.maps)
     if not _may_be_of(data, trace):
         steps = f"those of {named(trace.source or 'the trace')}"
         warn([f"{named(options.maps)} was made of other steps than {steps}"])
-    solved = written_theory(data)
-    asked = theory_of(options, solved)
+    solved = shared.written_theory(data)
+    asked = shared.theory_of(options, solved)
     trace, theory = as_corrected(trace, asked, options.maps)
     theory.check_steps(trace)
     if options.bound:
         maps = maps_of(data, str(options.maps))
     else:
-        maps = some_maps(data, options.maps, "check", ", or check its bound (--bound)")
+        maps = shared.some_maps(data, options.maps, "check", ", or check its bound (--bound)")
     # Replace each "auto" once for all maps, because counting returns takes long.
     resolved = settle(trace, theory).theory
     made_by = settle(trace, solved or theory).theory
@@ -163,26 +213,25 @@ def run_check(options: argparse.Namespace) -> int:
     unjudged = other and any(ssh_map.regions is not None for ssh_map in maps)
     maps = [replace(ssh_map, regions=None) for ssh_map in maps] if unjudged else maps
     violations = [check(trace, ssh_map, resolved) for ssh_map in maps]
-    said: list[str] = []  # sentences about what is checked besides the axioms
+    found = _Judgement(trace, data, maps, resolved, violations, not any(violations), [])
     if unjudged:
-        said.append(f"regions are not checked: {why}")
-    holds = not any(violations)
+        found.said.append(f"regions are not checked: {why}")
     weighed = data.get("weighed") if isinstance(data, dict) and resolved.weigh == "cost" else None
     if weighed:
-        holds &= _costs_hold(trace, data, maps, resolved, str(options.maps), said)
+        found.check_costs(str(options.maps))
     if options.bound:
         unproven = _why_no_proof(data, resolved, solved)
-        broken, doubt = not holds, why if other else None
-        if broken:
+        doubt = why if other else None
+        if not found.holds:
             doubt = "some maps break axioms" if any(violations) else "a claim about costs is false"
         elif solved is None:
             doubt = "the file names no theory"
-        holds &= _bound(trace, data, maps, doubt, made_by, broken, said, unproven)
+        found.check_bound(doubt, made_by, unproven)
         if weighed and not unproven:
-            said.append(f"that no map costs less than {weighed['bound']:.1f} nats is not checked")
-    found = _Judgement(violations, resolved, [*map(printable, said)], holds)
+            least = f"{weighed['bound']:.1f} nats"
+            found.said.append(f"that no map costs less than {least} is not checked")
     print(json_line(found.to_dict()) if options.json else "\n".join(found.lines()))
-    return 0 if holds else EXIT_VIOLATED
+    return 0 if found.holds else EXIT_VIOLATED
 
 
 def _may_be_of(data: Any, trace: Trace) -> bool:
@@ -224,89 +273,12 @@ def _axioms_of(theory: Theory) -> Theory:
     return theory.replace(prefer=AUTO, weigh="count")
 
 
-def _costs_hold(
-    trace: Trace,
-    data: Mapping[str, Any],
-    maps: Sequence[SSHMap],
-    theory: Theory,
-    where: str,
-    said: list[str],
-) -> bool:
-    """Recompute the costs of maps in nats. Append the result to `said`; return if all hold."""
-    # This loads numpy.
-    from ssh_abduction.checker.cost_claims import LONGEST, count_checked_rivals, false_costs
-
-    weighed = Solution.from_dict(data, where, trace).weighed  # the fields have the right form
-    false = list(false_costs(trace, data, maps, theory))
-    for name in ("confidence", "place_confidence") if weighed else ():
-        right: float | None = getattr(weighed, name)
-        claimed = data["weighed"].get(name)
-        if right is None:
-            is_right, expected = claimed is None, "null, as the search did not finish"
-        else:
-            is_right = is_finite(claimed) and abs(claimed - right) <= ROUNDED
-            expected = f"{right:.6f}, by the costs of the rivals"
-        if not is_right:
-            false.append(f"weighed.{name}: expected {expected}, got {brief(claimed)}")
-    said += false
-    rivals = len(data["weighed"]["rivals"])  # the first one is map 1
-    checked = max(count_checked_rivals(len(trace), rivals, theory), 1)
-    if len(trace) > LONGEST:
-        said.append(f"costs in nats are not checked, as the trace has more than {LONGEST} steps")
-        return not false
-    if not false:
-        others = f" and {counted(checked - 1, 'rivals')}" * (checked > 1)
-        said.append(f"the costs in nats of map 1{others} are right: they were computed anew")
-    if rivals > checked:
-        why = "as paths have a price" if theory.prices[2] else "as that would take long"
-        more = counted(rivals - checked, "more rivals")
-        said.append(f"the costs of {more} are not checked, {why}")
-    return not false
-
-
-def _bound(
-    trace: Trace,
-    data: Mapping[str, Any],
-    maps: Sequence[SSHMap],
-    doubt: str | None,
-    solved: Theory,
-    broken: bool,
-    said: list[str],
-    unproven: str | None,
-) -> bool:
-    """Check the lower bound and the other claims in a file of maps, and append to `said`.
-
-    `doubt` says why clingo's proofs may not hold for this trace and theory, `unproven` why the file
-    has no proof of the bound. Returns whether all claims hold.
-    """
-    bound = None if unproven else check_bound(trace, data["certificate"])
-    said += [f"bound: {fault}" for fault in bound.faults] if bound else []
-    proven = bound.dstates + len(bound.refuted) if bound else sys.maxsize
-    false = [
-        *false_claims(data, maps, len(trace), solved, proven),
-        *_false_of_maps(data, maps, trace),
-    ]
-    if not false and not broken and "theory" in data:
-        false += _false_of_all(data, trace)
-    said += false
-    if bound is None:
-        said += [] if false else ["the other claims of the file agree with its maps"]
-        said.append(f"that no better map exists is not checked: {unproven}")
-        return not false
-    if bound.faults:
-        return False
-    fewest = min((len(m.dstates) for m in maps), default=None)
-    total = bound.dstates + (0 if doubt else len(bound.refuted))
-    said += _bound_in_words(bound, total, fewest, doubt)
-    return not false and (fewest is None or fewest >= total)
-
-
 def _bound_in_words(
     bound: ProvenBound, total: int, fewest: int | None, doubt: str | None
 ) -> Iterator[str]:
     """Yield sentences about a lower bound of `total` dstates. A map has `fewest`, if there is one.
 
-    `doubt` is as for `_bound`.
+    `doubt` is as for `check_bound`.
     """
     pairs = counted(bound.dstates * (bound.dstates - 1) // 2, "pairs")
     states, steps = counted(bound.dstates, "dstates"), counted(bound.dstates, "steps")
@@ -388,8 +360,8 @@ Answer: TypeAlias = PairExplanation | TraceExplanation | PlaceExplanation
 @verb(
     {
         "trace": (
-            f"{TRACE_SAID}. Or a file of maps that solve -o wrote, or a folder that the command "
-            "'map' wrote: then the trace and theory of these maps are used",
+            f"{shared.TRACE_SAID}. Or a file of maps that solve -o wrote, or a folder that the "
+            "command 'map' wrote: then the trace and theory of these maps are used",
             {"type": str},
         ),
         "[steps step...]": (
@@ -401,14 +373,14 @@ Answer: TypeAlias = PairExplanation | TraceExplanation | PlaceExplanation
             "given by name",
             {"default": ()},
         ),
-        **max_maps("minimal maps, to count those in which the two steps are one dstate"),
+        **shared.max_maps("minimal maps, to count those in which the two steps are one dstate"),
         "--json": "print the explanation as JSON",
-        **limits("what is known", SECONDS),
+        **shared.limits("what is known", SECONDS),
         "--corrections FILE": (
             "obey the corrections in this file, or in corrections.yaml of this folder (default: "
             "corrections.yaml in the folder of the file that --theory names, if there is one)"
         ),
-        **theory_rows(),
+        **shared.theory_rows(),
     }
 )
 def run_explain(options: argparse.Namespace) -> int:
@@ -425,15 +397,15 @@ def run_explain(options: argparse.Namespace) -> int:
     """
     if not Path(trace_path(options.trace)).exists():  # a folder with a file of solve -o
         options.trace = maps_path(options.trace)
-    if trace_beside(options.trace):  # the file of maps in a folder that map wrote
+    if shared.trace_beside(options.trace):  # the file of maps in a folder that map wrote
         options.trace = str(Path(options.trace).parent)
-    kept = trace_of_maps(options.trace)
+    kept = shared.trace_of_maps(options.trace)
     if kept is not None or Path(options.trace).is_dir():
         options.theory = options.theory or maps_path(options.trace)
     trace = Trace.load(trace_path(options.trace)) if kept is None else kept
-    number_steps(options, trace)
+    shared.number_steps(options, trace)
     maps, found, data = _maps_of(options)
-    trace, theory = as_corrected(trace, theory_of(options, found), maps, options.corrections)
+    trace, theory = as_corrected(trace, shared.theory_of(options, found), maps, options.corrections)
     given: dict[str, Any] = {n: getattr(options, n) for n in ("time_limit", "memory_limit")}
     listing = _listing_of(maps, data, len(trace)) if found and options.steps else None
     if listing is not None:
@@ -448,8 +420,6 @@ def run_explain(options: argparse.Namespace) -> int:
     elif options.steps:
         first, second = (step_named(trace, step) for step in options.steps)
         if listing is not None:
-            from ssh_abduction.rivals.listing import PairInMap  # loads numpy
-
             pair = PairInMap.of(listing, first, second)
         given["max_maps"] = options.maps or None
         question = PairQuestion(trace, first, second, theory, **given)
@@ -505,14 +475,13 @@ def _maps_of(options: argparse.Namespace) -> tuple[str | None, Theory | None, An
     if file.endswith(".toml"):
         return file, None, None
     data, options.theory = read_json(file), None
-    return file, theory_of_maps(data, file), data
+    return file, shared.theory_of_maps(data, file), data
 
 
 def _listing_of(file: str | None, data: Any, steps: int) -> Listing | None:
     """Read the maps in the data of a file; None if it has no maps of a trace with `steps` steps."""
     if file is None or not data.get("maps"):
         return None
-    from ssh_abduction.rivals.listing import Listing  # loads numpy
 
     listing = Listing.from_dict(data, named(file))
     return listing.named_beside(file) if listing.steps == steps else None

@@ -10,15 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ssh_abduction.cli import shared
 from ssh_abduction.cli.import_log import check_folder
-from ssh_abduction.cli.options import (
-    check_number,
-    check_picture,
-    draw_plot,
-    maps_and_trace,
-    trace_of,
-    write_trace,
-)
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Rows, verb
 from ssh_abduction.cli.text import counted, table
@@ -73,7 +66,7 @@ def run_cluster(options: argparse.Namespace) -> int:
     from perception.views import ViewClusterer
     from ssh_abduction.learning.traces import Traces
 
-    check_picture(options.plot)
+    shared.check_picture(options.plot)
     files = _files(options)
     traces = Traces(tuple(Trace.load(file) for file in files))
     sources = ", ".join(named(file) for file in files)
@@ -98,7 +91,7 @@ def run_cluster(options: argparse.Namespace) -> int:
     _write(clustered, files, options, f"{_choice_of_k(clusterer, uncertainty)}\n{said}")
     warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
     warn(runner_up_doubts(clustered))
-    draw_plot(options, "draw_quality", clusterer.quality_, uncertainty, clusterer.k_)
+    shared.draw_plot(options, "draw_quality", clusterer.quality_, uncertainty, clusterer.k_)
     return 0
 
 
@@ -149,7 +142,7 @@ def _write(traces: Traces, files: dict[str, str], options: argparse.Namespace, s
     """
     if not options.together:
         (trace,) = traces.each
-        write_trace(
+        shared.write_trace(
             with_images_named_from(trace, Path(options.output).parent), options.output, said
         )
         return
@@ -203,7 +196,7 @@ def pair(text: str) -> tuple[int, int]:
 
 # A map and a trace whose images get the dstates of the map as labels.
 LABELLED: Rows = {
-    **maps_and_trace(" with images"),
+    **shared.maps_and_trace(" with images"),
     "--map N": (
         "the number of the map that gives the labels, from 1 (default: use only labels on which "
         "all maps agree)"
@@ -217,11 +210,11 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
     from perception.images import images_of
     from ssh_abduction.learning.learner import labels_of
 
-    options.trace = trace_of(options)
+    options.trace = shared.trace_of(options)
     trace = Trace.load(options.trace)
     data = read_json(options.maps)
     maps = maps_of(data, str(options.maps))
-    check_number(options.map, maps, options.maps)
+    shared.check_number(options.map, maps, options.maps)
     answer = data if isinstance(data, dict) else {}
     labels = labels_of(
         maps,
@@ -271,7 +264,7 @@ def run_learning_curve(options: argparse.Namespace) -> int:
     """
     from perception.recognition import learning_curve, recogniser
 
-    check_picture(options.plot)
+    shared.check_picture(options.plot)
     images, labels, _, features = _mapped(options)
     sizes = sorted({len(images) * tenth // 10 for tenth in range(1, 11)} - {0})
     how: dict[str, Any] = {"folds": options.folds, "random_state": options.seed}
@@ -284,7 +277,7 @@ def run_learning_curve(options: argparse.Namespace) -> int:
             for s, m, a, b in zip(curve.sizes, curve.mean, curve.lowest, curve.highest, strict=True)
         ]
         print(table(["images", "recognised", "worst fold", "best fold"], rows))
-    draw_plot(options, "draw_learning", {"map": curve})
+    shared.draw_plot(options, "draw_learning", {"map": curve})
     return 0
 
 
@@ -338,7 +331,7 @@ def run_tell_apart(options: argparse.Namespace) -> int:
     from perception.appearance import ReciprocalTransformer
     from perception.recognition import strongest, telling_features
 
-    check_picture(options.plot)
+    shared.check_picture(options.plot)
     ranges, labels, ssh_map, features = _mapped(options)
     if not isinstance(features, ReciprocalTransformer):
         raise MapError(
@@ -369,5 +362,5 @@ def run_tell_apart(options: argparse.Namespace) -> int:
         ]
         beams = [f"beams by {method}" for method in next(iter(found.values())).methods]
         print(table(["dstates", "recognised", *beams], rows))
-    draw_plot(options, "draw_telling", ranges, labels, found)
+    shared.draw_plot(options, "draw_telling", ranges, labels, found)
     return 0

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import hashlib
 import json
 import tempfile
 import time
@@ -18,31 +17,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from ssh_abduction.cli import import_log, jobs, shared
 from ssh_abduction.cli.correct import say_obeyed
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.import_log import (
-    READING,
-    WIDTH,
-    check_folder,
-    digest,
-    distinct,
-    folders_of,
-    is_done,
-    named_after,
-    reading_of,
-    write_run,
-    written_elsewhere,
-)
-from ssh_abduction.cli.jobs import FileAnswer, FileQuestion, answers_of, final_code, in_a_line
-from ssh_abduction.cli.options import (
-    check_jobs,
-    choices_of,
-    many,
-    max_maps,
-    theory_of,
-    theory_rows,
-)
-from ssh_abduction.cli.outcome import EXIT_ERROR, StopFlag, exit_code, on_ctrl_c, unwritten, warn
+from ssh_abduction.cli.outcome import EXIT_ERROR, StopFlag, exit_code, on_ctrl_c, warn
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.corrections import (
@@ -69,12 +47,8 @@ HURRY = 0.5  # seconds for the search, after the process that mapped the log was
 KEPT = 64  # the copy of a log for a worker keeps this many last characters of its name
 
 
-class UnwrittenError(AbductionError):
-    """The files of a run cannot be written."""
-
-
 @dataclass(frozen=True, slots=True)
-class MapQuestion(FileQuestion):
+class MapQuestion(jobs.FileQuestion):
     """The settings for mapping each of many logs."""
 
     theory: Theory | None  # the theory; None to choose it for each log
@@ -132,59 +106,45 @@ class MapQuestion(FileQuestion):
         path: str,
         content: bytes | None = None,
         given_up: Callable[[], bool] = lambda: False,
-        keep: Callable[[FileAnswer], None] | None = None,
-        tell: Callable[[str], None] = lambda note: None,
-    ) -> FileAnswer:
-        """Implement `FileQuestion.answer`: map one log. If that fails, the answer says why.
-
-        `keep` writes the answer, unless it is an error; None in a worker process. `tell` takes each
-        warning about the log as soon as it is known.
-        """
+    ) -> jobs.FileAnswer:
+        """Implement `FileQuestion.answer`: map one log. If that fails, the answer says why."""
         try:
             if given_up():
                 return self._given_up(number, path)
-            rest = (given_up, keep, tell)
-            if content is None:
-                return self._mapped(number, [path], [path], digest([path]), *rest)
-            sent = hashlib.sha256(content).hexdigest()
-            if Path(path).exists() and digest([path]) == sent:
-                return self._mapped(number, [path], [path], sent, *rest)
+            if content is None or (Path(path).is_file() and Path(path).read_bytes() == content):
+                return self.mapped(number, [path], given_up=given_up)
             with tempfile.TemporaryDirectory() as folder:
                 here = Path(folder) / Path(path).name[-KEPT:]
                 here.write_bytes(content)
-                return self._mapped(number, [path], [str(here)], sent, *rest)
-        except UnwrittenError:
-            raise
+                return self.mapped(number, [path], [str(here)], given_up)
         except Exception as error:  # one bad log must not stop the others
             return self.failed(number, path, error)
 
-    def answer_together(
-        self,
-        paths: Sequence[str],
-        keep: Callable[[FileAnswer], None],
-        tell: Callable[[str], None],
-    ) -> FileAnswer:
-        """Map the logs of several drives through one building together. Raises AbductionError."""
-        return self._mapped(0, paths, paths, digest(paths), lambda: False, keep, tell)
-
-    def _mapped(
+    def mapped(
         self,
         number: int,
         paths: Sequence[str],
-        files: Sequence[str],
-        content: str | None,
-        given_up: Callable[[], bool],
-        keep: Callable[[FileAnswer], None] | None,
-        tell: Callable[[str], None],
-    ) -> FileAnswer:
-        """Map one log, or several together, from `files`, which may be copies.
+        copies: Sequence[str] = (),
+        given_up: Callable[[], bool] = lambda: False,
+        keep: Callable[[jobs.FileAnswer], None] | None = None,
+        tell: Callable[[str], None] = lambda note: None,
+    ) -> jobs.FileAnswer:
+        """Map one log, or several drives through one building together. Raises AbductionError.
 
-        `content` is the digest of the logs before they are read. If a log changes later, the next
-        call sees another digest and maps them again. `keep` writes the answer; None in a worker.
+        Args:
+            number: The number of the answer.
+            paths: The logs.
+            copies: Files with the same content, to be read instead.
+            given_up: Returns whether the answer is not needed any more.
+            keep: Writes the answer; None in a worker process.
+            tell: Takes each warning about a log as soon as it is known.
         """
+        files = copies or paths
+        # If a log changes after this, the next call sees another digest, and maps it again.
+        content = import_log.digest(files)
         started = time.monotonic()
         begun: list[LogMapping] = []  # one entry, once the logs are read
-        names = [named_after(path) for path in paths]
+        names = [import_log.named_after(path) for path in paths]
 
         def interrupt() -> None:
             for mapping in begun:
@@ -250,7 +210,7 @@ class MapQuestion(FileQuestion):
         done: LogMap,
         content: str | None,
         started: float,
-    ) -> FileAnswer:
+    ) -> jobs.FileAnswer:
         """Make the answer for a log that was mapped, or for several that were mapped together.
 
         `started` is the time at which reading the logs began.
@@ -259,7 +219,7 @@ class MapQuestion(FileQuestion):
         run = json.loads(files["run.json"])
         run["log"]["source"] = " + ".join(paths)
         run["settings"], run["digest"] = self.settings, content
-        sources, path = {named_after(path): path for path in paths}, paths[0]
+        sources, path = {import_log.named_after(path): path for path in paths}, paths[0]
         for drive in run.get("drives", ()):
             # A part of a log after a jump of the odometer has another name than any log.
             drive["source"] = path = sources.get(drive["name"], path)
@@ -283,17 +243,17 @@ class MapQuestion(FileQuestion):
         is_ended = done.interrupted and self.known is None  # by a person
         code = interrupted_code() if is_ended else exit_code(solution)
         notes = (*log.warnings, *done.notes, *solution.warnings)
-        return FileAnswer(number, line, code, notes, tuple(files.items()))
+        return jobs.FileAnswer(number, line, code, notes, tuple(files.items()))
 
-    def _given_up(self, number: int, path: str) -> FileAnswer:
+    def _given_up(self, number: int, path: str) -> jobs.FileAnswer:
         """Make the answer for a log that was interrupted before anything was known."""
-        return FileAnswer(number, f"{named(path)}: {GIVEN_UP}", interrupted_code())
+        return jobs.FileAnswer(number, f"{named(path)}: {GIVEN_UP}", interrupted_code())
 
-    def failed(self, number: int, path: str, error: Exception) -> FileAnswer:
-        message = in_a_line(error)
+    def failed(self, number: int, path: str, error: Exception) -> jobs.FileAnswer:
+        message = jobs.in_a_line(error)
         if not message.startswith((named(path), named(Path(path)))):
             message = f"{named(path)}: error: {message}"
-        return FileAnswer(
+        return jobs.FileAnswer(
             number,
             message,
             EXIT_ERROR,
@@ -303,13 +263,10 @@ class MapQuestion(FileQuestion):
 
 @verb(
     {
-        "logs log...": (
-            "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
-            "compressed by gzip, bzip2, xz or zstd"
-        ),
+        "logs log...": import_log.LOG_SAID,
         "--together": "the logs are drives through one building: find their joint maps",
         "-o --output FOLDER!": "folder to write; each of several logs gets a folder inside it",
-        **max_maps("minimal maps", 300),
+        **shared.max_maps("minimal maps", 300),
         "--work-limit W": (
             "units of work for the search, each about a second of a quiet core; the same map on "
             "each machine (default: the time limit or, without one, a unit for 20 seconds that the "
@@ -322,9 +279,9 @@ class MapQuestion(FileQuestion):
             "of the work limit after the search, or a few units if that is more"
         ),
         "--set again true|false=false": "whether to map also logs that are already mapped",
-        **many("map", "logs"),
-        **READING,
-        **theory_rows(
+        **shared.many("map", "logs"),
+        **import_log.READING,
+        **shared.theory_rows(
             "topological, but without the axioms of stars, sides and paths, as logs do not show "
             "these reliably"
         ),
@@ -338,7 +295,7 @@ def run_map(options: argparse.Namespace) -> int:
     Logs that are already mapped with the same settings are skipped. With --together, the logs are
     drives through one building, and get one map.
     """
-    check_jobs(options.jobs, "logs to map at a time")
+    shared.check_jobs(options.jobs, "logs to map at a time")
     if "-" in options.logs:
         raise AbductionError(
             "-: expected the files of logs, got standard input; save the log to a file"
@@ -350,11 +307,11 @@ def run_map(options: argparse.Namespace) -> int:
         )
     check_limit("--time-limit", "seconds", options.time_limit)
     check_limit("--work-limit", "units of work", options.work_limit)
-    check_folder(Path(options.output))
+    import_log.check_folder(Path(options.output))
     question = MapQuestion(
         *_theory(options),
-        reading=reading_of(options),
-        width=options.width or WIDTH,
+        reading=import_log.reading_of(options),
+        width=options.width or import_log.WIDTH,
         limit=options.time_limit,
         work=options.work_limit,
         maps=options.maps,
@@ -362,7 +319,7 @@ def run_map(options: argparse.Namespace) -> int:
     )
     if options.together:
         return _together(question, options)
-    folders, same = folders_of(options.logs, Path(options.output))
+    folders, same = import_log.folders_of(options.logs, Path(options.output))
     for path, other in same.items():
         print(f"{named(path)}: the same log as {named(other)}, in {named(folders[other])}")
     # Skip the logs that are done, and those with a folder that cannot be written.
@@ -370,7 +327,7 @@ def run_map(options: argparse.Namespace) -> int:
         path
         for path in folders
         if options.again
-        or not is_done(folders[path], [path], question.obeying(folders[path]).settings)
+        or not import_log.is_done(folders[path], [path], question.obeying(folders[path]).settings)
     ]
     for path in folders:
         if path not in left:
@@ -386,7 +343,7 @@ def _many(question: MapQuestion, options: argparse.Namespace, folders: dict[str,
     left = [*folders]
     for path, folder in folders.items():
         try:
-            check_folder(folder)
+            import_log.check_folder(folder)
             _check_alone(path, folder)
         except AbductionError as error:
             print(f"{named(path)}: error: {error}", flush=True)
@@ -394,8 +351,8 @@ def _many(question: MapQuestion, options: argparse.Namespace, folders: dict[str,
             codes.append(EXIT_ERROR)
     stop = StopFlag()
     if left:
-        codes += _kept(answers_of(question, left, options, stop), left, folders)
-    return final_code(codes, len(folders), stop, "logs")
+        codes += _kept(jobs.answers_of(question, left, options, stop), left, folders)
+    return jobs.final_code(codes, len(folders), stop, "logs")
 
 
 def _together(question: MapQuestion, options: argparse.Namespace) -> int:
@@ -405,17 +362,17 @@ def _together(question: MapQuestion, options: argparse.Namespace) -> int:
             "--together: expected one search for all logs, got --jobs or --scheduler; leave "
             "them out"
         )
-    logs, same = distinct(options.logs)
+    logs, same = import_log.distinct(options.logs)
     warn([f"{named(log)}: the same log as {named(other)}; it is left out" for log, other in same])
     names: dict[str, str] = {}
     for log in logs:
-        if (other := names.setdefault(named_after(log), log)) != log:
+        if (other := names.setdefault(import_log.named_after(log), log)) != log:
             raise AbductionError(
                 f"{named(log)}: expected a name different from {named(other)}, as each drive gets "
                 "the name of its log; rename one of them"
             )
     folder = Path(options.output)
-    if not options.again and is_done(folder, logs, question.obeying(folder).settings):
+    if not options.again and import_log.is_done(folder, logs, question.obeying(folder).settings):
         print(f"{counted(len(logs), 'logs')}: done already, in {named(folder)}")
         return 0
     return _here(question, logs, folder)
@@ -438,45 +395,38 @@ def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
         printed.add(warning)
         warn([warning])
 
-    def keep(answer: FileAnswer) -> None:
-        try:
-            write_run(folder, answer.files)
-        except OSError as error:
-            where = written_elsewhere(answer.files)
-            raise UnwrittenError(unwritten(error, folder) + where) from None
-        _say(answer, folder)
+    def keep(answer: jobs.FileAnswer) -> None:
+        _keep(answer, folder)
         warn([warning for warning in answer.warnings if warning not in printed])
 
-    check_folder(folder)
+    import_log.check_folder(folder)
     question = question.obeying(folder)
-    if len(logs) == 1:
-        answer = question.answer(0, logs[0], keep=keep, tell=tell)
-    else:
-        answer = question.answer_together(logs, keep=keep, tell=tell)
-    if answer.code == EXIT_ERROR:
-        raise AbductionError(answer.line)
-    return answer.code
+    try:
+        return question.mapped(0, logs, keep=keep, tell=tell).code
+    except Exception as error:
+        if len(logs) > 1 or isinstance(error, import_log.UnwrittenError):
+            raise
+        raise AbductionError(question.failed(0, logs[0], error).line) from None
 
 
 def _kept(
-    answers: Iterator[FileAnswer], paths: list[str], folders: dict[str, Path]
+    answers: Iterator[jobs.FileAnswer], paths: list[str], folders: dict[str, Path]
 ) -> Iterator[int]:
     """Write the files of each answer and print its line, as they come. Yield the exit codes."""
     for answer in answers:
         path, code = paths[answer.number], answer.code
         try:
-            write_run(folders[path], answer.files)
-        except OSError as error:  # one full disk must not stop the other logs
-            why = unwritten(error, folders[path]) + written_elsewhere(answer.files)
-            print(f"{named(path)}: error: {why}", flush=True)
+            _keep(answer, folders[path])
+        except import_log.UnwrittenError as error:  # one full disk must not stop the other logs
+            print(f"{named(path)}: error: {error}", flush=True)
             code = EXIT_ERROR
-        else:
-            _say(answer, folders[path])
-        warn([f"{named(path)}: {warning}" for warning in answer.warnings])
+        jobs.warn_of(answer, path)
         yield code
 
 
-def _say(answer: FileAnswer, folder: Path) -> None:
+def _keep(answer: jobs.FileAnswer, folder: Path) -> None:
+    """Write the files of an answer, and print its line. Raises UnwrittenError."""
+    import_log.write_run(folder, answer.files)
     where = f" → {named(folder)}" if answer.files else ""
     print(f"{answer.line}{where}", flush=True)
 
@@ -492,6 +442,6 @@ def _theory(options: argparse.Namespace) -> tuple[Theory | None, dict[str, Any]]
                     f"{brief(pair)}; map without it, then call ssh-abduction correct "
                     f"{named(options.output)} {flag} {named(pair)}, and map again"
                 )
-    asked = theory_of(options)
-    choices = {name: getattr(asked, name) for name in choices_of(options)}
+    asked = shared.theory_of(options)
+    choices = {name: getattr(asked, name) for name in shared.choices_of(options)}
     return (asked, {}) if options.theory or asked.level == "causal" else (None, choices)

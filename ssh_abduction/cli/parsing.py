@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
@@ -18,7 +18,7 @@ from ssh_abduction.data.errors import printable
 from ssh_abduction.data.words import meant
 
 # The help text of each argument, by its form, such as "-n --maps K=100" (see `Parser.add_rows`).
-# A tuple adds further arguments of argparse's `add_argument`, or fields of Setting, by name.
+# A tuple adds further arguments of argparse's `add_argument`, by name.
 Rows: TypeAlias = Mapping[str, str | tuple[str, Mapping[str, Any]]]
 
 NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
@@ -115,39 +115,6 @@ def verb(rows: Rows) -> Callable[[Callable[[argparse.Namespace], int]], Verb]:
     return lambda run: Verb(run, rows)
 
 
-@dataclass(frozen=True)
-class Setting:
-    """An option that the user gives as --set NAME=VALUE."""
-
-    name: str  # the name, with underscores
-    help: str  # the help text
-    # Converts the text of the value. Raises ValueError or argparse.ArgumentTypeError.
-    type: Callable[[str], Any] = str
-    choices: Sequence[str] | None = None  # the texts that are allowed; None if `type` decides
-    metavar: str = "TEXT"  # the word for the value in the help
-    default: str | None = None  # the text of the value if the user does not give the setting
-    nargs: str | None = None  # "+" if it may be given several times; its value is then a list
-
-    @property
-    def shown(self) -> str:
-        """The setting as the help shows it, such as `star={auto,none}`."""
-        return f"{self.name}={'{' + ','.join(self.choices) + '}' if self.choices else self.metavar}"
-
-    def read(self, text: str) -> Any:
-        """Convert text to a value. Raise argparse.ArgumentTypeError if it is wrong."""
-        if self.choices and text not in self.choices:
-            expected = " or ".join(filter(None, (", ".join(self.choices[:-1]), self.choices[-1])))
-            hint = meant(text, self.choices)
-            raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}{hint}")
-        try:
-            return self.type(text)
-        except ValueError:
-            expected = NUMBERS.get(self.type, "another value")
-            raise argparse.ArgumentTypeError(
-                f"expected {expected}, got {text!r}; write one"
-            ) from None
-
-
 class _Set(argparse.Action):
     """The argparse action of --set: stores VALUE of NAME=VALUE as the option of that name."""
 
@@ -168,24 +135,33 @@ class _Set(argparse.Action):
                 self, f"expected NAME=VALUE with a name out of {known}, got {values!r}{hint}"
             )
         if text == "--":
-            raise argparse.ArgumentError(self, f"{setting.name}: expected a value, got '--'")
+            raise argparse.ArgumentError(self, f"{setting.dest}: expected a value, got '--'")
         try:
-            value = setting.read(text)
-        except argparse.ArgumentTypeError as error:
-            raise argparse.ArgumentError(self, f"{setting.name}: {error}") from None
-        if setting.nargs:
-            value = [*(getattr(namespace, setting.name) or []), value]
-        setattr(namespace, setting.name, value)
+            value = parser._get_value(setting, text)
+            parser._check_value(setting, value)
+        except argparse.ArgumentError as error:
+            raise argparse.ArgumentError(self, f"{setting.dest}: {error.message}") from None
+        setting(parser, namespace, value)
+
+
+class _Paragraphs(argparse.HelpFormatter):
+    """Keeps the paragraphs of long texts apart, and lists no verbs beside the word VERB."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        fill = super()._fill_text
+        return "\n\n".join(fill(part, width, indent) for part in text.split("\n\n"))
+
+    def _iter_indented_subactions(self, action: argparse.Action) -> Generator[argparse.Action]:
+        yield from ()  # the verbs are listed in groups
 
 
 class Parser(argparse.ArgumentParser):
-    """An argparse parser with settings, groups of verbs, and hints for misspelt names."""
+    """An argparse parser with settings, and hints for misspelt names."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.settings: dict[str, Setting] = {}  # of this verb, by name
-        # The names of this program's verbs, by their heading in the help.
-        self.groups: dict[str, tuple[str, ...]] = {}
+        self.settings: dict[str, argparse.Action] = {}  # of this verb, by name
+        self.formatter_class = _Paragraphs
 
     def add_rows(self, rows: Rows) -> None:
         """Add an argument, an option, a setting or a group for each row.
@@ -210,66 +186,36 @@ class Parser(argparse.ArgumentParser):
                 group = self.add_argument_group(form[2:], said)
             elif form.startswith("--set "):
                 (name,), details = _read_form(words[6:])
-                self._add_setting(name, shown, {"default": default or None, **details, **more})
+                self._add_setting(
+                    name, {"help": shown, "default": default or None, **details, **more}
+                )
             else:
                 names, details = _read_form(words)
                 given = {"default": default} if default else {}
                 group.add_argument(*names, help=shown, **{**details, **given, **more})
 
-    def _add_setting(self, name: str, said: str, details: Mapping[str, Any]) -> None:
+    def _add_setting(self, name: str, details: dict[str, Any]) -> None:
         if not self.settings:
             shown = "change one of the settings that are listed below; may be given again"
             self.add_argument(
                 "--set", help=shown, action=_Set, dest=argparse.SUPPRESS, metavar="NAME=VALUE"
             )
-        setting = self.settings[name] = Setting(name, said, **details)
-        self.set_defaults(**{name: setting.default and setting.read(setting.default)})
-
-    def format_help(self) -> str:
-        """Make the help text, with verbs in groups and with the settings."""
-        formatter = self._get_formatter()
-        formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
-        for paragraph in (self.description or "").split("\n\n"):
-            formatter.add_text(paragraph)
-        for group in self._action_groups:
-            actions = [
-                a
-                for a in group._group_actions
-                if not (self.groups and isinstance(a, argparse._SubParsersAction))
-            ]
-            formatter.start_section(group.title)
-            formatter.add_text(group.description)
-            formatter.add_arguments(actions)
-            formatter.end_section()
-        for title, names in self.groups.items():
-            verbs = [a for a in self._verb_actions() if a.dest in names]
-            self._add_section(formatter, title, [(a.dest, a.help or "") for a in verbs])
-        settings = [(setting.shown, setting.help) for setting in self.settings.values()]
-        if settings:
-            self._add_section(formatter, "settings, each given as --set NAME=VALUE", settings)
-        for paragraph in (self.epilog or "").split("\n\n"):
-            formatter.add_text(paragraph)
-        return formatter.format_help()
-
-    def _add_section(
-        self, formatter: argparse.HelpFormatter, title: str, rows: Iterable[tuple[str, str]]
-    ) -> None:
-        formatter.start_section(title)
-        for name, text in rows:
-            formatter.add_argument(argparse.Action([], name, metavar=name, help=text))
-        formatter.end_section()
-
-    def _verb_actions(self) -> Iterable[argparse.Action]:
-        for action in self._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                yield from action._choices_actions
+            self._listed = self.add_argument_group("settings, each given as --set NAME=VALUE")
+        many, choices = details.pop("nargs", None), details.get("choices")
+        value = f"{{{','.join(choices)}}}" if choices else details["metavar"]
+        kind = argparse._AppendAction if many else argparse._StoreAction
+        setting = kind([], name, **{**details, "metavar": f"{name}={value}"})
+        self.settings[name] = setting
+        self._listed._group_actions.append(setting)  # for the help: the parser has no such option
+        default = setting.default and self._get_value(setting, setting.default)
+        self.set_defaults(**{name: default})
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        try:
-            super()._check_value(action, value)
-        except argparse.ArgumentError as error:
-            hint = meant(value, map(str, action.choices or ()))
-            raise argparse.ArgumentError(action, f"{error.message}{hint}") from None
+        if action.choices is not None and value not in action.choices:
+            names = [*map(str, action.choices)]
+            expected = " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+            hint = meant(value, names)
+            raise argparse.ArgumentError(action, f"expected {expected}, got {value!r}{hint}")
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
         try:

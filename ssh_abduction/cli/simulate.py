@@ -5,25 +5,24 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import simulator
-from ssh_abduction.cli.options import OUTPUT_TRACE, check_jobs, write_trace
 from ssh_abduction.cli.outcome import progress_bar
 from ssh_abduction.cli.parsing import verb
+from ssh_abduction.cli.shared import OUTPUT_TRACE, check_jobs, write_trace
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import AbductionError, brief, named, printable
 from ssh_abduction.data.files import save_file, shipped, write_file
+from ssh_abduction.data.trace import Trace
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from perception.readers.scans import Scan
     from simulator.panorama import Camera
     from simulator.robot import RecordedDrive
-    from ssh_abduction.data.trace import Trace
 
 ENDINGS = (".log", ".clf", ".bag", ".mcap")
 SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").glob("*.json"))

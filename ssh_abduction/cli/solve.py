@@ -18,6 +18,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from ssh_abduction.cli import outcome, shared
 from ssh_abduction.cli.correct import (
     Obeying,
     corrections_of,
@@ -25,39 +26,8 @@ from ssh_abduction.cli.correct import (
     say_obeyed,
 )
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import (
-    TRACE_SAID,
-    check_output,
-    limits,
-    many,
-    max_maps,
-    number_steps,
-    theory_of,
-    theory_rows,
-)
-from ssh_abduction.cli.outcome import (
-    Given,
-    Warnings,
-    all_given,
-    answer_ending,
-    exit_code,
-    on_ctrl_c,
-    save_solution,
-    warn,
-    why_no_map,
-)
 from ssh_abduction.cli.parsing import verb
-from ssh_abduction.cli.text import (
-    counted,
-    describe,
-    describe_backbone,
-    findings,
-    first_map,
-    found_in,
-    headline,
-    table,
-    told_apart,
-)
+from ssh_abduction.cli.text import answer_lines, front_as_text
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
@@ -65,10 +35,8 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.runtime import program
 from ssh_abduction.runtime.loggers import PROGRESS
 from ssh_abduction.solver import (
-    Front,
     Search,
     Solution,
     Start,
@@ -77,7 +45,6 @@ from ssh_abduction.solver import (
     fault_front,
     opening,
     solve,
-    summary_of,
     written_map,
 )
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
@@ -92,8 +59,8 @@ HELD_DSTATES = 500_000
 
 @verb(
     {
-        "traces trace...": TRACE_SAID,
-        **max_maps("maps"),
+        "traces trace...": shared.TRACE_SAID,
+        **shared.max_maps("maps"),
         "--json": "print the solution as JSON; for many traces, one line each",
         "--together": "the traces are drives through one building: find their joint maps",
         "-o --output FILE": "also write the solution to this file, as JSON",
@@ -112,8 +79,8 @@ HELD_DSTATES = 500_000
             "the kinds that are set count. The report also names the knee: the number of faults "
             "beyond which further faults save few dstates"
         ),
-        **limits("the best answer so far", work=True),
-        **many(
+        **shared.limits("the best answer so far", work=True),
+        **shared.many(
             "solve",
             "traces",
             "With several traces, or with one of these options, each result is one line, in the "
@@ -122,7 +89,7 @@ HELD_DSTATES = 500_000
             "traces. Limits hold for each trace. The memory limit is for the whole process: it "
             "includes other threads of a Dask worker and, except on Linux, earlier traces.",
         ),
-        **theory_rows(),
+        **shared.theory_rows(),
         "--set within K=0": (
             "also list maps with up to K dstates more than the minimum; for each number of "
             "dstates, only the best maps. With displacements, K is in nats"
@@ -141,7 +108,7 @@ def run_solve(options: argparse.Namespace) -> int:
     With several traces, the result of each is one line.
     """
     if options.output is not None:
-        check_output(options.output, "the solution")
+        shared.check_output(options.output, "the solution")
     if options.onto is not None:
         return _onto(options)
     # Many traces are solved each by itself, by `batch`.
@@ -186,8 +153,8 @@ def run_solve(options: argparse.Namespace) -> int:
 
 def _solve(options: argparse.Namespace, trace: Trace) -> int:
     """Search for the minimal maps of a trace, and print and save them. Return the exit code."""
-    number_steps(options, trace)
-    theory = theory_of(options)
+    shared.number_steps(options, trace)
+    theory = shared.theory_of(options)
     theory.check_steps(trace)
     obeying = Obeying.of(options, trace, theory)
     with contextlib.ExitStack() as until_printed:
@@ -205,15 +172,15 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
                 on_progress=on_progress,
             )
             # Ctrl-C must not cut the output, as half of it would be useless.
-            until_printed.enter_context(on_ctrl_c(search.interrupt))
-            found = Warnings(search)
+            until_printed.enter_context(outcome.on_ctrl_c(search.interrupt))
+            found = outcome.Warnings(search)
             printed = _Json(search, obeying, found) if options.json else _Text(search, obeying)
 
             def last_words(why: Stop) -> tuple[str, int, Callable[[], None]]:
                 solution = obeying.with_names(search.snapshot(why))
-                warn(found.of(solution))
-                save = partial(save_solution, solution, options.output)
-                return printed.last_words(solution), exit_code(solution), save
+                outcome.warn(found.of(solution))
+                save = partial(outcome.save_solution, solution, options.output)
+                return printed.last_words(solution), outcome.exit_code(solution), save
 
             limits = options.time_limit, options.memory_limit
             guard = Guard(
@@ -228,12 +195,13 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
 
         def save() -> None:
             options.json = False  # the JSON is complete: a later error must not follow it
-            save_solution(solution, options.output)
-            warn(found.at_once(solution))  # here, as the guard may end the process after finish()
+            outcome.save_solution(solution, options.output)
+            # Warn here, as the guard may end the process after finish().
+            outcome.warn(found.at_once(solution))
 
-        guard.finish(exit_code(solution), printed.end(solution, explanation), save)
-        warn(found.second_opinion(solution))
-    return exit_code(solution)
+        guard.finish(outcome.exit_code(solution), printed.end(solution, explanation), save)
+        outcome.warn(found.second_opinion(solution))
+    return outcome.exit_code(solution)
 
 
 def _joint(paths: Sequence[str]) -> Trace:
@@ -246,7 +214,7 @@ def _joint(paths: Sequence[str]) -> Trace:
             from ssh_abduction.learning.traces import Traces  # loads scikit-learn
 
             Traces(tuple(traces)).warn_of_unrelated_views()
-    warn([str(warning.message) for warning in odd])
+    outcome.warn([str(warning.message) for warning in odd])
     return trace
 
 
@@ -264,7 +232,7 @@ class _Text:
             if len(self.kept) < HELD and self._room > 0:
                 self.kept.append(ssh_map)
                 self._room -= len(ssh_map.dstates)
-        return why_no_map(self._search)
+        return outcome.why_no_map(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> Callable[[], str]:
         """Make the output now, as text. Return a function that gives this text."""
@@ -288,9 +256,9 @@ class _Json:
     order in which they are found.
     """
 
-    def __init__(self, search: Search, obeying: Obeying, found: Warnings) -> None:
+    def __init__(self, search: Search, obeying: Obeying, found: outcome.Warnings) -> None:
         self._search, self._obeying, self._found = search, obeying, found
-        self._held: list[Given] = []
+        self._held: list[outcome.Given] = []
         self._room = HELD_DSTATES
         self._maps = 0  # maps that were printed
         self._begun = False
@@ -315,18 +283,18 @@ class _Json:
             self._room -= len(ssh_map.dstates)
             if len(self._held) > HELD or self._room < 0:
                 say(self._let_go)
-        return why_no_map(self._search)
+        return outcome.why_no_map(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> Callable[[], str]:
         """Return a function that makes the rest of the JSON: the maps in memory, and the fields."""
-        given = all_given(solution)
+        given = outcome.all_given(solution)
         fields = self._fields(solution, explanation, len(given))
         return lambda: self._opening() + "".join(map(self._line, given)) + fields
 
     def _fields(self, solution: Solution, explanation: Explanation | None, more: int = 0) -> str:
         """Make the fields after the maps; `more` maps are not printed yet."""
         warnings = self._found.of(solution)
-        end = answer_ending(solution, explanation, self._maps + more, warnings)
+        end = outcome.answer_ending(solution, explanation, self._maps + more, warnings)
         if blamed := self._obeying.blamed(solution, explanation):
             end["corrections"] = blamed
         return f"\n],{json_line(end)[1:]}\n"
@@ -353,49 +321,13 @@ class _Json:
         held, self._held = self._held, []
         return self._opening() + "".join(map(self._line, held))
 
-    def _line(self, given: Given) -> str:
+    def _line(self, given: outcome.Given) -> str:
         self._maps += 1
         return ("," if self._maps > 1 else "") + "\n" + json_line(written_map(*given))
 
 
 def _text(lines: Iterable[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
-
-
-def answer_lines(
-    solution: Solution, explanation: Explanation | None, existing: SSHMap | None = None
-) -> Iterator[str]:
-    """Yield the lines that describe the result of a search to people.
-
-    `existing` is the map to which drives were added, if there was one.
-    """
-    yield headline(solution, explanation)
-    yield from findings(solution, existing)
-    if solution.status is Status.UNSATISFIABLE:
-        if explanation and solution.trace is not None:
-            yield from explanation.sentences
-            first, last = map(solution.trace.at, (explanation.first, explanation.last))
-            where = f"at {last}" if first == last else f"from {first} to {last}"
-            mend = (
-                "leave one of these axioms out: --set without=NAME"
-                if explanation.clashes
-                else "explain a trace of these steps alone: ssh-abduction explain"
-            )
-            yield f"look at what was seen and done {where}, or {mend}"
-        return
-    if solution.cost is None:
-        if partial_map := solution.partial:
-            steps = len(partial_map.dstate_at)
-            first = "step" if steps == 1 else f"{steps} steps"
-            yield f"\nbest map of the first {first}\n{describe(partial_map)}"
-        return
-    yield first_map(solution)
-    count, backbone = found_in(solution), solution.shared
-    if backbone and (count > 1 or not solution.complete):
-        yield f"\n{summary_of(solution, count, backbone)}"
-    if backbone and not solution.minimal_listed and solution.trace is not None:
-        yield describe_backbone(backbone, solution.trace)
-    yield from told_apart(solution)
 
 
 @contextlib.contextmanager
@@ -435,10 +367,10 @@ def _onto(options: argparse.Namespace) -> int:
     said = corrections_of(options)
     # Steps of options such as --same are named by the drives of the old and the new traces.
     if existing.trace is not None:
-        number_steps(options, together([existing.trace, trace]))
+        shared.number_steps(options, together([existing.trace, trace]))
     solution = solve(
         trace,
-        theory_of(options, existing.theory.replace(returns=0)),
+        shared.theory_of(options, existing.theory.replace(returns=0)),
         onto=existing,
         time_limit=options.time_limit,
         work_limit=options.work_limit,
@@ -450,8 +382,8 @@ def _onto(options: argparse.Namespace) -> int:
     )
     if said is not None and solution.trace is not None:
         say_obeyed(said, solution.trace)
-    warn(solution.warnings)
-    save_solution(solution, options.output)
+    outcome.warn(solution.warnings)
+    outcome.save_solution(solution, options.output)
     keep_corrections(said, options.output)
     added = replace(solution, shared=None)
     print(
@@ -459,7 +391,7 @@ def _onto(options: argparse.Namespace) -> int:
         if options.json
         else "\n".join(answer_lines(added, None, existing.maps[0]))
     )
-    return exit_code(solution)
+    return outcome.exit_code(solution)
 
 
 def _front(options: argparse.Namespace) -> int:
@@ -476,7 +408,7 @@ def _front(options: argparse.Namespace) -> int:
         )
     front = fault_front(
         Trace.load(options.traces[0]),
-        theory_of(options, Theory.causal()),
+        shared.theory_of(options, Theory.causal()),
         options.front,
         options.time_limit,
     )
@@ -484,38 +416,5 @@ def _front(options: argparse.Namespace) -> int:
         points = [attributes_of(p, "faults", "dstates", "proven", "map") for p in front.points]
         print(json_line(attributes_of(front, "knee", "prices") | {"front": points}))
     else:
-        print(_front_as_text(front, options.front))
+        print(front_as_text(front, options.front))
     return 10 if front.stopped else 0 if front.points else 20
-
-
-def _front_as_text(front: Front, most: int) -> str:
-    """Write a front of at most `most` faults as a table, with sentences below it."""
-    if not front.points:
-        return (
-            f"no map has at most {counted(most, 'faults')}: the asserted pairs of steps (--same, "
-            "--different, --elsewhere) contradict what was seen and done; "
-            "allow more faults (--front), or assert less"
-        )
-    rows = []
-    for point in front.points:
-        faults = "; ".join(map(str, point.map.faults)) if point.map else "–"
-        shown = str(point.dstates) if point.proven else f"at least {point.dstates}"
-        knee = "knee" if point.faults == front.knee else ""
-        rows.append([point.faults, shown, knee, faults or "none"])
-    lines = [table(["faults", "dstates", "", "of the map found"], rows)]
-    if front.prices:
-        lines.append(
-            f"if a fault costs more than {front.prices[0]:g} and less than {front.prices[1]:g} "
-            "dstates, the map at the knee costs least of these"
-        )
-    elif not front.stopped and len({point.dstates for point in front.points}) == 1:
-        lines.append("no fault saves a dstate")
-    elif not front.stopped:
-        lines.append("no knee: each further fault saves about as many dstates")
-    if front.stopped:
-        why = "interrupted" if program.raised else "stopped by the time limit"
-        lines.append(f"{why} at {counted(front.points[-1].faults, 'faults')}")
-    if first := front.points[0].faults:
-        fewest = counted(first, "faults")
-        lines.append(f"no map with the asserted pairs of steps has fewer than {fewest}")
-    return "\n".join(lines)

@@ -19,7 +19,9 @@ from ssh_abduction.data.words import counted as counted  # noqa: PLC0414 - the v
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.output.cards import table_of_dstates
-from ssh_abduction.solver import Backbone, Cost, Solution, Status, stretches
+from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.runtime import program
+from ssh_abduction.solver import Backbone, Cost, Front, Solution, Status, stretches, summary_of
 from ssh_abduction.theory import Theory
 
 if TYPE_CHECKING:
@@ -36,6 +38,75 @@ NOUNS: dict[Matter, tuple[str, str]] = {
     "paths": ("path", "paths"),
     "courses": ("direction along the path", "directions along paths"),
 }
+
+
+def answer_lines(
+    solution: Solution, explanation: Explanation | None, existing: SSHMap | None = None
+) -> Iterator[str]:
+    """Yield the lines that describe the result of a search to people.
+
+    `existing` is the map to which drives were added, if there was one.
+    """
+    yield headline(solution, explanation)
+    yield from findings(solution, existing)
+    if solution.status is Status.UNSATISFIABLE:
+        if explanation and solution.trace is not None:
+            yield from explanation.sentences
+            first, last = map(solution.trace.at, (explanation.first, explanation.last))
+            where = f"at {last}" if first == last else f"from {first} to {last}"
+            mend = (
+                "leave one of these axioms out: --set without=NAME"
+                if explanation.clashes
+                else "explain a trace of these steps alone: ssh-abduction explain"
+            )
+            yield f"look at what was seen and done {where}, or {mend}"
+        return
+    if solution.cost is None:
+        if partial_map := solution.partial:
+            steps = len(partial_map.dstate_at)
+            first = "step" if steps == 1 else f"{steps} steps"
+            yield f"\nbest map of the first {first}\n{describe(partial_map)}"
+        return
+    yield first_map(solution)
+    count, backbone = found_in(solution), solution.shared
+    if backbone and (count > 1 or not solution.complete):
+        yield f"\n{summary_of(solution, count, backbone)}"
+    if backbone and not solution.minimal_listed and solution.trace is not None:
+        yield describe_backbone(backbone, solution.trace)
+    yield from told_apart(solution)
+
+
+def front_as_text(front: Front, most: int) -> str:
+    """Write a front of at most `most` faults as a table, with sentences below it."""
+    if not front.points:
+        return (
+            f"no map has at most {counted(most, 'faults')}: the asserted pairs of steps (--same, "
+            "--different, --elsewhere) contradict what was seen and done; "
+            "allow more faults (--front), or assert less"
+        )
+    rows = []
+    for point in front.points:
+        faults = "; ".join(map(str, point.map.faults)) if point.map else "–"
+        shown = str(point.dstates) if point.proven else f"at least {point.dstates}"
+        knee = "knee" if point.faults == front.knee else ""
+        rows.append([point.faults, shown, knee, faults or "none"])
+    lines = [table(["faults", "dstates", "", "of the map found"], rows)]
+    if front.prices:
+        lines.append(
+            f"if a fault costs more than {front.prices[0]:g} and less than {front.prices[1]:g} "
+            "dstates, the map at the knee costs least of these"
+        )
+    elif not front.stopped and len({point.dstates for point in front.points}) == 1:
+        lines.append("no fault saves a dstate")
+    elif not front.stopped:
+        lines.append("no knee: each further fault saves about as many dstates")
+    if front.stopped:
+        why = "interrupted" if program.raised else "stopped by the time limit"
+        lines.append(f"{why} at {counted(front.points[-1].faults, 'faults')}")
+    if first := front.points[0].faults:
+        fewest = counted(first, "faults")
+        lines.append(f"no map with the asserted pairs of steps has fewer than {fewest}")
+    return "\n".join(lines)
 
 
 def found_in(solution: Solution) -> int:
@@ -141,7 +212,6 @@ def told_apart(solution: Solution) -> Iterator[str]:
     """Yield lines about how the maps of a solution differ."""
     if len(solution.maps) > 1:
         from ssh_abduction.rivals.comparison import compare  # loads numpy
-        from ssh_abduction.rivals.listing import Listing
 
         held = len(solution.maps)
         some = "" if found_in(solution) == held else f" (of the first {held} found)"

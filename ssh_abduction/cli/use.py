@@ -7,32 +7,22 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import signal
 import tempfile
 import warnings
+import webbrowser
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.cli.options import (
-    JSON,
-    MAPS_SAID,
-    ONE_MAP,
-    check_number,
-    check_picture,
-    draw_plot,
-    flags_of,
-    read_maps,
-    some_maps,
-    trace_beside,
-    trace_of_maps,
-    written_theory,
-)
+from ssh_abduction.cli import shared
+from ssh_abduction.cli.correct import as_corrected
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import trace_path, verb
 from ssh_abduction.cli.text import describe, steps_in_words, table
 from ssh_abduction.data.checks import a_whole_number
-from ssh_abduction.data.corrections import named_beside
+from ssh_abduction.data.corrections import beside, named_beside
 from ssh_abduction.data.errors import (
     AbductionError,
     LocaliserError,
@@ -44,19 +34,18 @@ from ssh_abduction.data.errors import (
 )
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import gathered
-from ssh_abduction.data.map_parts import described, read_json
+from ssh_abduction.data.map_parts import described, read_json, write_map
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.schema import FieldReader, only_known
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver import drives_in
+from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.runtime import program
+from ssh_abduction.solver import drives_in, end_all
+from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.data.maps import SSHMap
-    from ssh_abduction.data.trace import Trace
     from ssh_abduction.online.localiser import Localiser
     from ssh_abduction.page.content import Called, Run
-    from ssh_abduction.rivals.listing import Listing
-    from ssh_abduction.theory.theory import Theory
 
 
 HEAD = ("step", "action", "seen", "", "dstate")
@@ -75,7 +64,7 @@ NOWHERE = "–"
 
 @verb(
     {
-        "maps": MAPS_SAID,
+        "maps": shared.MAPS_SAID,
         "other": (
             "trace of a robot in the mapped world that uses the same names of views and actions; "
             "- for standard input; or a folder that the command 'map' wrote",
@@ -97,7 +86,7 @@ NOWHERE = "–"
             "are then 0, and that of reentered is 1"
         ),
         "--plot PNG": "draw into this file how unsure the belief is at each step",
-        **JSON,
+        **shared.JSON,
     }
 )
 def run_localise(options: argparse.Namespace) -> int:
@@ -107,7 +96,7 @@ def run_localise(options: argparse.Namespace) -> int:
     computes a belief over dstates after each step. The robot may start anywhere, be kidnapped, or
     leave the map.
     """
-    check_picture(options.plot)
+    shared.check_picture(options.plot)
     localiser, trace = _localiser(options)
     beliefs = [belief.to_dict() for belief in localiser.beliefs(trace)]
     if options.json:
@@ -126,7 +115,7 @@ def run_localise(options: argparse.Namespace) -> int:
         ]
         place = ("place",) if localiser.ssh_map.places else ()
         print(table((*HEAD, *place, *NUMBERS), rows))
-    draw_plot(options, "draw_beliefs", beliefs)
+    shared.draw_plot(options, "draw_beliefs", beliefs)
     return 0
 
 
@@ -137,9 +126,9 @@ def _localiser(options: argparse.Namespace) -> tuple[Localiser, Trace]:
     """
     from ssh_abduction.online.localiser import Chances, Localiser
 
-    data = read_maps(options.maps)
-    maps = named_maps(some_maps(data, options.maps, "localise in"), data, options.maps)
-    check_number(options.map, maps, options.maps)
+    data = shared.read_maps(options.maps)
+    maps = named_maps(shared.some_maps(data, options.maps, "localise in"), data, options.maps)
+    shared.check_number(options.map, maps, options.maps)
     if len(maps) > 1 and options.map is None:
         warnings.warn(
             f"{named(options.maps)}: the first of {len(maps)} maps is taken; choose one with --map",
@@ -148,18 +137,12 @@ def _localiser(options: argparse.Namespace) -> tuple[Localiser, Trace]:
     given = only_known(**{name: getattr(options, name) for name in CHANCES})
     chances = replace(Chances.none() if options.zero_one else Chances(), **given)
     ssh_map = maps[(options.map or 1) - 1]
-    mapped = Trace.load(options.trace) if options.trace else _mapped(options.maps)
+    mapped = shared.mapped_trace(options.maps, options.trace)
     other = Trace.load(options.other)
     recogniser = _recogniser(options, ssh_map, mapped, other)
     of_recogniser = said_of(named(options.recogniser or options.maps), LocaliserError)
     with said_of(named(options.maps), MapError), of_recogniser:
         return Localiser(ssh_map, recogniser, trace=mapped, chances=chances), other
-
-
-def _mapped(maps: str) -> Trace | None:
-    """Return the trace that was mapped, if it is beside the maps or in their file."""
-    beside = trace_beside(maps)
-    return Trace.load(beside) if beside else trace_of_maps(maps)
 
 
 def _recogniser(
@@ -170,7 +153,7 @@ def _recogniser(
         from perception.store import load
 
         return load(options.recogniser).model
-    is_log = options.trace is None and trace_beside(options.maps) is not None
+    is_log = options.trace is None and shared.trace_beside(options.maps) is not None
     if not is_log or mapped is None or other.steps[0].image is None:
         return None
     from ssh_abduction.robot_logs.log_maps import recogniser_of
@@ -200,7 +183,7 @@ def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
 
 @verb(
     {
-        "maps": MAPS_SAID,
+        "maps": shared.MAPS_SAID,
         "--from A": (
             "start: the number of a dstate, a step such as monday:12, or a place or region by "
             "number or name, such as p3, region2 or kitchen (default: the robot's last dstate)",
@@ -213,8 +196,8 @@ def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
             "made. With places, it may use any move along a path of the map, and drive back where "
             "it came from"
         ),
-        **ONE_MAP,
-        **JSON,
+        **shared.ONE_MAP,
+        **shared.JSON,
     }
 )
 def run_route(options: argparse.Namespace) -> int:
@@ -228,7 +211,6 @@ def run_route(options: argparse.Namespace) -> int:
     the JSON.
     """
     from ssh_abduction.online.routes import action_in_words, route  # loads networkx
-    from ssh_abduction.rivals.listing import Listing
 
     listing = Listing.load(options.maps)
     given = {name.text for ssh_map in listing.maps for name in ssh_map.names}
@@ -272,7 +254,12 @@ def _names(words: list[str] | None, given: Collection[str]) -> list[str]:
     ]
 
 
-@verb({"maps": MAPS_SAID, "--map N": "show only the map with this number, from 1 (default: all)"})
+@verb(
+    {
+        "maps": shared.MAPS_SAID,
+        "--map N": "show only the map with this number, from 1 (default: all)",
+    }
+)
 def run_show(options: argparse.Namespace) -> int:
     """Print the dstates, places, paths and links of maps.
 
@@ -280,7 +267,7 @@ def run_show(options: argparse.Namespace) -> int:
     """
     data, where = read_json(options.maps), str(options.maps)
     maps = named_maps(maps_of(data, where), data, where)
-    check_number(options.map, maps, options.maps)
+    shared.check_number(options.map, maps, options.maps)
     if not maps:
         print("no map")
         return 0
@@ -310,12 +297,12 @@ FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
 
 @verb(
     {
-        "maps": MAPS_SAID,
+        "maps": shared.MAPS_SAID,
         f"--to {{{','.join(FORMATS)}}}!": (
             "the format to write: nav2 and tmap2 are for programs that drive a robot, svg is a "
             "picture, and the others are graphs"
         ),
-        **ONE_MAP,
+        **shared.ONE_MAP,
         "--trace TRACE": (
             "the trace that was mapped; its turns give a better layout of a map without poses"
         ),
@@ -342,9 +329,7 @@ def run_export(options: argparse.Namespace) -> int:
     Positions are in metres from the first dstate if the map has poses. Otherwise they come from a
     layout, and a warning says so. docs/reference/formats.md describes each format.
     """
-    from ssh_abduction.data.map_parts import write_map
     from ssh_abduction.output.export import export_doubts, export_map  # loads networkx
-    from ssh_abduction.rivals.listing import Listing
 
     listing = Listing.load(options.maps)
     chosen = listing.maps[listing.number(options.map)]
@@ -362,7 +347,7 @@ def run_export(options: argparse.Namespace) -> int:
 
 @verb(
     {
-        "maps": MAPS_SAID,
+        "maps": shared.MAPS_SAID,
         "[trace]": (
             "the trace that was mapped; adds actions and laser images, and is needed for --serve "
             "(default: the trace in the folder of the maps, if map wrote it, or in the file of "
@@ -397,28 +382,24 @@ def run_view(options: argparse.Namespace) -> int:
     The page is one file that works without a network. Without --serve, it cannot ask the solver. It
     shows the commands for that.
     """
-    from ssh_abduction.cli.correct import as_corrected
-    from ssh_abduction.data.corrections import beside
-    from ssh_abduction.data.map_parts import read_json
-    from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.content import Called, content_of  # loads numpy
     from ssh_abduction.page.html import Page
-    from ssh_abduction.rivals.listing import Listing
 
-    options.trace = options.trace or trace_beside(options.maps)
-    trace = trace_of_maps(options.maps) if options.trace is None else Trace.load(options.trace)
+    options.trace = options.trace or shared.trace_beside(options.maps)
+    trace = shared.mapped_trace(options.maps, options.trace)
     _check(options, trace)
     data = read_json(options.maps)
     source = "standard input" if options.maps == "-" else options.maps
     listing = Listing.from_dict(data, source).named_beside(options.maps)
-    theory = written_theory(data)
-    seen = trace
+    theory = shared.written_theory(data)
+    maps = "maps.json" if options.maps == "-" else options.maps
+    flags = [] if theory is None else ["--theory", maps]
     if trace is not None and theory is not None:
+        recorded = trace, theory
         trace, theory = as_corrected(trace, theory, options.maps)
-    flags = [] if theory is None else flags_of(theory, trace)
-    flags += [] if trace == seen else ["--corrections", str(beside(options.maps))]
+        flags += [] if (trace, theory) == recorded else ["--corrections", str(beside(maps))]
     called = Called(
-        "maps.json" if options.maps == "-" else shlex.quote(options.maps),
+        shlex.quote(maps),
         shlex.quote(options.trace) if options.trace else "TRACE",
         "".join(f" {shlex.quote(flag)}" for flag in flags),
     )
@@ -431,7 +412,7 @@ def run_view(options: argparse.Namespace) -> int:
     page.save(file)
     print(file)
     if not options.output and options.open:
-        _open(Path(file).absolute().as_uri())
+        webbrowser.open(Path(file).absolute().as_uri())
     return 0
 
 
@@ -451,7 +432,6 @@ def _check(options: argparse.Namespace, trace: Trace | None) -> None:
 
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
     """Make the localised run that the options ask for; None if they ask for none."""
-    from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.content import Run
 
     if options.run is None and options.belief is None:
@@ -462,40 +442,36 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
             "--belief: expected the trace of the run, got none; name it with --run, or give the "
             "trace that was mapped"
         )
-    if options.belief is None:
-        from ssh_abduction.online.localiser import Localiser
+    if options.belief is not None:
+        return _with_beliefs(followed, options.belief, maps_of(data, "maps"))
+    from ssh_abduction.online.localiser import Localiser
 
-        return Run(followed, lambda ssh_map: Localiser(ssh_map, trace=trace).beliefs(followed))
-    return _with_beliefs(followed, options.belief, data)
+    return Run(followed, lambda ssh_map: Localiser(ssh_map, trace=trace).beliefs(followed))
 
 
-def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
+def _with_beliefs(followed: Trace, file: str, maps: Sequence[SSHMap]) -> Run:
     """Make a run with the beliefs of a file that `localise --json` wrote. Raises MapError."""
-    from ssh_abduction.data.map_parts import read_json
-    from ssh_abduction.data.maps import maps_of
     from ssh_abduction.page.content import Run
 
     record = read_json(file)
-    beliefs = record.get("beliefs") if isinstance(record, dict) else None
-    if not isinstance(beliefs, list) or not all(isinstance(belief, dict) for belief in beliefs):
+    record = record if isinstance(record, dict) else {}
+    beliefs, number = record.get("beliefs"), record.get("map", 1)
+    if not isinstance(beliefs, list):
         raise MapError(
             f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write "
             "them with localise --json"
         )
-    maps, number = maps_of(data, "maps"), record.get("map", 1)
     mend = "run localise with these maps"
     a_whole_number(f"{named(file)}: map", number, MapError, 1, len(maps), what="a map", mend=mend)
-    if record.get("dstates", count := len(maps[number - 1].dstates)) != count:
+    chosen = maps[number - 1]
+    size = record.get("dstates", len(chosen.dstates)), len(beliefs)
+    if size != (len(chosen.dstates), len(followed)):
         raise MapError(
-            f"{named(file)}: dstates: expected {count}, as map {number} has, got "
-            f"{brief(record['dstates'])}; run localise with these maps"
+            f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, in "
+            f"map {number} with {len(chosen.dstates)} dstates, got {size[1]} in a map with "
+            f"{brief(size[0])} dstates; run localise with these maps, or name that run with --run"
         )
-    if len(beliefs) != len(followed):
-        raise MapError(
-            f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, got "
-            f"{len(beliefs)}; name that run with --run"
-        )
-    chosen, labels = maps[number - 1], maps[number - 1].renumbered().dstate_at
+    labels = chosen.renumbered().dstate_at
     visited = dict.fromkeys([*chosen.dstate_at, *range(len(chosen.dstates))])
     new = {s: i for i, s in enumerate(visited)}  # the page numbers dstates by first visit
     try:
@@ -519,11 +495,8 @@ def _serve(
     localised: Run | None,
     called: Called,
 ) -> int:
-    import signal
 
     from ssh_abduction.page.server import PageServer
-    from ssh_abduction.runtime import program
-    from ssh_abduction.solver import end_all
 
     where: dict[str, Any] = {"port": options.port, "time_limit": options.time_limit}
     try:
@@ -535,7 +508,7 @@ def _serve(
     with server:
         print(server.url, flush=True)
         if options.open:
-            _open(server.url)
+            webbrowser.open(server.url)
         try:
             server.serve_forever()
         except KeyboardInterrupt:
@@ -544,9 +517,3 @@ def _serve(
         finally:
             end_all()
     return 0
-
-
-def _open(address: str) -> None:
-    import webbrowser
-
-    webbrowser.open(address)

@@ -22,8 +22,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
+from functools import partial
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -77,13 +78,7 @@ def counting(is_on: bool) -> Iterator[None]:
 
 def each_counting(is_on: bool, items: Iterator[Item]) -> Iterator[Item]:
     """Yield the items of an iterator. Only its own work runs within `counting(is_on)`."""
-    while True:
-        with counting(is_on):
-            try:
-                item = next(items)
-            except StopIteration:
-                return
-        yield item
+    return _each_within(partial(counting, is_on), items)
 
 
 def look_at_clock(micro: int = TURN) -> None:
@@ -128,8 +123,14 @@ def heeding(check: Callable[[], None]) -> Iterator[None]:
 
 def each_heeding(check: Callable[[], None], items: Iterator[Item]) -> Iterator[Item]:
     """Yield the items of an iterator. Only its own work runs within `heeding(check)`."""
+    return _each_within(partial(heeding, check), items)
+
+
+def _each_within(
+    context: Callable[[], AbstractContextManager[None]], items: Iterator[Item]
+) -> Iterator[Item]:
     while True:
-        with heeding(check):
+        with context():
             try:
                 item = next(items)
             except StopIteration:

@@ -1,4 +1,4 @@
-"""Options that several verbs have in common, such as those that choose a theory."""
+"""What several verbs share: options, and the theories, traces and maps that they name."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
+from ssh_abduction.solver import trace_in
 from ssh_abduction.theory.fields import CHOICES
-from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
 
 Step = TypeVar("Step")  # a step by its number or its name
@@ -210,16 +210,19 @@ def trace_of(options: argparse.Namespace) -> str:
     return str(options.trace)
 
 
-def solved_trace(options: argparse.Namespace) -> Trace:
-    """Load the trace that was solved: the named one (`trace_of`), or the one in the file of maps.
+def mapped_trace(maps: str, file: str | None = None) -> Trace | None:
+    """Load the trace of some maps: the named file, or the trace beside the maps or in their file.
 
-    The trace in the file of maps has no images and no truth. Raises AbductionError.
+    The trace in the file of maps has no images and no truth. None if there is no trace. Raises
+    AbductionError.
     """
-    if options.trace is None and trace_beside(options.maps) is None:
-        kept = trace_of_maps(options.maps)
-        if kept is not None:
-            return kept
-    return Trace.load(trace_of(options))
+    file = file or trace_beside(maps)
+    return Trace.load(file) if file else trace_of_maps(maps)
+
+
+def solved_trace(options: argparse.Namespace) -> Trace:
+    """Load the trace that was solved, as `mapped_trace`. Raises AbductionError if there is none."""
+    return mapped_trace(options.maps, options.trace) or Trace.load(trace_of(options))
 
 
 def trace_of_maps(file: str) -> Trace | None:
@@ -227,7 +230,6 @@ def trace_of_maps(file: str) -> Trace | None:
 
     Raises TraceError.
     """
-    from ssh_abduction.solver import trace_in
 
     try:
         data = read_json(file) if file != "-" else None
@@ -385,32 +387,3 @@ def choices_of(options: argparse.Namespace) -> dict[str, Any]:
     if "prefer" in chosen and not chosen["prefer"]:
         chosen["prefer"] = ()
     return chosen
-
-
-def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
-    """List the words of the command line that choose a theory. This inverts `theory_of`.
-
-    Only fields that differ from the default theory need words. If the trace is known, "auto" in
-    the default theory is replaced by what the trace decides.
-    """
-    default = Theory.causal() if theory.level == "causal" else Theory.topological()
-    flags = ["--theory", "causal"] if theory.level == "causal" else []
-    if trace is not None:
-        # The theory may have been made for another trace, with other evidence.
-        with suppress(AbductionError):
-            default = settle(trace, default).theory
-    for field in fields(Theory):
-        value = getattr(theory, field.name)
-        if value == getattr(default, field.name) or field.name in ("level", *SETTLED):
-            continue
-        if field.name == "rules":
-            flags += [part for rules in value for part in ("--set", f"rules={rules.name}")]
-        elif field.name in ASSERTIONS:
-            flag = f"--{field.name.replace('_', '-')}"
-            flags += [part for i, j in value for part in (flag, f"{i},{j}")]
-        else:
-            values = value if isinstance(value, tuple) else (value,)
-            text = ",".join(str(part).removesuffix(".0") for part in values)
-            text = text.lower() if isinstance(value, bool) else text
-            flags += ["--set", f"{field.name}={text}"]
-    return flags
