@@ -28,7 +28,7 @@ from perception.recognition import recogniser
 from ssh_abduction import Localiser
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.localiser import BeliefVerdict
-from ssh_abduction.robot_logs.log_maps import FLOOR, LogMap, map_log
+from ssh_abduction.robot_logs.log_maps import FLOOR, LogMap, map_log, recogniser_of
 
 # A dstate is within NEAR metres and TURNED radians of an image that shows it.
 NEAR, TURNED = 2.0, math.radians(45)
@@ -70,7 +70,7 @@ def localised(done: LogMap, asked: Trace) -> dict[str, int]:
     """Count the steps of another drive where a localiser is sure, and where it is right."""
     ssh_map, trace = done.solution.maps[0], done.imported.trace
     labels, poses, others = np.array(ssh_map.dstate_at), poses_of(trace), poses_of(asked)
-    localiser = Localiser(ssh_map, done.recogniser(), trace=trace)
+    localiser = Localiser(ssh_map, recogniser_of(trace, ssh_map), trace=trace)
     counts = dict.fromkeys(("steps", "at learnt dstates", "located", "located and right"), 0)
     for belief, pose in zip(localiser.beliefs(asked), others, strict=True):
         located = belief.verdict is BeliefVerdict.LOCATED

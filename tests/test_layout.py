@@ -220,7 +220,7 @@ def test_layout_uses_given_poses() -> None:
     assert layout(replace(square, fit=Fit(1.0, 1, 0.5))).metric is False
 
 
-def test_layout_places_unconnected_parts_side_by_side() -> None:
+def test_layout_places_unconnected_parts_below_each_other() -> None:
     square = mapped(SQUARE)
     far = [
         replace(s, id=s.id + 16, place=(s.place or 0) + 4, path=(s.path or 0) + 4)
@@ -237,7 +237,7 @@ def test_layout_places_unconnected_parts_side_by_side() -> None:
     )
     found = layout(both)
     check(both, found)
-    assert max(found.places[p][0] for p in range(4)) < min(found.places[p][0] for p in range(4, 8))
+    assert min(found.places[p][1] for p in range(4)) > max(found.places[p][1] for p in range(4, 8))
 
 
 def test_layout_refuses_wrong_turns() -> None:

@@ -916,7 +916,7 @@ def test_trace_reader_recognises_a_log(tmp_path: Path) -> None:
         with pytest.raises(
             TraceError,
             match=(
-                r"as robots' logs are; make a trace of it with ssh-abduction import LOG -o "
+                r"got a robot's log; make a trace of it with ssh-abduction import LOG -o "
                 r"trace\.jsonl"
             ),
         ):

@@ -262,7 +262,13 @@ def finite(value: Any, where: str) -> float:
 
 
 def checked_image(value: Any, where: str) -> tuple[float, ...] | int:
-    """Return an image, finite numbers or an index into the sidecar file, or raise TraceError."""
+    """Return an image, finite numbers or an index into the sidecar file, or raise TraceError.
+
+    Of a tuple, only the first number is checked: traces are copied often, and images are long.
+    """
+    if isinstance(value, tuple) and (not value or is_finite(value[0])):
+        return value
+    value = value.tolist() if hasattr(value, "tolist") else value
     if is_whole(value):
         if value < 0:
             raise TraceError(
@@ -281,16 +287,6 @@ def numbers_listed(value: Any, where: str) -> list[Any] | tuple[Any, ...]:
     if isinstance(value, list | tuple):
         return value
     raise TraceError(f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]")
-
-
-def frozen_image(value: Any, where: str) -> tuple[float, ...] | int:
-    """Return an image as a tuple of numbers, or as an index into the sidecar file.
-
-    Of a tuple, only the first number is checked: traces are copied often, and images are long.
-    """
-    if isinstance(value, tuple) and (not value or is_finite(value[0])):
-        return value
-    return checked_image(value.tolist() if hasattr(value, "tolist") else value, where)
 
 
 def plain_number(x: float) -> float:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import codecs
 import hashlib
 import os
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -77,13 +78,7 @@ FORMAT, VERSION = "ssh-trace", 1
 LONGEST_LINE = 16 * 2**20
 # How files of maps and robots' logs begin. Users sometimes give these files instead of a trace.
 _MAPS = (b'{"format": "ssh-solution"', b'{"format": "ssh-map"')
-_LOGS = {
-    b"\x1f\x8b": "gzipped data",
-    b"#ROSBAG V": "a bag of ROS 1",
-    b"SQLite format 3\0": "a bag of ROS 2",
-    b"\x89MCAP0": "MCAP",
-    b"# message formats defined": "a log of CARMEN",
-}
+_LOG = re.compile(rb"\x1f\x8b|#ROSBAG V|SQLite format 3\0|\x89MCAP0|# message formats defined")
 _STEP_FIELDS = tuple(f.name for f in fields(Step) if f.name not in ("extra", "gateways"))
 _HEADER_FIELDS = ("format", "version", "name", "images", "odometry", "drive", "closures")
 
@@ -571,12 +566,9 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
 
 def _refuse_other_files(raw: bytes, where: str) -> None:
     """Raise TraceError if the first line is that of a robot's log or of a file of maps."""
-    log = next((kind for magic, kind in _LOGS.items() if raw.startswith(magic)), None)
-    if log is None and LINE_OF_A_LOG.match(raw):
-        log = "lines of CARMEN or g2o"
-    if log:
+    if _LOG.match(raw) or LINE_OF_A_LOG.match(raw):
         raise TraceError(
-            f"{where}: header: expected a trace, got {log}, as robots' logs are; "
+            f"{where}: header: expected a trace, got a robot's log; "
             f"make a trace of it with ssh-abduction import LOG -o trace.jsonl"
         )
     if raw.startswith(_MAPS):

@@ -126,7 +126,8 @@ def drawable_poses(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
             if s.place is None or s.place != here.place:
                 return None
     poses = _on_each_other(ssh_map, poses)
-    moves = _moves_of(parts, [(pose.x, pose.y) for pose in poses], beside=not ssh_map.floors)
+    spots = {i: (pose.x, pose.y) for i, pose in enumerate(poses)}
+    moves = _moves_of(parts, spots, beside=not ssh_map.floors)
     return tuple(
         replace(pose, x=pose.x + moves[s.id][0], y=pose.y + moves[s.id][1])
         for s, pose in zip(ssh_map.dstates, poses, strict=True)
@@ -192,14 +193,14 @@ def _turned(pose: Pose, turn: complex, at: complex) -> Pose:
 
 
 def _moves_of(
-    parts: Sequence[Sequence[int]], at: Sequence[Point], least: float = 0.0, *, beside: bool = True
-) -> list[Point]:
-    """Find how far to move each dstate, so that each floor or piece is below the one before.
+    parts: Sequence[Sequence[int]], at: Mapping[int, Point], least: float = 0.0, beside: bool = True
+) -> dict[int, Point]:
+    """Find how far to move the members of each part, so that each is below the part before.
 
     If `beside`, all begin at one x. Otherwise each is a little right of the one before, so that
     lifts do not cover the ways of floors.
     """
-    moves = [(0.0, 0.0)] * len(at)
+    moves: dict[int, Point] = {}
     corners = [[*zip(*(at[s] for s in part), strict=True)] for part in parts]
     boxes = [(min(xs), min(ys), max(xs), max(ys)) for xs, ys in corners]
     extent = max((max(x1 - x0, y1 - y0) for x0, y0, x1, y1 in boxes), default=0.0)
@@ -209,22 +210,24 @@ def _moves_of(
         aside = boxes[0][0] - x0 if beside else i * gap
         move = (0.0, 0.0) if below is None else (aside, below - gap - y1)
         below = y0 + move[1]
-        for s in part:
-            moves[s] = move
+        moves |= dict.fromkeys(part, move)
     return moves
 
 
 def _floor_by_floor(ssh_map: SSHMap, found: Layout) -> Layout:
     """Move the floors of a drawing, so that each is below the one before."""
-    moves = _moves_of(ssh_map.floors, [(x, y) for x, y, _ in found.dstates], GAP)
+    if not ssh_map.floors:
+        return found
+    spots = {i: (x, y) for i, (x, y, _) in enumerate(found.dstates)}
+    moves = _moves_of(ssh_map.floors, spots, GAP)
     of_place = {s.place: moves[s.id] for s in ssh_map.dstates}
     places = {
         p: (x + of_place[p][0], y + of_place[p][1]) if p in of_place else (x, y)
         for p, (x, y) in found.places.items()
     }
     dstates = tuple(
-        (x + dx, y + dy, heading)
-        for (x, y, heading), (dx, dy) in zip(found.dstates, moves, strict=True)
+        (x + moves[i][0], y + moves[i][1], heading)
+        for i, (x, y, heading) in enumerate(found.dstates)
     )
     return replace(found, places=places, dstates=dstates)
 
@@ -400,21 +403,15 @@ class StraightDrawing:
         return kept
 
     def _packed(self, at: Mapping[int, Point]) -> dict[int, Point]:
-        """Move parts that no street connects side by side. The first spot is at (0, 0)."""
+        """Move parts that no street connects below each other. The first spot is at (0, 0)."""
         graph: nx.Graph[Any] = nx.Graph()
         graph.add_nodes_from(self.spots)
         graph.add_edges_from(pair for path in self.map.paths for pair in pairwise(path.order))
         if not self.map.paths:
             graph.add_edges_from((self.spot[s], self.spot[x]) for s, x in self._walks())
-        packed: dict[int, Point] = {}
-        right = 0.0
-        for part in nx.connected_components(graph):
-            members = [p for p in self.spots if p in part]
-            (x0, y0), left = at[members[0]], min(at[p][0] for p in members)
-            shift = right - left if packed else -x0
-            packed |= {p: (at[p][0] + shift, at[p][1] - y0) for p in members}
-            right = max(packed[p][0] for p in members) + GAP
-        return packed
+        parts = [[p for p in self.spots if p in part] for part in nx.connected_components(graph)]
+        moves, (x0, y0) = _moves_of(parts, at, GAP), at[self.spots[0]]
+        return {p: (x + moves[p][0] - x0, y + moves[p][1] - y0) for p, (x, y) in at.items()}
 
 
 class _Turn(NamedTuple):

@@ -182,22 +182,16 @@ class LogMap:
         found["report.html"] = report(self.log, self.imported, solution, self.rungs, self.to_dict())
         files = {name: text.encode() for name, text in found.items()}
         if solution.maps:
-            files["recogniser.skops"] = written(self.recogniser())
+            files["recogniser.skops"] = written(recogniser_of(trace, solution.maps[0]))
         run = f"{json.dumps(self.to_dict(), indent=2, ensure_ascii=False)}\n"
         return {**files, "run.json": run.encode()}
-
-    def recogniser(self) -> Any:
-        """Train a recogniser on the images of the trace, labelled with the dstates of the best map.
-
-        This is the last step of the bootstrap loop (Kuipers & Beeson 2002).
-        """
-        return recogniser_of(self.imported.trace, self.solution.maps[0])
 
 
 def recogniser_of(trace: Trace, ssh_map: SSHMap) -> Any:
     """Train a recogniser on the images of the trace of a log, labelled with the dstates of a map.
 
-    It recognises dstates in the images of another drive. Raises PerceptionError if a step has no
+    It recognises dstates in the images of another drive. This is the last step of the bootstrap
+    loop (Kuipers & Beeson 2002). Raises PerceptionError if a step has no
     image.
     """
     return new_recogniser(FLOOR).fit(images_of(trace), ssh_map.dstate_at)
