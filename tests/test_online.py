@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from instances import maze
-from strategies import FOREIGN, PAIRS, theories, traces
+from strategies import theories, traces
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
@@ -22,9 +22,8 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, Odometry, Step, TheoryError, TraceError
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Status
-from ssh_abduction.solver.sources.symbolic.sketch import Sketch
 from ssh_abduction.theory.settle import settle
-from ssh_abduction.theory.speedups import Speedups, row
+from ssh_abduction.theory.speedups import Speedups
 
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins
 
@@ -169,81 +168,6 @@ def test_repr_of_a_mapper_shows_its_progress() -> None:
     mapper = OnlineMapper("a", time_limit=None)
     mapper.observe("travel", "b")
     assert repr(mapper) == "<OnlineMapper: 2 steps, optimal, 2 dstates>"
-
-
-def drawn(data: st.DataObject, most: int) -> tuple[Trace, Theory]:
-    """Draw a trace of at most this many steps, and a theory. Sketches ignore displacements."""
-    trace = data.draw(traces(max_steps=most), label="trace").without_displacements()
-    fixed = (*FOREIGN, *PAIRS, "planar")
-    return trace, settle(trace, data.draw(theories(trace, fixed=fixed), label="theory")).theory
-
-
-@settings(max_examples=12)
-@given(st.data())
-def test_online_sketches_are_consistent(data: st.DataObject) -> None:
-    trace, theory = drawn(data, 14)
-    assume(row("certain sketches").holds_for(theory))  # others are checked
-    sketch = data.draw(st.sampled_from(Sketch.all_of(trace.steps[0], theory)), label="sketch")
-    for i, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True)):
-        assert check(trace.prefix(i + 1), sketch.map(), theory) == ()
-        if not sketch.extend(action, step):
-            return
-    assert check(trace, sketch.map(), theory) == ()
-
-
-def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
-    """Continue a minimal map of the first steps as a sketch, and check it after each step.
-
-    If the sketch is certain, it must be consistent. Returns for each step whether it was uncertain.
-    """
-    maps = solve(trace.prefix(known), theory, max_maps=5).maps
-    if not maps:
-        return []
-    sketch = Sketch.beyond(maps[which % len(maps)], trace.prefix(known), theory)
-    assert sketch.map() == maps[which % len(maps)]
-    doubts = []
-    for i in range(known, len(trace)):
-        before = trace.actions[i - 1]
-        if not sketch.extend(before, trace.steps[i]):
-            break
-        consistent = check(trace.prefix(i + 1), sketch.map(), theory) == ()
-        assert consistent or not sketch.certain
-        doubts.append(not sketch.certain)
-        if not consistent:
-            break
-        sketch.certain = True
-    return doubts
-
-
-@settings(max_examples=8)
-@given(st.data())
-def test_map_continued_by_a_sketch_is_consistent(data: st.DataObject) -> None:
-    trace, theory = drawn(data, 10)
-    draft(
-        trace,
-        theory,
-        data.draw(st.integers(1, len(trace)), label="known"),
-        data.draw(st.integers(0, 4), label="which"),
-    )
-
-
-def test_draft_with_turns_that_lead_back_may_break_an_axiom() -> None:
-    """Two turns to the right lead back, so a new place ahead would be on both sides of a path."""
-    trace = Trace.from_steps("aaaa", ["right", "right", "travel"])
-    theory = settle(trace, Theory(star="none", path_order="partial", all_on_paths=True)).theory
-    assert draft(trace, theory, 3, 0) == [True]
-
-
-@pytest.mark.parametrize("stars", [False, True])
-def test_draft_follows_a_robot_through_a_maze(stars: bool) -> None:
-    doubts: list[bool] = []
-    for seed in range(2):
-        trace = maze(3, 3, steps=60, seed=seed, loops=0.5, stars=True).trace
-        trace = (
-            trace if stars else Trace.from_steps([step.view or "" for step in trace], trace.actions)
-        )
-        doubts += draft(trace, settle(trace).theory, 12 + 4 * seed if stars else 6 + seed, seed)
-    assert {*doubts} == {True, False}
 
 
 @pytest.mark.parametrize("steps", [3, 4])

@@ -15,10 +15,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ssh_abduction.checker.checker import check, unchecked
+from ssh_abduction.checker.checker import unchecked
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import DState, Fault, SSHMap
-from ssh_abduction.data.trace import Action, Step, Trace
+from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver import (
     Cost,
     Effort,
@@ -142,7 +142,8 @@ class MapKeeper(Keeper):
         self._cost: Cost | None = None  # the counts of a minimal map; None if they are unknown
         # Whether the claim in `mapper.py` holds for the theory, so that maps are replayed.
         self._replays = row("prefixes").holds_for(problem.theory)
-        self._drafts = Drafts(problem, self._judging)  # maps that were made without a search
+        # Drafts (see the head of this module), the best first. They need not be consistent.
+        self._drafts: list[Sketch] = []
         # The last search, which the next one continues; None before the first.
         self.search: Search | None = None
         self._found: Solution | None = None  # the solution of this search, without its maps
@@ -155,8 +156,9 @@ class MapKeeper(Keeper):
         """
         keeper = MapKeeper(problem, self._options, before=self)
         if self._problem.theory.displacement == "use":
-            for ssh_map in [m.explained() for m in self._maps[:DRAFTS]] + self._drafts.maps():
-                keeper._drafts.add(ssh_map, problem.trace)
+            known = [m.explained() for m in self._maps[:DRAFTS]]
+            for ssh_map in (*known, *(draft.map() for draft in self._drafts)):
+                keeper._add_draft(ssh_map)
         return keeper
 
     def _follow(self) -> bool:
@@ -174,13 +176,13 @@ class MapKeeper(Keeper):
         longer = (m.predicting(action.name, seen) for m in self._maps if self._replays)
         self._maps = [m for m in longer if m and m.is_allowed(trace, pairs, self._judging)]
         self._complete = self._complete and not untried
-        self._drafts.follow(action, trace.steps[-1])
+        self._drafts = [draft for draft in self._drafts if draft.extend(action, trace.steps[-1])]
         if self._maps:
             return False
         self._status, self._complete = Status.UNKNOWN, False
         for rival in untried[:DRAFTS]:
-            self._drafts.add(rival.explained(), trace)
-        return was_proven or not self._drafts.maps()
+            self._add_draft(rival.explained())
+        return was_proven or not self._drafts
 
     @property
     def _is_proven(self) -> bool:
@@ -223,9 +225,9 @@ class MapKeeper(Keeper):
             if len(found) >= len(self._maps) or not self._is_proven:
                 self._maps = [ExtendedMap.of(m, trace, theory) for m in found]
             self._status, self._complete, self._cost = said.status, said.complete, said.cost
-            self._drafts.clear()
+            self._drafts = []
         elif found:
-            self._drafts.add(found[0], trace)
+            self._add_draft(found[0])
         return search.stopped
 
     def _solution(self, began: float) -> Solution:
@@ -234,7 +236,7 @@ class MapKeeper(Keeper):
         problem, steps = self._problem, len(self._problem.trace)
         status, cost = self._status, self._cost
         maps = tuple(m.explained() for m in self._maps)
-        if status is Status.UNKNOWN and (best := self._drafts.best(problem.trace, problem.pairs)):
+        if status is Status.UNKNOWN and (best := self._best_draft()):
             maps, status, cost = (best,), Status.FEASIBLE, Cost.of(best)
         self._judge(maps, began)
         searched = asked.seconds if asked.steps == steps else Seconds(0.0, 0.0, 0.0)
@@ -256,84 +258,28 @@ class MapKeeper(Keeper):
             support=asked.support,
         )
 
-
-@dataclass(slots=True)
-class Draft:
-    """A sketch (a map made without a search), and how far the evidence has tested it."""
-
-    sketch: Sketch
-    passed: int = 0  # the number of first steps for which no evidence rejected it
-
-
-class Drafts:
-    """Keeps drafts: maps of the steps so far that were made without a search, the best first."""
-
-    def __init__(self, problem: Problem, judging: Judging) -> None:
-        theory, evidence = problem.theory, problem.evidence
-        self._theory, self._judging = theory, judging
-        self._has_evidence = bool(evidence)
-        # Evidence judges a sketch as it grows. The other axioms hold by construction, or the
-        # checker judges them.
-        self._other_axioms = theory.replace(
-            without=(*theory.without, *(kind.axiom for kind in evidence))
-        )
-        self._may_sketch = row("prefixes").holds_for(theory) and not unchecked(theory)
-        self._trusts_sketches = row("certain sketches").holds_for(self._other_axioms)
-        self._drafts: list[Draft] = []
-
-    def maps(self) -> list[SSHMap]:
-        """Return the maps of all drafts, the best first. These maps need not be consistent."""
-        return [draft.sketch.map() for draft in self._drafts]
-
-    def follow(self, action: Action, step: Step) -> None:
-        """Extend drafts by a step, and drop those that the step contradicts."""
-        self._drafts = [draft for draft in self._drafts if draft.sketch.extend(action, step)]
-
-    def add(self, ssh_map: SSHMap, trace: Trace) -> None:
+    def _add_draft(self, ssh_map: SSHMap) -> None:
         """Extend a map of the first steps to a draft of all steps, unless a step contradicts it."""
-        if not self._may_sketch:
+        trace, theory = self._problem.trace, self._problem.theory
+        if not self._replays or unchecked(theory):
             return
         known = len(ssh_map.dstate_at)
-        sketch = sketch_beyond(ssh_map, trace.prefix(known), self._theory)
+        sketch = sketch_beyond(ssh_map, trace.prefix(known), theory)
         later = zip(trace.actions[known - 1 :], trace.steps[known:], strict=True)
         if all(sketch.extend(action, step) for action, step in later):
-            self._drafts = sorted([*self._drafts, Draft(sketch)], key=self._cost)[:DRAFTS]
+            drafts = [*self._drafts, sketch]
+            drafts.sort(key=lambda draft: Cost.of(draft.map()).preferred_by(theory))
+            self._drafts = drafts[:DRAFTS]
 
-    def clear(self) -> None:
-        """Drop all drafts."""
-        self._drafts = []
-
-    def best(self, trace: Trace, pairs: Pairs) -> SSHMap | None:
-        """Return the map of the best consistent draft; None if there is none.
-
-        `pairs` is what the evidence says about pairs of these steps. Drafts that turn out
-        to be inconsistent are dropped.
-        """
+    def _best_draft(self) -> SSHMap | None:
+        """Return the map of the best consistent draft, and drop the inconsistent ones before it."""
+        judging = Judging(self._problem)
         while self._drafts:
-            if self._is_consistent(self._drafts[0], trace, pairs):
-                return self._drafts[0].sketch.map()
+            ssh_map = self._drafts[0].map()
+            if judging.accepts(ssh_map):
+                return ssh_map
             del self._drafts[0]
         return None
-
-    def _cost(self, draft: Draft) -> tuple[int, ...]:
-        """Return the counts that the theory minimises, for the map of a draft."""
-        return Cost.of(draft.sketch.map()).preferred_by(self._theory)
-
-    def _is_consistent(self, draft: Draft, trace: Trace, pairs: Pairs) -> bool:
-        """Whether the map of a draft satisfies the evidence and all other axioms."""
-        sketch, steps = draft.sketch, len(trace)
-        if self._has_evidence and draft.passed < steps:
-            ssh_map = sketch.map()
-            place_of = [s.place for s in ssh_map.dstates]
-            new = range(draft.passed, steps)
-            if not all(pairs.allow(t, sketch.labels, place_of) for t in new):
-                return False
-            if not self._judging.allows_grown(trace, ssh_map, draft.passed):
-                return False
-            draft.passed = steps
-        if not sketch.certain or not self._trusts_sketches:
-            sketch.certain = not check(trace, sketch.map(), self._other_axioms)
-        return sketch.certain
 
 
 @dataclass(frozen=True, slots=True)

@@ -338,14 +338,6 @@ TABLE = (
         "maps that break axioms.",
     ),
     Speedup(
-        "certain sketches",
-        "greedy",
-        "While a robot drives: a sketch is consistent by its construction, so it is not checked.",
-        _keeps_headings,
-        PLACES - {"course_needs_travel"},
-        lambda: SURVIVE_A_CUT - {"asserted same", *PAIRS_OF_STEPS},
-    ),
-    Speedup(
         "digest",
         "digest",
         "To add a drive to an existing map, give the solver each link of the map once, instead of "

@@ -126,8 +126,6 @@ class Sketch:
 
     Attributes:
         labels: The dstate of each step.
-        certain: Whether the map is known to be consistent. If not, the caller has to check the map.
-            If the map is consistent, the caller may then set `certain` to True.
     """
 
     def __init__(
@@ -147,7 +145,6 @@ class Sketch:
         self._slots: dict[tuple[int, int], tuple[int, int]] = {}
         self._excused: tuple[tuple[int, int], ...] = ()  # pairs of paths
         self._map: SSHMap | None = None
-        self._tree = self.certain = True
         self.labels.append(self._new_place(first))
         if theory.all_on_paths and theory.level == "topological":
             self._find_course(0)
@@ -167,7 +164,7 @@ class Sketch:
     def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory, homing: bool = True) -> Self:
         """Make a sketch that begins with a map of a trace, which has to satisfy all axioms."""
         sketch = cls(trace.steps[0], theory, homing)
-        sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.dstate_at)
+        sketch._map, sketch.labels = ssh_map, list(ssh_map.dstate_at)
         sketch._links = {(s, action): x for s, action, x in ssh_map.links}
         sketch._excused = ssh_map.excused
         sketch._orders = [list(path.order) for path in ssh_map.paths]
@@ -248,8 +245,6 @@ class Sketch:
             there = self._new(step, s.place, heading)
         if around:
             self._turned_around(here, there)
-        elif s.path is not None and self._states[there].path is not None:
-            self._doubt_if_grown_from_map()
         return there
 
     def _turned_to(self, here: int, heading: int, action: Action, step: Step) -> int | None:
@@ -269,7 +264,6 @@ class Sketch:
         self._states[there].reverse.append(here)
         for s in (self._states[here], self._states[there]):
             if s.path is not None:
-                self._doubt_if_grown_from_map()
                 for x in s.reverse:
                     self._set_course(x, s.path, -s.direction)
 
@@ -285,8 +279,6 @@ class Sketch:
             if self._theory.next_place:
                 raise Contradiction
         there = self._new_place(step)
-        if not self._framed:
-            self._doubt_if_grown_from_map()
         order.insert(position + (direction == 1), self._states[there].place)
         self._set_course(there, path, direction)
         return there
@@ -304,8 +296,6 @@ class Sketch:
             there = self._new(step, place, heading)
         elif not self._may_be_at(there, step):
             return None
-        else:
-            self._doubt_if_grown_from_map()
         self._set_course(there, path, direction)
         return there
 
@@ -318,8 +308,6 @@ class Sketch:
         s = self._states[here]
         if s.path is None:
             path, direction = self._course_through(here) or (len(self._orders), 1)
-            if path < len(self._orders) or not self._framed:
-                self._doubt_if_grown_from_map()
             if path == len(self._orders):
                 self._orders.append([s.place])
             self._set_course(here, path, direction)
@@ -330,13 +318,6 @@ class Sketch:
         """Return the known path and direction in the heading of a dstate; None without frames."""
         s = self._states[here]
         return self._slots.get((s.place, s.heading))
-
-    def _doubt_if_grown_from_map(self) -> None:
-        """Set `certain` to False if the sketch began with a map.
-
-        The last action may contradict that map. A sketch that is a tree stays certain.
-        """
-        self.certain = self._tree
 
     def _set_course(self, here: int, path: int, direction: int) -> None:
         """Give a dstate a course, and those that a turn around links with it the reverse one."""
