@@ -204,22 +204,15 @@ def _pixels(fields: MapFile, path: Path) -> tuple[NDArray[np.float64], NDArray[n
                 raise Image.DecompressionBombError(f"got {image.width:,} x {image.height:,}")
             return _shades(image, with_alpha=fields.mode == "trinary")
     except UnidentifiedImageError:
-        raise SimulatorError(
-            f"{where}: expected {kinds}, got {brief(data[:20])}; convert it"
-        ) from None
+        said = f"expected {kinds}, got {brief(data[:20])}; convert it"
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        raise SimulatorError(
-            f"{where}: expected at most {MOST_PIXELS:,} pixels: {error}; scale it down"
-        ) from None
+        said = f"expected at most {MOST_PIXELS:,} pixels: {error}; scale it down"
     except OSError as error:
-        raise SimulatorError(
-            f"{where}: expected {kinds}: {error.strerror or error}; check the path and the file"
-        ) from None
+        said = f"expected {kinds}: {error.strerror or error}; check the path and the file"
     # Damaged images and impossible paths raise these.
     except (ValueError, SyntaxError, IndexError, OverflowError) as error:
-        raise SimulatorError(
-            f"{where}: expected {kinds}: {error}; the file is damaged, or is no image"
-        ) from None
+        said = f"expected {kinds}: {error}; the file is damaged, or is no image"
+    raise SimulatorError(f"{where}: {said}")
 
 
 def _shades(
@@ -248,17 +241,15 @@ def _edges(
     The bottom row of the mask, (rows, columns), comes first. The other arguments are as in
     `MapFile`.
     """
-    found: list[tuple[float, float, float, float]] = []
+    found = []
     # Find borders between rows, then between columns by transposing.
-    for flipped in (False, True):
-        cells = occupied.T if flipped else occupied
+    for cells, columns in ((occupied, [0, 1, 2, 3]), (occupied.T, [1, 0, 3, 2])):
         padded = np.pad(cells, ((1, 1), (0, 0)))
-        border = padded[1:] != padded[:-1]
-        for row in range(border.shape[0]):
-            steps = np.flatnonzero(np.diff(np.concatenate([[0], border[row].astype(int), [0]])))
-            for first, last in zip(steps[::2], steps[1::2], strict=True):
-                found.append((row, first, row, last) if flipped else (first, row, last, row))
+        border = np.pad(padded[1:] != padded[:-1], ((0, 0), (1, 1))).astype(np.int8)
+        steps = np.diff(border, axis=1)
+        (rows, first), (_, last) = np.nonzero(steps == 1), np.nonzero(steps == -1)
+        found.append(np.column_stack([first, rows, last, rows])[:, columns])
     x, y, yaw = origin
-    ends = np.array(found, dtype=float).reshape(-1, 2) * resolution
+    ends = np.vstack(found).reshape(-1, 2) * resolution
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     return np.asarray((ends @ turn if yaw else ends) + (x, y)).reshape(-1, 4)

@@ -271,13 +271,7 @@ def record_plan(
         f"{plan.name}, {counted(tours, 'tours')}, seed {seed}", LASER, odometer or Odometer(), seed
     )
     come += come[-1:] * (len(drive) - len(come))
-    return _judged(drive, rooms, tour, tours, come)
-
-
-def _judged(
-    drive: RecordedDrive, rooms: Rooms, tour: Round, tours: int, come: Sequence[int]
-) -> RecordedDrive:
-    """Add the truth to a drive. `come` has the point of the round at each scan."""
+    # The truth about each scan, each passage and each door.
     size = len(tour.way)
     return drive.judged(
         {_name(room): middle for room, middle in rooms.middles.items()},

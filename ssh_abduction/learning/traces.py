@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
+from sklearn.neighbors import NearestCentroid
 
 from perception.appearance import features_of
 from perception.errors import PerceptionError
@@ -183,13 +183,12 @@ def _alike(
 
     The views are compared by their mean image in `images`.
     """
-    shared = np.array(sorted({*views} & {*other_views}, key=str), dtype=object)
+    shared = list({*views} & {*other_views})
     if len(shared) < 2:
         return np.zeros(0, dtype=bool)
-    means = np.array([images[views == view].mean(axis=0) for view in shared])
-    compared = np.isin(other_views, shared)
-    nearest = cdist(others[compared], means).argmin(axis=1)
-    return np.asarray(shared[nearest] == other_views[compared], dtype=bool)
+    own, compared = np.isin(views, shared), np.isin(other_views, shared)
+    means = NearestCentroid().fit(images[own], views[own].astype(str))
+    return np.asarray(means.predict(others[compared]) == other_views[compared].astype(str))
 
 
 def _without_images(trace: Trace) -> Trace:
