@@ -157,19 +157,17 @@ class Traces:
         `images` has the vector of each image, (n, d). A step without a view (noise, -1) gets the
         view whose centre is nearest to its image. `second` has the runner-up's views, if any.
         """
-        of_steps = np.ones(len(images)) if sure is None else sure.round(4)
-        parts = zip(
-            self.each, self.parts(nearest_views(images, views)), self.parts(of_steps), strict=True
-        )
-        seen = [
-            trace.with_views(part.tolist(), None if sure is None else c.tolist())
-            for trace, part, c in parts
-        ]
-        others = (
-            [None] * len(seen) if second is None else [part.tolist() for part in self.parts(second)]
-        )
+
+        def listed(of_all: NDArray[Any] | None) -> list[Any]:
+            nothing = [None] * len(self.each)
+            return nothing if of_all is None else [part.tolist() for part in self.parts(of_all)]
+
+        columns = (nearest_views(images, views), None if sure is None else sure.round(4), second)
+        parts = zip(self.each, *map(listed, columns), strict=True)
         return Traces(
-            tuple(with_runner_up(t, other) for t, other in zip(seen, others, strict=True))
+            tuple(
+                with_runner_up(trace.with_views(seen, c), other) for trace, seen, c, other in parts
+            )
         )
 
 
