@@ -33,7 +33,8 @@ from worlds import rectangle
 import ssh_abduction
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.checker.claims import check_bound
-from ssh_abduction.cli import guard, main
+from ssh_abduction.cli import main
+from ssh_abduction.cli import outcome as ending
 from ssh_abduction.explain import explain, explain_pair, explain_trace
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
 from ssh_abduction.solver import Search, Status, check_rules, find_backbone
@@ -58,8 +59,8 @@ POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals")
 # Wait in clingo, which cannot be stopped, under a guard.
 DEAF = """
 import sys, clingo
-from ssh_abduction.cli import guard as patience
-from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli import outcome as patience
+from ssh_abduction.cli.outcome import Guard
 from ssh_abduction.cli.outcome import on_ctrl_c
 patience.DEAF, patience.LATE = 0.2, (1.1, 0.1)
 limit, memory = (float(word) or None for word in sys.argv[1:])
@@ -311,8 +312,8 @@ def test_guard_lets_a_starving_search_find_its_first_map(
     known: tuple[object, ...] | None, used: float, is_late: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The clock shows one second. The process had the processor for `used` seconds of it."""
-    monkeypatch.setattr(guard, "LATE", (1.0, 0.0))
-    guarding = guard.Guard(lambda: None, limit=1.0, known=lambda: known)
+    monkeypatch.setattr(ending, "LATE", (1.0, 0.0))
+    guarding = ending.Guard(lambda: None, limit=1.0, known=lambda: known)
     guarding._began -= 1.1
     monkeypatch.setattr(guarding, "_used", lambda: used)
     assert (guarding._why() == "time limit") == is_late
@@ -519,9 +520,9 @@ def test_all_clingo_programs_keep_ctrl_c() -> None:
 def test_solve_ended_late_writes_the_best_map(room: str, tmp_path: Path) -> None:
     program = """
 import sys, time
-from ssh_abduction.cli import guard, main
+from ssh_abduction.cli import main, outcome
 from ssh_abduction.solver import Search
-guard.LATE = (1.0, 0.0)
+outcome.LATE = (1.0, 0.0)
 Search.__iter__ = lambda search: iter(lambda: time.sleep(100), 0)
 main(sys.argv[1:])
 """
@@ -550,8 +551,8 @@ def test_late_second_opinion_does_not_cost_the_other_warnings(tmp_path: Path) ->
     """The guard ends a process whose second opinion ignores the time limit."""
     script = """
 import sys, time
-from ssh_abduction.cli import guard, main, outcome
-guard.LATE = (1.0, 0.2)
+from ssh_abduction.cli import main, outcome
+outcome.LATE = (1.0, 0.2)
 outcome.second_map = lambda *_: time.sleep(60)
 main(sys.argv[1:])
 """

@@ -105,8 +105,8 @@ def test_current_folder_moves_to_the_end_of_the_module_path(
 DEAF = """
 import sys, clingo
 from ssh_abduction import __main__
-from ssh_abduction.cli import guard, parser
-guard.DEAF = 0.2
+from ssh_abduction.cli import outcome, parser
+outcome.DEAF = 0.2
 def run(options):
     print("ready", flush=True)
     control = clingo.Control()

@@ -21,7 +21,7 @@ from in_processes import sleep, until
 
 from perception.readers.writers import write_carmen
 from ssh_abduction import Trace, solve
-from ssh_abduction.cli import guard, main
+from ssh_abduction.cli import main, outcome
 from ssh_abduction.cli.import_log import until_ctrl_c
 from ssh_abduction.cli.jobs import FileAnswer
 from ssh_abduction.cli.mapping import MapQuestion
@@ -39,8 +39,8 @@ SOON = 60  # seconds, enough on a slow and busy machine
 PROGRAM = """
 import sys, time
 from ssh_abduction import __main__
-from ssh_abduction.cli import guard, jobs, judge, outcome, solve
-guard.DEAF = 0.2
+from ssh_abduction.cli import jobs, judge, outcome, solve
+outcome.DEAF = 0.2
 exec(sys.argv.pop(1))
 __main__.run()
 """
@@ -92,7 +92,7 @@ def test_ctrl_c_after_the_answer_does_not_repeat_it(change: str, room: str) -> N
 def test_ctrl_c_ends_a_program_that_writes_into_an_unread_pipe(room: str, tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    with started("guard.SAVING = 0.2", "solve", room, "-o", str(pipe)) as process:
+    with started("outcome.SAVING = 0.2", "solve", room, "-o", str(pipe)) as process:
         assert process.stdout
         assert process.stdout.readline().startswith(b"optimal")
         process.send_signal(signal.SIGTERM)
@@ -187,7 +187,7 @@ def test_second_ctrl_c_soon_after_the_first_waits_for_answers(
 def test_code_without_last_words_has_more_time_on_a_busy_machine(
     last_words: Any, used: float, waited: float, is_deaf: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    guarding = guard.Guard(lambda: None, last_words, given_up=lambda: True)
+    guarding = outcome.Guard(lambda: None, last_words, given_up=lambda: True)
     passed = SimpleNamespace(used=0.0, waited=0.0)
     monkeypatch.setattr(time, "process_time", lambda: passed.used)
     monkeypatch.setattr(limits, "now", lambda: passed.waited)

@@ -13,7 +13,6 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -146,9 +145,8 @@ def test_progress_lines_come_at_intervals(
 ) -> None:
     assert lines(capsys, "solve", tee)[1] == []
     seconds = itertools.count()
-    monkeypatch.setattr(
-        outcome, "time", Mock(monotonic=lambda: next(seconds))
-    )  # a second passes at each look
+    # A second passes at each look.
+    monkeypatch.setattr(outcome._NowAndThen, "clock", lambda _: next(seconds))
     monkeypatch.setattr(outcome, "EVERY", 4.0)
     some = lines(capsys, "solve", tee)[1]
     assert some

@@ -37,8 +37,7 @@ from ssh_abduction.cli import (
     solve,
     use,
 )
-from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.outcome import EXIT_ERROR, add_verbosity, telling, unwritten, warn
+from ssh_abduction.cli.outcome import EXIT_ERROR, Guard, add_verbosity, telling, unwritten, warn
 from ssh_abduction.cli.parsing import Parser, Verb
 from ssh_abduction.cli.shared import check_inputs_are_kept
 from ssh_abduction.data.errors import AbductionError, printable

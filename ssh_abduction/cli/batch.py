@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 from ssh_abduction.cli import jobs, outcome
-from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli.outcome import Guard
 from ssh_abduction.cli.shared import check_jobs, theory_of
 from ssh_abduction.cli.text import headline
 from ssh_abduction.data.errors import AbductionError, named

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli import shared
-from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.outcome import on_ctrl_c, warn
+from ssh_abduction.cli.outcome import Guard, on_ctrl_c, warn
 from ssh_abduction.cli.parsing import maps_path, verb
 from ssh_abduction.cli.text import compared, counted, depending, table
 from ssh_abduction.data.errors import MapError, brief, named, printable, said_of

@@ -20,8 +20,7 @@ from ssh_abduction.checker.checker import Violation, check, unchecked
 from ssh_abduction.checker.claims import ProvenBound, check_bound, false_claims
 from ssh_abduction.cli import shared
 from ssh_abduction.cli.correct import as_corrected
-from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.outcome import on_ctrl_c, warn
+from ssh_abduction.cli.outcome import Guard, on_ctrl_c, warn
 from ssh_abduction.cli.parsing import maps_path, trace_path, verb
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.drives import fingerprints_of, step_named

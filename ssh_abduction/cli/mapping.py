@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ssh_abduction.cli import import_log, jobs, shared
 from ssh_abduction.cli.correct import say_obeyed
-from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.outcome import EXIT_ERROR, StopFlag, exit_code, on_ctrl_c, warn
+from ssh_abduction.cli.outcome import EXIT_ERROR, Guard, StopFlag, exit_code, on_ctrl_c, warn
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.corrections import (

@@ -25,7 +25,7 @@ from ssh_abduction.cli.correct import (
     keep_corrections,
     say_obeyed,
 )
-from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli.outcome import Guard
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import answer_lines, front_as_text
 from ssh_abduction.data.drives import together
