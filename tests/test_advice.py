@@ -44,7 +44,7 @@ SAID_BY = {
     "ssh_abduction/evaluation/paper_report.py": ("reproduce",),
     "ssh_abduction/evaluation": ("evaluate",),
     "ssh_abduction/explain/no_map.py": WITH_THEORY,
-    "ssh_abduction/solver/front.py": ("solve",),
+    "ssh_abduction/solver/entry.py": ("solve",),
     "ssh_abduction/robot_logs/log_maps.py": ("map",),
     "ssh_abduction/robot_logs/log_report.py": ("map",),
     "ssh_abduction/explain/pair_reasons.py": ("explain",),

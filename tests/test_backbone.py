@@ -171,7 +171,7 @@ def test_each_engine_can_prove_the_backbone_from_one_map(frame_after: float, eng
         every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
         search = Search(trace, theory, max_maps=1, _start=Start(reasons=True))
         reasoned = search.solution(tuple(search))
-    assert type(search._parts.prefixes.engine) is engine
+    assert type(search.parts.prefixes.engine) is engine
     assert every.count == 32
     assert find_backbone(first) == reasoned.backbone == every.backbone
     assert every.backbone is not None
@@ -190,7 +190,7 @@ def test_backbone_of_a_maze_with_stars_comes_from_its_labels() -> None:
     )
     first = search.solution(tuple(search))
     assert every.count == 7
-    assert type(search._parts.prefixes.engine) is LabelsFirst
+    assert type(search.parts.prefixes.engine) is LabelsFirst
     assert find_backbone(first) == first.backbone == every.backbone
     assert find_backbone(solve(trace, max_maps=1)) == every.backbone
     assert "7 minimal maps: the dstates of steps 80, 83–84, 97 and 99–100 differ" in every.summary

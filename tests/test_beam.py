@@ -79,7 +79,7 @@ def test_interrupted_beam_gives_a_map_with_new_dstates_for_the_rest(looks: int) 
     """The steps that the beam reached are joined, and all others are new."""
     (known,) = truth.mazes(5, 120, [700], DRIFTING)
     search = Search(known.trace, Theory(star="none"))
-    candidates, left = search._parts.candidates, iter(range(looks))
+    candidates, left = search.parts.candidates, iter(range(looks))
     candidates.sketch(0.0)
     trivial = search.best
     beam = candidates.beam(1)

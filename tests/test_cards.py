@@ -94,7 +94,7 @@ def test_every_kind_of_answer_has_a_card(
 
 def test_card_of_an_unknown_answer_shows_the_map_of_a_prefix() -> None:
     search = Search(ACES)
-    search._parts.known.partial = solve(ACES[:10])[0]
+    search.parts.known.partial = solve(ACES[:10])[0]
     text = shown(search.solution())[1]
     assert text.startswith("unknown: no map of 23 steps yet")
     assert "the best map of the first 10 steps:" in text

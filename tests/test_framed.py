@@ -130,7 +130,7 @@ def test_framed_maps_equal_those_of_the_plain_encoding(
         search = Search(trace, theory, max_maps=None, speedups=Speedups.without(off))
         maps = tuple(search)
     found = search.solution(maps)
-    assert isinstance(search._parts.prefixes.engine, LabelsFirst)
+    assert isinstance(search.parts.prefixes.engine, LabelsFirst)
     assert found.status is expected.status
     assert set(maps) == set(expected.maps)
     assert len(set(maps)) == len(maps)
@@ -160,7 +160,7 @@ def test_framed_maps_join_places_that_a_person_joins(
     with patch.object(choosing, "FEW_STEPS", 0):
         search = Search(trace, theory, max_maps=None)
         assert set(search) == set(expected.maps)
-    assert isinstance(search._parts.prefixes.engine, LabelsFirst)
+    assert isinstance(search.parts.prefixes.engine, LabelsFirst)
 
 
 @settings(max_examples=5)
@@ -218,7 +218,7 @@ def test_framed_mapper_maps_a_maze_step_by_step() -> None:
                 assert set(answer.maps) == set(expected.maps)
             assert isinstance(mapper._keeper, MapKeeper)
             search = mapper._keeper.search
-            engine = search and search._parts.prefixes.engine
+            engine = search and search.parts.prefixes.engine
             if isinstance(engine, LabelsFirst):
                 paths.add((engine._labels.program.batch, len(engine._labels.program._said)))
     assert max(paths)[0] > 5
@@ -372,7 +372,7 @@ def test_refused_path_becomes_a_rule_for_clingo() -> None:
     """Otherwise the maps would be the same, but each answer without paths would be forbidden
     separately."""
     trace = maze(3, 3, steps=60, seed=0, stars=True).trace
-    asked = Search(trace, Theory(star="frame"))._parts.prefixes.engine
+    asked = Search(trace, Theory(star="frame")).parts.prefixes.engine
     assert isinstance(asked, LabelsFirst)
     asked.grow(len(trace))
     assert isinstance(asked._labels, VisitLabels)
@@ -401,7 +401,7 @@ def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
     contradicted = 0
     for seed in (0, 2):
         trace = maze(3, 3, steps=45, seed=seed, stars=True).trace
-        engine = Search(trace, theory)._parts.prefixes.engine
+        engine = Search(trace, theory).parts.prefixes.engine
         assert isinstance(engine, LabelsFirst)
         engine.grow(len(trace))
         assert isinstance(engine._labels, VisitLabels)
@@ -472,7 +472,7 @@ def test_framed_search_at_the_time_limit_gives_map_and_bound() -> None:
         patch.object(labels_first, "FIRST_PREFIXES", 300),
     ):
         search = Search(walk.trace, Theory.topological())
-        search._parts.prefixes.start = 201
+        search.parts.prefixes.start = 201
         solution = search.solution(tuple(search))
     assert solution.status is Status.FEASIBLE
     assert solution.cost
@@ -502,7 +502,7 @@ def test_framed_engine_continues_after_a_limit() -> None:
     fewest: set[int] = set()
     stopped = 0
     for stop in range(4, 25, 5):
-        engine = Search(trace, Theory.topological())._parts.prefixes.engine
+        engine = Search(trace, Theory.topological()).parts.prefixes.engine
         assert isinstance(engine, LabelsFirst)
         engine.grow(len(trace))
         checks = iter(range(1, 10**6))
@@ -531,7 +531,7 @@ def test_framed_engine_interrupted_in_preparation_is_prepared_again() -> None:
     would be taken for one of the whole trace."""
     walk = maze(3, 3, steps=120, seed=1, stars=True)
     search = Search(walk.trace, Theory.topological(), time_limit=100)
-    engine = search._parts.prefixes.engine
+    engine = search.parts.prefixes.engine
     engine.grow(40)
     with (
         patch.object(Chart, "framed", side_effect=KeyboardInterrupt),
@@ -539,7 +539,7 @@ def test_framed_engine_interrupted_in_preparation_is_prepared_again() -> None:
     ):
         engine.grow(121)
     assert engine.size == 40
-    search._parts.prefixes.start = 121
+    search.parts.prefixes.start = 121
     maps = tuple(search)
     assert search.status is Status.OPTIMAL
     for ssh_map in maps:
@@ -553,8 +553,8 @@ def test_ctrl_c_discards_the_engine() -> None:
     with patch.object(Prefixes, "minimise", side_effect=KeyboardInterrupt):
         assert [check(search.trace, ssh_map, search.theory) for ssh_map in search] == [()]
     assert search.stopped == "interrupted"
-    later = Search(trace, Theory.topological(), max_maps=None, _start=Start(after=search._parts))
-    assert later._parts.prefixes.engine is not search._parts.prefixes.engine
+    later = Search(trace, Theory.topological(), max_maps=None, _start=Start(after=search.parts))
+    assert later.parts.prefixes.engine is not search.parts.prefixes.engine
     assert set(later) == set(solve(trace, max_maps=None).maps)
 
 
@@ -562,16 +562,16 @@ def test_error_discards_the_engine() -> None:
     trace = maze(3, 3, steps=80, seed=1, stars=True).trace
     first = Search(trace.prefix(60), Theory.topological())
     list(first)
-    second = Search(trace.prefix(70), Theory.topological(), _start=Start(after=first._parts))
-    assert second._parts.prefixes.engine is first._parts.prefixes.engine
+    second = Search(trace.prefix(70), Theory.topological(), _start=Start(after=first.parts))
+    assert second.parts.prefixes.engine is first.parts.prefixes.engine
     with (
         patch.object(VisitLabels, "_best_answer", side_effect=MemoryError),
         pytest.raises(MemoryError),
     ):
         list(second)
     assert (
-        Search(trace, Theory.topological(), _start=Start(after=first._parts))._parts.prefixes.engine
-        is not first._parts.prefixes.engine
+        Search(trace, Theory.topological(), _start=Start(after=first.parts)).parts.prefixes.engine
+        is not first.parts.prefixes.engine
     )
 
 
@@ -580,9 +580,9 @@ def test_search_with_a_known_cost_lists_maps_of_the_whole_trace() -> None:
     trace = maze(3, 3, steps=70, seed=44, stars=True).trace
     first = Search(trace, Theory.topological(), max_maps=1)
     known = next(iter(first))
-    first._parts.known.stopped = "interrupted"
+    first.parts.known.stopped = "interrupted"
     again = Search(
-        trace, Theory.topological(), max_maps=None, _start=Start(after=first._parts, minimal=known)
+        trace, Theory.topological(), max_maps=None, _start=Start(after=first.parts, minimal=known)
     )
     assert not again.prefix
     assert set(again) == set(solve(trace, max_maps=None).maps)

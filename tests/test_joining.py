@@ -351,7 +351,7 @@ def test_search_joins_drives_even_if_some_views_are_unknown(
 ) -> None:
     (known,) = of_mazes(4, steps, [315], NOISE, drives=drives)
     views = [None if hides and t % hides == 1 else v for t, v in enumerate(known.trace.views)]
-    candidates = Search(known.trace.with_views(views))._parts.candidates
+    candidates = Search(known.trace.with_views(views)).parts.candidates
     joining = candidates.joining()
     assert joining is not None
     *_, ssh_map = candidates.maps_of(joining)

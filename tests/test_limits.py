@@ -224,7 +224,7 @@ def test_snapshot_waits_for_the_running_sketch(
 
     monkeypatch.setattr(Candidates, "_attempts", slowly)
     search = Search(Trace.load(noisy))
-    other = threading.Thread(target=search._parts.candidates.sketch)
+    other = threading.Thread(target=search.parts.candidates.sketch)
     other.start()
     assert begun.wait(SOON)
     snapshot = search.snapshot("time limit")
@@ -426,8 +426,8 @@ def test_noise_is_reported_if_listing_is_stopped() -> None:
     list(search)
     assert search.status is Status.OPTIMAL
     # as if the limit ended the listing while clingo gets more steps
-    search._parts.prefixes.engine._labels.size = 0
-    search._parts.known.complete, search._parts.known.stopped = False, "time limit"
+    search.parts.prefixes.engine._labels.size = 0
+    search.parts.known.complete, search.parts.known.stopped = False, "time limit"
     noise = search.solution().noise
     assert noise
     assert noise.step == 40
@@ -464,10 +464,10 @@ def test_limit_during_ranking_leaves_the_list_complete() -> None:
     trace = Trace.from_steps("aba", ["travel"] * 2, displacements=[(5.0, 0.0, 0.0)] * 2)
     search = Search(trace, Theory(weigh="count"))
     for _ in search.unranked():
-        search._parts.watch.interrupted = True  # a limit ends the work with the last map
+        search.parts.watch.interrupted = True  # a limit ends the work with the last map
         assert search.over()
-        search._parts.watch.interrupted = False
-    search._parts.watch.interrupted = True
+        search.parts.watch.interrupted = False
+    search.parts.watch.interrupted = True
     assert search.over()
     assert (search.complete, search.stopped) == (True, None)
 

@@ -1,4 +1,4 @@
-"""Visits localised in a map of some of them (steps/localising.py)."""
+"""Visits localised in a map of some of them (steps/chart.py)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.sources.exact import visit_labels as same
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
-from ssh_abduction.solver.steps.chart import Chart, FramedChart
-from ssh_abduction.solver.steps.localising import Located, State, faced, located
+from ssh_abduction.solver.steps.chart import Chart, FramedChart, Located, State, faced, located
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.speedups import Speedups
 
@@ -92,7 +91,7 @@ def test_long_trace_is_solved_from_some_of_its_visits() -> None:
     search = Search(trace, max_maps=None)
     with patch.object(same, "FIRST_PAIRS", 500):
         maps = tuple(search)
-    engine = search._parts.prefixes.engine
+    engine = search.parts.prefixes.engine
     assert isinstance(engine, LabelsFirst)
     assert len(engine._labels.program.visits) < 0.8 * len(engine._labels.chart.stars)
     expected = solve(trace, max_maps=None, speedups=Speedups.without("lazy"))

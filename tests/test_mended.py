@@ -82,16 +82,16 @@ def test_steps_that_contradict_a_sketch_are_checked_for_a_clash() -> None:
     views = [*range(12), "around", "wrong", "later"]
     trace = Trace.from_steps(views, [*["travel"] * 11, "around", "around", "travel"])
     search = Search(trace)
-    search._parts.candidates.sketch()
-    assert list(search._parts.candidates.contradicting) == [13]
+    search.parts.candidates.sketch()
+    assert list(search.parts.candidates.contradicting) == [13]
 
     def maps_of(trace: Trace, theory: Theory) -> tuple[tuple[SSHMap, ...], bool]:
         solution = solve(trace, theory, max_maps=1)
         return solution.maps, solution.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
 
-    assert late_clash(search._parts, maps_of) is None  # the search was not stopped
-    search._parts.known.stopped = "time limit"
-    clash = late_clash(search._parts, maps_of)
+    assert late_clash(search.parts, maps_of) is None  # the search was not stopped
+    search.parts.known.stopped = "time limit"
+    clash = late_clash(search.parts, maps_of)
     assert clash == range(10, 14)
     assert search.status is Status.UNSATISFIABLE
     found = explain(trace, near=clash)
@@ -122,7 +122,7 @@ def test_unproven_maps_of_a_mended_trace_are_not_minimal() -> None:
         return (maps, True) if most == 1 else ((), False)
 
     for solver, is_listed in ((search._solve_mended, True), (too_late, False)):
-        mending = Mending(search._parts.task, solver)
+        mending = Mending(search.parts.task, solver)
         (*_, best) = mending.maps()
         assert mending.minimal_maps(0) == ((best.map,), is_listed)
 
@@ -132,7 +132,7 @@ def test_piece_that_ran_out_of_time_is_no_clash(status: Status) -> None:
     """The least cost may be proven before a map is found. Then the piece has a map."""
 
     def ended(search: Search) -> Iterator[SSHMap]:
-        search._parts.known.status = status
+        search.parts.known.status = status
         return iter(())
 
     trace = Trace.from_steps("abc", ["travel", "travel"])

@@ -27,7 +27,7 @@ from ssh_abduction.data.errors import SolverError, TraceError
 from ssh_abduction.solver import Status
 from ssh_abduction.solver import onto as added_drives
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.laying import Digest
+from ssh_abduction.solver.onto import Digest
 from ssh_abduction.solver.sources.exact import choosing
 from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory import Speedups

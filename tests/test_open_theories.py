@@ -313,7 +313,7 @@ def test_every_engine_forbids_maps_refused_by_evidence(name: str, data: st.DataO
     ):
         asked = Search(trace, theory, max_maps=None, speedups=Speedups())
         found = tuple(asked)
-    assert isinstance(asked._parts.prefixes.engine, kind) or name == "frameless"
+    assert isinstance(asked.parts.prefixes.engine, kind) or name == "frameless"
     assert asked.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
     assert {key(ssh_map) for ssh_map in found} == expected
 

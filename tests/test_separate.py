@@ -50,9 +50,9 @@ def test_separate_map_exists_if_any_map_does(theory: Theory) -> None:
 def test_turns_around_that_show_new_views_have_a_quick_map() -> None:
     """Steps 0 and 2 look alike, but a turn around leads from them to different views."""
     search = Search(Trace.from_steps("abac", ["around"] * 3), Theory(star="none"))
-    search._parts.candidates.sketch()
-    assert search._parts.known.best is not None
-    assert search._parts.known.best.dstate_at == (0, 1, 2, 3)
+    search.parts.candidates.sketch()
+    assert search.parts.known.best is not None
+    assert search.parts.known.best.dstate_at == (0, 1, 2, 3)
 
 
 def test_clash_of_a_whole_visit_is_found_after_the_limit(
@@ -107,5 +107,5 @@ def test_clash_of_turns_within_a_visit_uses_displacements() -> None:
 def test_steps_at_which_a_refused_map_breaks_axioms_come_from_one_check() -> None:
     search = Search(wrong_turn())
     with patch.object(candidates, "violations", side_effect=AssertionError):
-        search._parts.candidates.sketch()
-    assert search._parts.candidates.contradicting == {3: None}
+        search.parts.candidates.sketch()
+    assert search.parts.candidates.contradicting == {3: None}

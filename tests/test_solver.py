@@ -309,7 +309,7 @@ def test_time_limit_while_listing_keeps_the_proof() -> None:
     maps = []
     for ssh_map in search:
         maps.append(ssh_map)
-        search._parts.watch._spent += 500  # so that the time is over after two maps
+        search.parts.watch._spent += 500  # so that the time is over after two maps
     solution = search.solution(tuple(maps))
     assert (solution.status, solution.complete, solution.stopped) == (
         Status.OPTIMAL,
@@ -538,7 +538,7 @@ def test_growth_continues_after_a_limit_with_the_same_maps() -> None:
 def test_interrupt_releases_maps_that_were_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
     search = Search(drive(*TOURS["comb"]), theory, max_maps=None)
-    honest = search._parts.prefixes.engine.maps_of_cost
+    honest = search.parts.prefixes.engine.maps_of_cost
 
     def interrupted(cost: tuple[int, ...], enough: int) -> Iterator[object]:
         for number, found in enumerate(honest(cost, enough)):
@@ -546,7 +546,7 @@ def test_interrupt_releases_maps_that_were_held_back(monkeypatch: pytest.MonkeyP
                 raise LimitError("interrupted")
             yield found
 
-    monkeypatch.setattr(search._parts.prefixes.engine, "maps_of_cost", interrupted)
+    monkeypatch.setattr(search.parts.prefixes.engine, "maps_of_cost", interrupted)
     maps = tuple(search)
     solution = search.solution(maps)
     assert (solution.count, len(set(maps)), solution.complete, solution.stopped) == (
@@ -567,14 +567,14 @@ def test_interrupt_during_growth_returns_replayed_maps(
         trace = wandering(seed, rooms=4, length=14, views=2)
         every = set(solve(trace, Theory.causal(), max_maps=None).maps)
         search = Search(trace, Theory.causal(), max_maps=None)
-        grow = search._parts.prefixes.engine.grow
+        grow = search.parts.prefixes.engine.grow
 
         def stopped(size: int, search: Search = search, grow: Callable[[int], None] = grow) -> None:
             if search.status is Status.OPTIMAL:
                 raise LimitError("time limit")
             grow(size)
 
-        monkeypatch.setattr(search._parts.prefixes.engine, "grow", stopped)
+        monkeypatch.setattr(search.parts.prefixes.engine, "grow", stopped)
         maps = set(search)
         assert maps <= every
         assert search.stopped == "time limit"

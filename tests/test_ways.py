@@ -172,7 +172,7 @@ def test_maze_without_stars_has_the_known_maps(off: str) -> None:
     with stepwise(-1.0):
         search = Search(trace, max_maps=None, speedups=Speedups.without(off))
         found = search.solution(tuple(search))
-    assert isinstance(search._parts.prefixes.engine, LabelsFirst)
+    assert isinstance(search.parts.prefixes.engine, LabelsFirst)
     assert set(found.maps) == maps_of_a_maze()
     assert found.complete
     assert found.certificate
@@ -188,7 +188,7 @@ def test_aces3_route_without_stars_has_the_known_maps() -> None:
     with patch.object(choosing, "FEW_STEPS", 0), stepwise(-1.0):
         search = Search(trace, Theory(star="none"), max_maps=None)
         found = search.solution(tuple(search))
-    assert isinstance(search._parts.prefixes.engine, LabelsFirst)
+    assert isinstance(search.parts.prefixes.engine, LabelsFirst)
     assert found.cost
     assert found.cost.to_dict() == {"dstates": 19, "places": 9, "paths": 4}
     assert len(set(found.maps)) == found.count == 38
@@ -270,8 +270,8 @@ def test_later_search_continues_from_a_frameless_engine() -> None:
     with stepwise(-1.0):
         search = Search(first, max_maps=None)
         before = search.solution(tuple(search))
-        assert isinstance(search._parts.prefixes.engine, LabelsFirst)
-        after = Search(trace, max_maps=None, _start=Start(after=search._parts))
+        assert isinstance(search.parts.prefixes.engine, LabelsFirst)
+        after = Search(trace, max_maps=None, _start=Start(after=search.parts))
         found = after.solution(tuple(after))
     assert before.complete
     assert set(found.maps) == set(

@@ -408,7 +408,7 @@ def test_map_and_cost_agree_if_a_limit_ends_the_computation_of_a_cost(
     priced, unpriced = weighed_route.maps[0], solve(route.trace, Theory(weigh="count")).maps[0]
     assert search._weighing is not None
     search._weighing.add(priced)
-    search._parts.known.keep(Found.of(unpriced, search.theory), unpriced.labels)
+    search.parts.known.keep(Found.of(unpriced, search.theory), unpriced.labels)
     over = patch.object(Misfit, "nats_of", side_effect=LimitError("time limit"))
     with over, pytest.raises(LimitError):
         search._weighing.keep_best()

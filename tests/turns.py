@@ -10,7 +10,7 @@ from unittest.mock import patch
 from ssh_abduction.solver import Search, schedule
 from ssh_abduction.solver.costs.weighing import Weighing
 
-STEPWISE = schedule.turn("prefixes, second try").most
+STEPWISE = schedule.turn("prefixes").most
 
 
 def turn_with(name: str, **changes: Any) -> AbstractContextManager[Any]:
@@ -20,10 +20,8 @@ def turn_with(name: str, **changes: Any) -> AbstractContextManager[Any]:
 
 def stepwise(most: float) -> AbstractContextManager[Any]:
     """Let searches go step by step for at most this many units of work inside a `with` block."""
-    names = ("prefixes, first try", "prefixes, second try")
-    turns = {name: schedule.TURNS[name] for name in names}
-    changed = {name: replace(turn, most=min(most, turn.most)) for name, turn in turns.items()}
-    return patch.dict(schedule.TURNS, changed)
+    turn = schedule.turn("prefixes")
+    return turn_with("prefixes", most=min(most, turn.most))
 
 
 def guessed(search: Search) -> Weighing:

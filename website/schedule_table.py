@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from ssh_abduction.solver.schedule import COST, COUNT, LATE, TABLE, SourceTurn
+from ssh_abduction.solver.schedule import TABLE, SourceTurn
 
 PAGE = Path(__file__).parent.parent / "docs" / "reference" / "schedule.md"
 HEAD = (
@@ -23,7 +23,6 @@ HEAD = (
     "instead.\n"
 )
 COLUMNS = "| source | for which problems | share | why |"
-TITLES = {COUNT: "If maps are counted", COST: "If maps are weighed by cost", LATE: "In the end"}
 
 
 def share_of(turn: SourceTurn) -> str:
@@ -37,16 +36,14 @@ def share_of(turn: SourceTurn) -> str:
 def page() -> str:
     """Return the text of the page."""
     lines = [HEAD]
-    for when, title in TITLES.items():
+    for title, turns in TABLE.items():
         lines += [
             f"## {title}\n",
             "| source | for which problems | share | why |",
             "|---|---|---|---|",
         ]
         lines += [
-            f"| {turn.name} | {turn.problems} | {share_of(turn)} | {turn.why} |"
-            for turn in TABLE
-            if turn.when == when
+            f"| {turn.name} | {turn.problems} | {share_of(turn)} | {turn.why} |" for turn in turns
         ]
         lines.append("")
     return "\n".join(lines)

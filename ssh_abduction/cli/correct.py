@@ -145,8 +145,8 @@ class Obeying:
         left = math.inf if limit is None else limit - (spent or 0.0)
 
         def find(trace: Trace, theory: Theory, most: float) -> Solution:
-            limited: dict[str, Any] = {"work_limit" if counts else "time_limit": most}
-            return solve(trace, theory, max_maps=1, **limited)
+            within: dict[str, Any] = limits.of_part(most)
+            return solve(trace, theory, max_maps=1, **within)
 
         return with_correction_warnings(self.corrections, self.with_names(solution), left, find)
 

@@ -27,6 +27,7 @@ from ssh_abduction.solver import (
     Seconds,
     Sketch,
     Solution,
+    Start,
     Status,
     Stop,
     observation,
@@ -207,15 +208,16 @@ class MapKeeper(Keeper):
         ones. The best of them becomes a draft, which later steps extend.
         """
         trace, theory, options = self._problem.trace, self._problem.theory, self._options
-        search = Search.continuing(
-            self.search,
+        before = self.search.parts if self.search else None
+        minimal = self._maps[0].explained() if self._is_proven else None
+        search = Search(
             trace,
             theory,
             time_limit=options.time_limit,
             work_limit=options.work_limit,
             max_maps=options.max_maps,
             speedups=options.speedups,
-            minimal=self._maps[0].explained() if self._is_proven else None,
+            _start=Start(after=before, minimal=minimal),
         )
         # The maps are not ranked, as ranking takes longer than a step may.
         found = tuple(search.unranked())

@@ -140,7 +140,6 @@ class Listing:
     def _of(cls, solution: Solution, where: str = "maps") -> Listing:
         """Make a listing from a solution. `where` is its name in messages."""
         minimal = solution.levels[0].count if solution.levels else solution.count
-        recorded = solution.support.recorded  # its drives have fingerprints
         listing = cls(
             solution.maps,
             minimal if solution.status is Status.OPTIMAL else None,
@@ -150,7 +149,7 @@ class Listing:
             where,
             solution.weighed,
             solution.by_minimality,
-            recorded.drives if recorded else solution.drives,
+            solution.support.drives or solution.drives,  # those of a file have fingerprints
             solution.warnings,
             _has_one_view(solution.theory),
         )

@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.costs.misfit import Misfit as Misfit
     from ssh_abduction.solver.derived_regions import find_regions as find_regions
     from ssh_abduction.solver.derived_regions import with_regions as with_regions
+    from ssh_abduction.solver.entry import Front as Front
+    from ssh_abduction.solver.entry import Point as Point
+    from ssh_abduction.solver.entry import fault_front as fault_front
     from ssh_abduction.solver.entry import find_backbone as find_backbone
+    from ssh_abduction.solver.entry import obeyed as obeyed
     from ssh_abduction.solver.entry import solve as solve
-    from ssh_abduction.solver.front import Front as Front
-    from ssh_abduction.solver.front import Point as Point
-    from ssh_abduction.solver.front import fault_front as fault_front
+    from ssh_abduction.solver.entry import with_correction_warnings as with_correction_warnings
+    from ssh_abduction.solver.entry import with_names as with_names
     from ssh_abduction.solver.geometry.fit import fit as fit
     from ssh_abduction.solver.geometry.ranking import Ranking as Ranking
-    from ssh_abduction.solver.obeying import obeyed as obeyed
-    from ssh_abduction.solver.obeying import with_correction_warnings as with_correction_warnings
-    from ssh_abduction.solver.obeying import with_names as with_names
     from ssh_abduction.solver.parts import Limits as Limits
     from ssh_abduction.solver.parts import Start as Start
     from ssh_abduction.solver.search import Search as Search

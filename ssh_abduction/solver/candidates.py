@@ -10,7 +10,6 @@ import threading
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -33,7 +32,7 @@ from ssh_abduction.solver.sources.symbolic.sketched import (
 )
 from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
 from ssh_abduction.solver.values import Found
-from ssh_abduction.theory.speedups import Speedups, row
+from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
@@ -63,8 +62,7 @@ class Candidates:
     def __init__(
         self, task: Task, known: Known, judging: Judging, report: Callable[[], None]
     ) -> None:
-        self._given = task  # some views of its trace may be unknown
-        self._task, self._known, self._judging = _with_all_views(task), known, judging
+        self._task, self._known, self._judging = task, known, judging
         self._report = report
         self._beams: dict[int, Beam] = {}  # by their widths
         self.contradicting: dict[int, None] = {}
@@ -94,7 +92,7 @@ class Candidates:
         from ssh_abduction.solver.sources.metric.beam import Beam  # loads numpy
 
         if width not in self._beams:
-            self._beams[width] = Beam(self._given.problem, self._given.log, width)
+            self._beams[width] = Beam(self._task.problem, self._task.log, width)
         return self._beams[width]
 
     def maps_of(self, search: Beam | Joining) -> Iterator[SSHMap]:
@@ -110,12 +108,12 @@ class Candidates:
         """
         from ssh_abduction.solver.sources.metric.beam import Beam  # loads numpy
 
-        trace, theory = self._given.trace, self._given.theory
+        trace, theory = self._task.trace, self._task.theory
         mended = trace.without_displacements_at(wrong)
-        problem = self._given.problem.changed(mended, theory.replace(jumped=0.0))
+        problem = self._task.problem.changed(mended, theory.replace(jumped=0.0))
         jumps = faults_of(((t, "jumped") for t in wrong), {}, {}, trace, theory)
         most -= theory.prices[0] * sum(fault.cost for fault in jumps)
-        for ssh_map in Beam(problem, self._given.log, 1).maps(most):
+        for ssh_map in Beam(problem, self._task.log, 1).maps(most):
             whole = with_more_faults(ssh_map, jumps)
             if self._judging.accepts(whole):
                 return whole
@@ -126,13 +124,11 @@ class Candidates:
 
         None without displacements, or if lifts or faults within a drive are allowed.
         """
-        theory = self._task.theory
-        trusts_drives = not (theory.lifts or theory.replace(changed=0.0).has_faults)
-        if self.beam(1) is None or not theory.several_drives or not trusts_drives:
+        if not (self._trusts_drives() and self._task.theory.several_drives):
             return None
         from ssh_abduction.solver.sources.metric.joint_drives import Joining  # loads numpy
 
-        return Joining(self._given.problem, self._given.log)
+        return Joining(self._task.problem, self._task.log)
 
     def smoothed(self, begin: SSHMap | None = None) -> SSHMap | None:
         """Merge visits, or places of the map `begin`, at poses that fit all closures.
@@ -140,14 +136,18 @@ class Candidates:
         None if the checker refuses the map. Also None where there are no beams, or with lifts or
         faults within a drive.
         """
-        theory = self._task.theory
-        trusts_drives = not (theory.lifts or theory.replace(changed=0.0).has_faults)
-        if theory.displacement != "use" or not trusts_drives or self.beam(1) is None:
+        if not (self._trusts_drives() and self._task.theory.displacement == "use"):
             return None
         from ssh_abduction.solver.sources.metric.overlay import smoothed_map  # loads numpy
 
-        found = smoothed_map(self._given.problem, self._given.log, begin)
+        found = smoothed_map(self._task.problem, self._task.log, begin)
         return found if found is not None and self._judging.accepts(found) else None
+
+    def _trusts_drives(self) -> bool:
+        """Whether beams suit the trace, and no lifts or faults within a drive are allowed."""
+        theory = self._task.theory
+        allows = theory.lifts or theory.replace(changed=0.0).has_faults
+        return not allows and self.beam(1) is not None
 
     def go_on(self, beam: Beam) -> None:
         """Extend the partial maps of a beam to the whole trace, the longest first.
@@ -156,8 +156,8 @@ class Candidates:
         """
         before = self._known.best
         for first in beam.partial():
-            done = self._given.trace.prefix(len(first.dstate_at))
-            self._go_on_to_end(sketch_beyond(first, done, self._given.theory, homing=False))
+            done = self._task.trace.prefix(len(first.dstate_at))
+            self._go_on_to_end(sketch_beyond(first, done, self._task.theory, homing=False))
             if self._known.best is not before:
                 return
 
@@ -199,37 +199,9 @@ class Candidates:
         finally:
             self._sketching.release()
 
-    def sketch_least(self) -> bool:
-        """Offer a map without a search that has only as many dstates as pairwise distinct steps.
-
-        No map has fewer dstates. Such a sketch exists if the robot drives there and back and most
-        views are different. Clingo then only has to find the fewest places and paths. Returns
-        whether such a sketch was found and accepted.
-        """
-        from ssh_abduction.solver.steps.apart import Continuations  # loads numpy
-
-        trace, theory, log = self._task.trace, self._task.theory, self._task.log
-        if (
-            not self._task.speedups.greedy
-            or trace is not self._given.trace
-            or not row("clique").holds_for(theory)
-            or not self._judging.can_accept
-        ):
-            return False
-        apart: int | None = None
-        for sketch in sketches_of(trace.steps[0], theory):
-            if first_contradiction(sketch, trace) is not None:
-                continue
-            ssh_map = sketch.map()
-            apart = apart or len(Continuations(log.seen, log.actions).clique())
-            if len(ssh_map.dstates) == apart:
-                self.offer(ssh_map)
-                return self._known.best is not None and len(self._known.best.dstates) == apart
-        return False
-
     def _attempts(self) -> list[Callable[[], None]]:
         """List functions that each make a map without a search. Those for small maps come first."""
-        trace, theory, known = self._given.trace, self._given.theory, self._known.partial
+        trace, theory, known = self._task.trace, self._task.theory, self._known.partial
         sketches = sketches_of(trace.steps[0], theory)
         if known is not None:
             sketches.insert(0, sketch_beyond(known, trace.prefix(len(known.dstate_at)), theory))
@@ -245,14 +217,14 @@ class Candidates:
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
         """Extend a map to the end of the trace and offer it, unless a step contradicts it."""
-        if (wrong := first_contradiction(sketch, self._given.trace)) is None:
+        if (wrong := first_contradiction(sketch, self._task.trace)) is None:
             self._offer_or_blame(sketch.map())
         else:
             self.contradicting[wrong] = None
 
     def _offer_separate(self) -> None:
         """Offer a map in which steps share a dstate only if the axioms force them to."""
-        trace, theory = self._given.trace, self._task.theory
+        trace, theory = self._task.trace, self._task.theory
         if (ssh_map := separate_map(trace, theory)) is not None:
             self._offer_or_blame(ssh_map)
             return
@@ -274,8 +246,8 @@ class Candidates:
             # The next travel may put these steps on a path.
             later = (
                 t
-                for t in range(last, len(self._given.trace) - 1)
-                if self._given.trace.actions[t].kind == "travel"
+                for t in range(last, len(self._task.trace) - 1)
+                if self._task.trace.actions[t].kind == "travel"
             )
             self.contradicting |= dict.fromkeys((next(later, last - 1) + 1, last))
 
@@ -302,7 +274,7 @@ class Candidates:
 
     def offer(self, ssh_map: SSHMap) -> None:
         """Keep a map of the whole trace if it is the best so far and the checker accepts it."""
-        ssh_map = projected(self._with_unknown_views(ssh_map), self._task.theory)
+        ssh_map = projected(ssh_map, self._task.theory)
         found = Found.of(ssh_map, self._task.theory)
         if self._known.is_better(found) and self._judging.accepts(ssh_map):
             _log.info(
@@ -313,14 +285,6 @@ class Candidates:
             )
             self._known.keep(found, ssh_map.dstate_at)
 
-    def _with_unknown_views(self, ssh_map: SSHMap) -> SSHMap:
-        """Give each dstate of a map its view in the original trace, see `_with_all_views`."""
-        if self._task.trace is self._given.trace:
-            return ssh_map
-        views = facts.views_of(dict(enumerate(ssh_map.dstate_at)), self._given.trace)
-        dstates = tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
-        return replace(ssh_map, dstates=dstates)
-
 
 def has_quick_map(trace: Trace, theory: Theory) -> bool:
     """Whether the checker accepts one of the surest maps that are made without a search."""
@@ -328,28 +292,3 @@ def has_quick_map(trace: Trace, theory: Theory) -> bool:
     sketches = sketches_of(trace.steps[0], theory)[-2:]
     maps += [sketch.map() for sketch in sketches if first_contradiction(sketch, trace) is None]
     return any(m is not None and next(violations(trace, m, theory), None) is None for m in maps)
-
-
-def _with_all_views(task: Task) -> Task:
-    """Return the same task, in which each step has a view.
-
-    A step of unknown view gets the view of a step that must be at the same dstate, by a sketch. If
-    there is none, it gets one new view. Each map of the changed trace is also a map of the trace
-    itself. The new view only prevents steps of unknown view from sharing a dstate with other steps.
-    """
-    if not task.theory.unknown_views:
-        return task
-    views = task.trace.views
-    surest = sketches_of(task.trace.steps[0], task.theory)[-1]
-    if first_contradiction(surest, task.trace) is None:
-        ssh_map = surest.map()
-        views = tuple(ssh_map.dstates[label].view for label in ssh_map.dstate_at)
-    known, new = set(views), "?"
-    while new in known:
-        new += "?"
-    trace = task.trace.with_views(
-        [new if view is None else view for view in views],
-        [s.confidence for s in task.trace.steps],
-    )
-    theory = replace(task.theory, unknown_views=False)
-    return Task.of(task.problem.changed(trace, theory), task.watch, task.speedups)

@@ -73,13 +73,8 @@ class Counting:
         may_change = isinstance(engine, StepEngine) and not self._goes_on and takes_all(task)
         may_frame = may_change and task.speedups.framing
         may_settle = may_change and task.speedups.ways and parts.speedups.names
-        if may_settle:
-            yield Source(turn("prefixes, first try"), lambda: True, self._find)
-            if self._is_open() and parts.candidates.sketch_least():
-                self._settle_dstates_first()
-                may_frame = may_settle = False
         if may_frame or may_settle:
-            yield Source(turn("prefixes, second try"), self._is_open, self._find)
+            yield Source(turn("prefixes"), self._is_open, self._find)
             if self._is_open() and may_frame:
                 _log.info("looking for maps in which places have frames, as candidates")
                 parts.candidates.frame(parts.speedups)

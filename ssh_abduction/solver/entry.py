@@ -1,4 +1,4 @@
-"""The functions that users call: `solve` and `find_backbone`.
+"""The functions that users call, and the names and corrections of a person that they obey.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> trace = Trace.from_steps(views=["end", "end", "end"], actions=["travel", "around"])
@@ -9,23 +9,41 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from statistics import median
 from typing import Any
 
 from ssh_abduction.data.checks import an_instance
-from ssh_abduction.data.corrections import Corrections
-from ssh_abduction.data.drives import joined_drives, together
-from ssh_abduction.data.errors import SolverError
+from ssh_abduction.data.corrections import (
+    Corrections,
+    Passage,
+    checked_corrections,
+    direction_in_words,
+    number_at,
+)
+from ssh_abduction.data.drives import (
+    Drive,
+    drives_of,
+    fingerprints_of,
+    joined_drives,
+    step_name,
+    step_of,
+    together,
+    travels_of,
+)
+from ssh_abduction.data.errors import SolverError, TheoryError, brief, is_whole, named
 from ssh_abduction.data.maps import SSHMap, check_of_trace
+from ssh_abduction.data.star import with_gateway
+from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace, checked_trace
-from ssh_abduction.runtime.clock import counting, heeding
+from ssh_abduction.runtime.clock import counting, each_heeding, heeding
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.board import Judging
-from ssh_abduction.solver.obeying import obeyed, with_correction_warnings, with_names
-from ssh_abduction.solver.onto import Solving, solve_onto
+from ssh_abduction.solver.onto import Solving, joint_with, solve_onto
 from ssh_abduction.solver.parts import Limits, Start
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.result import Solution
@@ -33,14 +51,18 @@ from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine, may_name
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import prove_backbone
-from ssh_abduction.solver.values import Progress
-from ssh_abduction.theory.settle import Problem
+from ssh_abduction.solver.values import Found, Progress, Status
+from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import ALL, Speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 _log = log_of(__name__)
 # If the time limit is over, a search gets this many seconds to find any map.
 LEAST_SECONDS = 1e-9
+# A search for a map without corrections of gateways may take this many seconds.
+SHORTEST, DOUBTING = 0.05, 10.0
+# If the theory allows no faults, allow both kinds. Their costs do not matter for a front.
+KINDS = {"misread": 1.5, "slipped": 1.5}
 
 
 def solve(
@@ -100,7 +122,7 @@ def solve(
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
     joint = together(trace) if isinstance(trace, list | tuple | Iterator) else checked_trace(trace)
-    Limits(time_limit, memory_limit, work_limit=work_limit)  # checks them
+    limits = Limits(time_limit, memory_limit, work_limit=work_limit)
     watch = Watch(time_limit, memory_limit, work=work_limit)
     watch.start()
 
@@ -120,37 +142,41 @@ def solve(
         return search.solution(tuple(search))
 
     if onto is not None:
-        with counting(watch.counts_work):
-            solution = solve_onto(joint, onto, theory, corrections, Solving(find, speedups, watch))
-        return _with_warnings(solution, corrections, watch, memory_limit)
+        joint, theory, standing = joint_with(joint, onto, theory)
     theory = checked_theory(theory)
     theory.check_steps(joint)
+    names = corrections
     if corrections is not None:
         joint, theory = obeyed(corrections, joint, theory)
-    solution = find(joint, theory)
-    if corrections is not None:
-        solution = with_names(corrections, solution, joint)
-    return _with_warnings(solution, corrections, watch, memory_limit)
+    if onto is None:
+        solution = find(joint, theory)
+    else:
+        with counting(watch.counts_work):
+            solving = Solving(find, speedups, watch)
+            solution = solve_onto(joint, onto, theory, standing, solving)
+        if names is None:
+            names = Corrections.of_names(standing, solution.drives)
+    if names is not None:
+        solution = with_names(names, solution, joint)
+    return _with_warnings(solution, corrections, watch, limits)
 
 
 def _with_warnings(
-    solution: Solution,
-    corrections: Corrections | None,
-    watch: Watch,
-    memory_limit: int | None,
+    solution: Solution, corrections: Corrections | None, watch: Watch, limits: Limits
 ) -> Solution:
     """Add warnings about drives that share no place, and log them."""
 
     def find(trace: Trace, theory: Theory, left: float) -> Solution:
-        limit: dict[str, Any] = {"work_limit" if watch.counts_work else "time_limit": left}
-        search = Search(trace, theory, max_maps=1, memory_limit=memory_limit, **limit)
+        within: dict[str, Any] = limits.of_part(left)
+        search = Search(trace, theory, max_maps=1, **within)
         return search.solution(tuple(search))
 
+    said = len(solution.support.warnings)
     if corrections is not None:
         solution = with_correction_warnings(corrections, solution, watch.left(), find)
     if solution.maps and len(joined_drives(solution.drives, solution.maps[0])) > 1:
         _log.warning("%s", solution.joined)
-    for warning in solution.support.correction_warnings:
+    for warning in solution.support.warnings[said:]:
         _log.warning("%s", warning)
     return solution
 
@@ -191,9 +217,7 @@ def find_backbone(
         MapError: The maps are not of the given trace.
     """
     an_instance("solution", solution, Solution, SolverError, mend="take what solve returned")
-    check_limit("time_limit", "seconds", time_limit)
-    check_limit("memory_limit", "MiB", memory_limit)
-    check_limit("work_limit", "units of work", work_limit)
+    Limits(time_limit, memory_limit, work_limit=work_limit)  # checks them
     trace = solution.trace if trace is None else checked_trace(trace)
     minimal, known = solution.minimal_maps, solution.backbone
     if known is None or known.proven or not minimal or solution.theory.weigh == "cost":
@@ -224,3 +248,342 @@ def find_backbone(
     # The search may have seen more maps than the solution holds.
     has_learnt = proven or sharing.maps > len(minimal)
     return replace(sharing.backbone(proven=proven), drives=known.drives) if has_learnt else known
+
+
+@dataclass(frozen=True)
+class Point:
+    """The fewest dstates of a map that may have some number of faults.
+
+    Attributes:
+        faults: The number of faults that a map may have.
+        dstates: The fewest dstates of such a map if proven, else a lower bound.
+        map: The best map found; None if none was found in time.
+        proven: Whether `dstates` is proven to be the minimum.
+    """
+
+    faults: int
+    dstates: int
+    map: SSHMap | None
+    proven: bool
+
+
+@dataclass(frozen=True)
+class Front:
+    """The points for 0, 1, 2, … faults, as far as they were computed in time.
+
+    A number of faults has no point if the assertions of the theory allow no map with so few faults.
+
+    Attributes:
+        points: The points, those for fewer faults first.
+        stopped: Whether a time limit or Ctrl-C ended the search.
+    """
+
+    points: tuple[Point, ...]
+    stopped: bool = False
+
+    @property
+    def knee(self) -> int | None:
+        """The number of faults at which the number of dstates stops falling fast.
+
+        The fall to a point is how many dstates it saves over the point with one fault less. The
+        knee is the point whose fall exceeds the next fall by most. Only proven points count. None
+        if no fall exceeds the next one.
+        """
+        counts = self._proven
+        bends = {
+            k: (counts[k - 1] - counts[k]) - (counts[k] - counts[k + 1])
+            for k in counts
+            if k - 1 in counts and k + 1 in counts
+        }
+        knee = max(bends, key=lambda k: bends[k], default=None)
+        return knee if knee is not None and bends[knee] > 0 else None
+
+    @property
+    def prices(self) -> tuple[float, float] | None:
+        """The range (low, high) of the cost of a fault in which the map at the knee costs least.
+
+        Costs are in dstates. None if there is no such cost, or no knee.
+        """
+        if self.knee is None:
+            return None
+        counts = self._proven
+        here = counts[self.knee]
+        least = max(
+            (here - count) / (k - self.knee) for k, count in counts.items() if k > self.knee
+        )
+        most = min((count - here) / (self.knee - k) for k, count in counts.items() if k < self.knee)
+        return (least, most) if least < most else None
+
+    @property
+    def _proven(self) -> dict[int, int]:
+        """The number of dstates of each proven point, by number of faults."""
+        return {point.faults: point.dstates for point in self.points if point.proven}
+
+
+def fault_front(
+    trace: Trace, theory: Theory | None = None, most: int = 5, time_limit: float | None = None
+) -> Front:
+    """Find the fewest dstates for at most 0, 1, …, `most` faults.
+
+    Even if the trace is wrong, the causal theory has a map without faults. It needs many dstates.
+    With many faults, few dstates are enough. The truth is mostly at the *knee*: the number of
+    faults at which the number of dstates stops falling fast. A weighted sum of both numbers hides
+    the knee.
+
+    >>> from ssh_abduction import Trace
+    >>> seen = [f"v{t % 4}" if t != 9 else "v0" for t in range(25)]
+    >>> front = fault_front(Trace.from_steps(seen, ["right", "travel"] * 12), most=2)
+    >>> [point.dstates for point in front.points], front.knee, front.prices
+    ([13, 4, 4], 1, (0.0, 9.0))
+
+    Args:
+        trace: The views and actions to explain.
+        theory: Theory.causal() by default. A theory without costs of faults allows both kinds:
+            wrong views and wrong actions.
+        most: The greatest number of faults, 0 to 1000.
+        time_limit: Seconds in all; None for no limit.
+
+    Returns:
+        A point for each number of faults that was reached in time.
+
+    Raises:
+        TheoryError: The theory is not the plain causal one, it allows wrong displacements, or it
+            names steps that the trace does not have; or `most` is out of range.
+    """
+    theory = Theory.causal() if theory is None else checked_theory(theory)
+    check_limit("time_limit", "seconds", time_limit)
+    is_plain = theory.level == "causal" and not (theory.rules or theory.without or theory.jumped)
+    if not is_plain or theory.prefer not in (("dstates",), ("auto",)):
+        raise TheoryError(
+            "theory: expected the causal axioms alone, fewest dstates first, without wrong "
+            "displacements, to find the front (the fewest dstates for each number of faults); take "
+            "Theory.causal() (--theory causal), and leave out rules, without, prefer and jumped"
+        )
+    if not is_whole(most) or not 0 <= most <= 1000:
+        raise TheoryError(
+            f"front: expected a number of faults from 0 to 1000, got {brief(most)}"
+            "; take one in this range"
+        )
+    theory.check_steps(checked_trace(trace))
+    problem = settle(trace, theory if theory.has_faults else theory.replace(**KINDS))
+    watch = Watch(time_limit)
+    watch.start()
+    points = tuple(each_heeding(watch.check, _points(Task.of(problem, watch), most)))
+    return Front(points, stopped=any(not point.proven for point in points))
+
+
+def _points(task: Task, most: int) -> Iterator[Point]:
+    """Yield the points for 0 to `most` faults. The first point that is not proven ends them."""
+    from ssh_abduction.solver.sources.exact.faulty import FaultyEngine  # loads numpy
+
+    before: SSHMap | None = None
+    for faults in range(most + 1):
+        engine = FaultyEngine(task, faults)
+        best: Found | None = None
+        try:
+            engine.grow(len(task.trace))
+            for found in engine.improving_maps():
+                best = found
+        except (LimitError, KeyboardInterrupt):
+            yield Point(
+                faults,
+                -(-(engine.bound or 10) // 10),
+                None if best is None else best.map,
+                proven=False,
+            )
+            return
+        if best is None:  # the assertions allow no map with so few faults
+            continue
+        if before is None or len(best.map.dstates) < len(before.dstates):
+            before = best.map  # repeats a map that needs fewer faults
+        yield Point(faults, len(before.dstates), before, proven=True)
+
+
+def obeyed(corrections: Corrections, trace: Trace, theory: Theory) -> tuple[Trace, Theory]:
+    """Return the trace and the theory that obey the corrections of a person.
+
+    Pairs of steps are added to the fields same, different, elsewhere and same_place of the theory.
+    Sentences about gateways that are open or closed change the stars of their steps.
+
+    Args:
+        corrections: The corrections. Sentences about drives that the trace lacks have no effect.
+        trace: The trace of the drives that the corrections are about.
+        theory: The theory to which the pairs of steps are added.
+
+    Raises:
+        MapError: The corrections are of other drives, or contradict the trace.
+    """
+    checked_corrections(corrections).check_drives(dict(fingerprints_of(checked_trace(trace))))
+    said = corrections.assertions(trace)
+    pairs = {
+        kind: tuple(dict.fromkeys((*getattr(checked_theory(theory), kind), *found)))
+        for kind, found in said.items()
+    }
+    return corrections.corrected(trace), theory.replace(**pairs)
+
+
+def with_names(corrections: Corrections, solution: Solution, trace: Trace) -> Solution:
+    """Return a solution whose maps have the names that a person gave."""
+    drives = drives_of(trace)
+    maps = tuple(corrections.named(ssh_map, drives) for ssh_map in solution.maps)
+    return replace(solution, maps=maps)
+
+
+def with_correction_warnings(
+    corrections: Corrections,
+    solution: Solution,
+    left: float,
+    find: Callable[[Trace, Theory, float], Solution],
+) -> Solution:
+    """Add warnings about drives that contradict a corrected gateway, and about unused names.
+
+    A correction changes only the stars of the steps that it names. If another drive saw the gateway
+    as it was before, its steps cannot be at the place any more. Without stars, they can be there.
+
+    Args:
+        corrections: The corrections that the solution obeys.
+        solution: The solution, with its trace.
+        left: The seconds, or units of work, that are left; infinity without a limit.
+        find: Finds a map of a trace and a theory in that much time. It is called once, without
+            corrections of gateways, if the correction may keep a drive from the place.
+    """
+    said = [*_unused_names(corrections, solution)]
+    if corrections.gateways and solution.stopped != "interrupted":
+        most = max(min(left, DOUBTING), SHORTEST)
+        said += _contradictions(
+            corrections, solution, lambda trace, theory: find(trace, theory, most)
+        )
+    return replace(solution, support=solution.support.warning_of(*said))
+
+
+def _unused_names(corrections: Corrections, solution: Solution) -> Iterator[str]:
+    """Yield a warning for each name that the first map does not have."""
+    if not solution.maps or solution.trace is None:
+        return
+    drives = drives_of(solution.trace)
+    ssh_map = corrections.named(solution.maps[0], drives)
+    for naming in corrections.known_in(drives).names:
+        label = ssh_map.dstate_at[step_of(drives, naming.step)]
+        used = ssh_map.name_of(naming.kind, number_at(ssh_map, naming.kind, label))
+        if used != naming.name:
+            why = (
+                f"this step has no {naming.kind}; name another step"
+                if used is None
+                else f"this {naming.kind} is also {brief(used)}; rename or remove one of them"
+            )
+            yield (
+                f"{named(corrections.source or 'corrections')}: {naming}: it is not shown: in the "
+                f"first map, {why}"
+            )
+
+
+def _contradictions(
+    corrections: Corrections, solution: Solution, find: Callable[[Trace, Theory], Solution]
+) -> Iterator[str]:
+    """Yield the warnings that `with_correction_warnings` adds."""
+    trace = solution.trace
+    if trace is None or not solution.maps:
+        return
+    drives, ssh_map = drives_of(trace), solution.maps[0]
+    said, found = corrections.known_in(drives), solution
+    unit = 90 if solution.theory.star == "frame" else 1
+    doubted = [(p, d) for p in said.gateways for d in drives]
+    # With stars, solve again without the corrections of gateways, to see what they prevent.
+    if solution.theory.star != "none":
+        seen = replace(trace, steps=tuple(step.as_seen() for step in trace.steps))
+        doubted = [(p, d) for p, d in doubted if _may_keep_out(p, d, seen, ssh_map)]
+        if not doubted:
+            return
+        found = find(*obeyed(replace(said, gateways=()), seen, solution.theory))
+    for passage, drive in doubted:
+        apart = drive in _apart(passage, drives, ssh_map)
+        sentence, without = f"{named(said.source or 'corrections')}: {passage}: ", ""
+        steps = _seen_otherwise(passage, drive, trace, found, unit)
+        if steps:
+            step, way = next(iter(steps.items()))
+            option = "--open" if passage.is_open else "--closed"
+            if found is not solution:
+                shared = "places" if apart else "this place"
+                without = f": without it, {drive.name} would share {shared} with the other drives"
+            agree = f"(correct {option} '{step} {direction_in_words(way)}')"
+            yield (
+                f"{sentence}it contradicts what {drive.name} saw at "
+                f"{'step' if len(steps) == 1 else 'steps'} {', '.join(steps)}{without}; say the "
+                f"same of {step} {agree}, or remove it"
+            )
+        # In doubt, an unproven map without the correction leaves the drive apart, too.
+        elif (
+            apart
+            and found is not solution
+            and found.status is not Status.OPTIMAL
+            and (not found.maps or drive in _apart(passage, found.drives, found.maps[0]))
+        ):
+            yield (
+                f"{sentence}{drive.name} shares no place with the drives that it is about; if "
+                f"{drive.name} saw this gateway otherwise, say the same of its steps (correct)"
+            )
+
+
+def _apart(passage: Passage, drives: Sequence[Drive], ssh_map: SSHMap) -> list[Drive]:
+    """List the drives that a map does not join with the drives of a corrected gateway."""
+    about = {step.rpartition(":")[0] for step, _ in passage.seen}
+    joined = {
+        name for names in joined_drives(drives, ssh_map) if about & {*names} for name in names
+    }
+    return [drive for drive in drives if drive.name not in joined]
+
+
+def _may_keep_out(passage: Passage, drive: Drive, seen: Trace, ssh_map: SSHMap) -> bool:
+    """Whether a corrected gateway may keep a drive out of its place.
+
+    The drive shares no place with the drives of the correction; or it was not at the place, but saw
+    nearby as many gateways as the robot saw there before the correction. `seen` is the trace as it
+    was before.
+    """
+    drives = drives_of(seen)
+    if drive in _apart(passage, drives, ssh_map):
+        return True
+    there = [step_of(drives, step) for step, _ in passage.seen]
+    places = {ssh_map.place_of(t) for t in there}
+    steps = range(drive.first, drive.stop)
+    if any(ssh_map.place_of(t) in places for t in steps):
+        return False
+    poses = ssh_map.fit.poses if ssh_map.fit else ()
+    near = median(travels_of(seen) or [0.0]) / 2
+    counts = [step.gateways and len(step.gateways.gateways) for step in seen.steps]
+
+    def is_near(t: int, u: int) -> bool:
+        here, other = (poses[ssh_map.dstate_at[step]] for step in (t, u))
+        return math.hypot(here.x - other.x, here.y - other.y) < near
+
+    return any(
+        counts[t] == counts[u] and (not poses or is_near(t, u)) for t in steps for u in there
+    )
+
+
+def _seen_otherwise(
+    passage: Passage, drive: Drive, trace: Trace, found: Solution, unit: int
+) -> dict[str, float]:
+    """Find the steps of a drive that saw a corrected gateway otherwise, by the best map found.
+
+    Each has the direction of the gateway. `unit` is the unit of the map's headings, in degrees.
+    """
+    if not found.maps:
+        return {}
+
+    def is_otherwise(step: Step, way: float) -> bool:
+        star = step.star
+        return star is not None and with_gateway(star, way, is_open=passage.is_open) != star
+
+    drives, ssh_map = drives_of(trace), found.maps[0]
+    ways = {ssh_map.dstate_at[step_of(drives, step)]: way for step, way in passage.seen}
+    for label, way in [*ways.items()]:
+        here = ssh_map.dstates[label]
+        for s in ssh_map.dstates:
+            if s.place == here.place and s.heading is not None and here.heading is not None:
+                ways.setdefault(s.id, (way + unit * (here.heading - s.heading)) % 360)
+    return {
+        step_name(drives, t): ways[label]
+        for t, label in enumerate(ssh_map.dstate_at[: drive.stop])
+        if t >= drive.first and label in ways and is_otherwise(trace.steps[t], ways[label])
+    }

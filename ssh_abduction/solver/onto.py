@@ -1,12 +1,15 @@
 """Add a drive to the map of old drives, in about the time that solving the new drive takes.
 
 The map of the old drives is the *existing map*: the joint map must keep its dstates and places. The
-solver does not get the old drives. It gets a digest of them (`laying.py`), and assertions about its
-steps: those at one dstate or place of the existing map are at one, and others are not. The search
-begins with the existing map, to which a sketch adds the new drives.
+solver does not get the old drives. It gets a *digest*: a short trace in which each link of their
+map occurs once. Axioms are about links and observations. So each map of the digest and a new drive
+gives a map of all drives. Assertions about the steps of the digest say that those at one dstate or
+place of the existing map are at one, and others are not. The search begins with the existing map,
+to which a sketch adds the new drives.
 
-With displacements, a long drive is laid on the existing map (`laying.py`). If that fails, or if the
-drives are short, the solver gets all old steps.
+With displacements, a long drive is laid on the existing map. No search of all drives follows, so it
+is not proven that the joint map has the least cost. If that fails, or if the drives are short, the
+solver gets all old steps.
 
 >>> from ssh_abduction import Trace, solve
 >>> monday = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
@@ -18,36 +21,46 @@ drives are short, the solver gets all old steps.
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 from ssh_abduction.data.checks import an_instance
-from ssh_abduction.data.corrections import ASSERTIONS, Corrections
+from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, starts_of, step_name, together
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.gateways import with_allowed_headings
-from ssh_abduction.data.groups import first_index_of, firsts
+from ssh_abduction.data.groups import first_index_of, firsts, numbered
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.step import Action, Step
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.clock import heeding
-from ssh_abduction.solver.asp.limits import EARLY, LimitError, Watch
+from ssh_abduction.solver.asp.limits import EARLY, LimitError, Stop, Watch
 from ssh_abduction.solver.board import Judging
-from ssh_abduction.solver.laying import Digest, can_lay, laid, unproven
-from ssh_abduction.solver.obeying import obeyed, with_names
+from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of
+from ssh_abduction.solver.costs.estimating import may_join_more, rival_of, rivals_of
+from ssh_abduction.solver.derived_regions import Deriving
+from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning
+from ssh_abduction.solver.schedule import turn
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
-from ssh_abduction.solver.solution.weighed import Weighed
+from ssh_abduction.solver.solution.weighed import IMPROBABLE, Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE
+from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond
 from ssh_abduction.solver.sources.symbolic.sketched import first_contradiction
-from ssh_abduction.solver.values import Cost, Level, Status
+from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status, nats_of
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
+
+if TYPE_CHECKING:
+    from ssh_abduction.solver.sources.metric.joint_drives import ExistingMap
 
 # New drives may be laid on a map for this many seconds of processor time, even if the time limit is
 # over. That is enough for a drive of some hundred steps. Without it, a busy machine would leave the
@@ -70,40 +83,58 @@ class Solving:
     watch: Watch
 
 
+def joint_with(
+    trace: Trace, existing: Solution, theory: Theory | None
+) -> tuple[Trace, Theory, SSHMap]:
+    """Return the joint trace of old and new drives, its theory, and the map to keep.
+
+    The existing solution has the trace of the old drives, and its first map is the one to keep. Its
+    theory is the default. Raises SolverError without a map or trace, or if the theory allows
+    faults.
+    """
+    mend = "take what solve returned, or Solution.load"
+    solution = an_instance("onto", existing, Solution, SolverError, mend=mend)
+    if not solution.maps or solution.trace is None:
+        raise SolverError(
+            "onto: expected a solution with a map and its trace, got one without; read a file that "
+            "solve -o wrote"
+        )
+    theory = checked_theory(theory or solution.theory.replace(returns=0))
+    if theory.has_faults or solution.theory.has_faults or solution.maps[0].faults:
+        raise SolverError(
+            "onto: expected a map without faults, got a theory that allows them; solve all drives "
+            "together"
+        )
+    if theory.level == "causal" and solution.theory.level != "causal":
+        raise SolverError(
+            "onto: expected a topological theory, as the existing map has places, got "
+            "level=causal; take Theory.topological() (solve --theory topological)"
+        )
+    return together([solution.trace, trace]), theory, solution.maps[0]
+
+
 def solve_onto(
-    trace: Trace,
-    existing: Solution,
-    theory: Theory | None,
-    corrections: Corrections | None,
-    solving: Solving,
+    joint: Trace, existing: Solution, theory: Theory, ssh_map: SSHMap, solving: Solving
 ) -> Solution:
     """Find the minimal joint maps of new and old drives that keep the map of the old drives.
 
-    The existing solution has the trace of the old drives, and its first map is the one to keep. Its
-    theory is the default; steps in a theory are steps of the joint trace. With displacements, new
-    drives may join pieces of that map. Corrections of a person are obeyed. Raises SolverError
-    without a map or trace, or if the new drive contradicts the map.
+    The trace, the theory and the map are what `joint_with` returns, perhaps with corrections of a
+    person. With displacements, new drives may join pieces of the map. Raises SolverError if the new
+    drive contradicts the map.
     """
     # 1. The joint problem, of old and new drives.
-    old, ssh_map = _existing(existing)
-    theory = checked_theory(theory or existing.theory.replace(returns=0))
-    _check_theory(theory, existing)
-    joint = together([old, trace])
-    theory.check_steps(joint)
-    if corrections is not None:
-        joint, theory = obeyed(corrections, joint, theory)
-        old, trace = joint[: len(old)], joint[len(old) :]
+    old, trace = joint[: len(ssh_map.dstate_at)], joint[len(ssh_map.dstate_at) :]
     says_joined = _check_assertions(theory, old, ssh_map)
     problem = settle(joint, theory)
     in_use = problem.theory
 
     # 2. Long drives: map the new ones alone, and lay their maps on the old map.
-    if solving.speedups.greedy and len(joint) > READABLE and can_lay(in_use):
+    can_lay = in_use.weigh == "cost" and not (in_use.has_faults or in_use.lifts)
+    if solving.speedups.greedy and len(joint) > READABLE and can_lay:
         judged = all(getattr(in_use, f) == getattr(existing.theory, f) for f in _JUDGES)
-        since = len(old) if judged else 0
-        on_map = _laid_in_time(old, ssh_map, trace, problem, solving.watch, since)
+        on_map = _laid_in_time(old, ssh_map, trace, problem, len(old) if judged else 0, solving)
         if on_map is not None:
-            return _named(on_map, ssh_map, corrections)
+            return on_map
 
     # 3. A short trace that stands for the old map (its digest), and the new drive.
     short = solving.speedups.that_hold_for(in_use).digest and in_use.displacement == "none"
@@ -127,20 +158,6 @@ def solve_onto(
         found, maps = replace(found, status=Status.FEASIBLE, cost=Cost.of(grown)), (grown,)
     if not maps:
         raise _contradiction(old, trace, ssh_map, digest, found)
-    solution = _of_joint_trace(found, maps, theory, joint, solving.watch)
-    support = Support(
-        odometry_warning=found.support.odometry_warning,
-        weigh_warning=found.support.weigh_warning,
-        weighed=None if short or not kept else _weighed(found, digest, ssh_map),
-        onto=tuple(drive.name for drive in drives_of(old)),
-    )
-    return _named(replace(solution, support=support), ssh_map, corrections)
-
-
-def _of_joint_trace(
-    found: Solution, maps: tuple[SSHMap, ...], theory: Theory, joint: Trace, watch: Watch
-) -> Solution:
-    """Turn the solution for a digest and a new drive into one for all drives, with these maps."""
     assert found.cost is not None
     return replace(
         found,
@@ -151,11 +168,16 @@ def _of_joint_trace(
         effort=replace(
             found.effort,
             prefix=min(found.effort.prefix, len(joint)),  # a digest may have more steps
-            seconds=replace(found.seconds, total=watch.seconds()),
+            seconds=replace(found.effort.seconds, total=solving.watch.seconds()),
         ),
         levels=(Level(found.cost, len(maps), found.complete),) if found.within else (),
         shared=None,
         trace=joint,
+        support=Support(
+            warnings=found.support.warnings,
+            weighed=None if short or not kept else _weighed(found, digest, ssh_map),
+            onto=tuple(drive.name for drive in drives_of(old)),
+        ),
     )
 
 
@@ -176,24 +198,37 @@ def _begun(found: SSHMap, joint: Trace, theory: Theory) -> SSHMap:
 
 
 def _laid_in_time(
-    old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem, watch: Watch, since: int
+    old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem, since: int, solving: Solving
 ) -> Solution | None:
-    """Call `laid`; None if it takes too long. After Ctrl-C, give the new drives new places."""
+    """Make a solution of the map that `laid` finds; None if there is none, or it takes too long.
+
+    After Ctrl-C, give the new drives new places.
+    """
+    joint, found, weighed = problem.trace, None, None
+    stopped: Stop = "no proof"
     try:
-        with suppress(LimitError), heeding(watch.later(LAYING)):
-            return laid(old, ssh_map, trace, problem, watch, since)
+        with suppress(LimitError), heeding(solving.watch.later(LAYING)):
+            found, weighed = laid(old, ssh_map, trace, problem, since) or (None, None)
     except KeyboardInterrupt:
-        if (grown := _grown(ssh_map, old, problem)) is None:
+        stopped, found = "interrupted", _grown(ssh_map, old, problem)
+        if found is None:
             raise
-        return unproven(grown, ssh_map, old, problem, watch, "interrupted")
-    return None
-
-
-def _named(solution: Solution, ssh_map: SSHMap, corrections: Corrections | None) -> Solution:
-    """Give the maps the names that a person gave or, without corrections, those of the old map."""
-    assert solution.trace is not None
-    said = Corrections.of_names(ssh_map, solution.drives) if corrections is None else corrections
-    return with_names(said, solution, solution.trace)
+    if found is None:
+        return None
+    support = Support(weighed=weighed, onto=tuple(drive.name for drive in drives_of(old)))
+    return Solution(
+        status=Status.FEASIBLE,
+        maps=(found,),
+        cost=Cost.of(found),
+        bound=Bound(max(cost.dstates for cost in _costs(ssh_map))),
+        complete=False,
+        theory=problem.theory,
+        steps=len(joint),
+        effort=Effort(0, Seconds(solving.watch.seconds(), 0.0, 0.0)),
+        stopped=stopped,
+        trace=joint,
+        support=support.warning_of(units_warning(joint) or noise_warning(found, joint)),
+    )
 
 
 def _grown(ssh_map: SSHMap, old: Trace, problem: Problem) -> SSHMap | None:
@@ -216,32 +251,6 @@ def _sketched(digest: Digest, ssh_map: SSHMap, part: Trace, theory: Theory) -> I
         sketch = sketch_beyond(standing, digest.trace, theory, homing)
         if first_contradiction(sketch, part) is None:
             yield _begun(sketch.map(), part, theory)
-
-
-def _existing(existing: object) -> tuple[Trace, SSHMap]:
-    """Return the trace of a solution and its first map. Raises SolverError if one is missing."""
-    mend = "take what solve returned, or Solution.load"
-    solution = an_instance("onto", existing, Solution, SolverError, mend=mend)
-    if not solution.maps or solution.trace is None:
-        raise SolverError(
-            "onto: expected a solution with a map and its trace, got one without; read a file that "
-            "solve -o wrote"
-        )
-    return solution.trace, solution.maps[0]
-
-
-def _check_theory(theory: Theory, existing: Solution) -> None:
-    """Raise SolverError if a theory allows faults, or lacks the places of the existing map."""
-    if theory.has_faults or existing.theory.has_faults or existing.maps[0].faults:
-        raise SolverError(
-            "onto: expected a map without faults, got a theory that allows them; solve all drives "
-            "together"
-        )
-    if theory.level == "causal" and existing.theory.level != "causal":
-        raise SolverError(
-            "onto: expected a topological theory, as the existing map has places, got "
-            "level=causal; take Theory.topological() (solve --theory topological)"
-        )
 
 
 def _check_assertions(theory: Theory, old: Trace, ssh_map: SSHMap) -> bool:
@@ -337,27 +346,215 @@ def _contradiction(
     old: Trace, trace: Trace, ssh_map: SSHMap, digest: Digest, found: Solution
 ) -> SolverError:
     """Make the error that says what contradicts the existing map, and what to do."""
-    reason, drives = "no map keeps the existing map", drives_of(old)
-    if found.maps:
-        best = found.maps[0]
-        dstates, places = _broken(best.dstate_at, _places_in(best), digest, ssh_map)
-        first = first_index_of(ssh_map.dstate_at)
-        pairs = [
-            f"{step_name(drives, first[s])} and {step_name(drives, first[x])}" for s, x in places
-        ]
-        parts = [counted(len(dstates), "dstates")] if dstates else []
-        parts += [f"the places of {', '.join(pairs[:3])}"] if pairs else []
-        reason = (
-            f"the best map found, of {counted(len(best.dstates), 'dstates')}, changes "
-            f"{' and '.join(parts)}"
-        )
     new = ", ".join(drive.name for drive in drives_of(trace))
     if found.stopped in _LIMITS:
         return SolverError(
             f"onto: expected a map that keeps the existing one, found none for {new} before the "
             f"search ended ({found.stopped}); give it more time or memory"
         )
+    reason, parts = "no map keeps the existing map", []
+    if found.maps:
+        best, first = found.maps[0], first_index_of(ssh_map.dstate_at)
+        dstates, places = _broken(best.dstate_at, _places_in(best), digest, ssh_map)
+        steps = [[step_name(drives_of(old), first[s]) for s in pair] for pair in places[:3]]
+        parts += [counted(len(dstates), "dstates")] if dstates else []
+        parts += [f"the places of {', '.join(map(' and '.join, steps))}"] if steps else []
+        size = counted(len(best.dstates), "dstates")
+        reason = f"the best map found, of {size}, changes {' and '.join(parts)}"
     return SolverError(
         f"onto: expected a drive that agrees with the existing map, got {new}: {reason}; solve all "
         "drives together (solve --together)"
     )
+
+
+def laid(
+    old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem, since: int
+) -> tuple[SSHMap, Weighed] | None:
+    """Find a joint map of little cost that keeps each piece of the map of the old drives.
+
+    `trace` has the new drives, and the problem all drives. The result is the cheapest of up to
+    three maps, with its costs: in one the new drives are pieces of their own, and in the others
+    they are joined to the old ones. Pieces of the old map may be joined, too. None if no such map
+    satisfies the axioms. The displacements of the first `since` steps are known to agree with the
+    map.
+    """
+    from ssh_abduction.solver.costs.misfit import Misfit  # loads numpy
+    from ssh_abduction.solver.sources.metric.joint_drives import ExistingMap
+
+    joint, theory = problem.trace, problem.theory
+    judging, existing, misfit = Judging(problem), ExistingMap(old, ssh_map), Misfit(problem)
+    maps = _joint_maps(existing, old, ssh_map, trace, problem)
+    found = sorted(((misfit.nats_of(m), m) for m in maps), key=lambda pair: pair[0])
+    while found and not judging.accepts(
+        found[0][1], since if _is_kept(ssh_map, found[0][1]) else 0
+    ):
+        del found[0]
+    if not found:
+        return None
+    best = Deriving(joint, theory).mapped(Ranking(joint).fitted(found[0][1]))
+    kept = (ssh_map if ssh_map.fit else Ranking(old).fitted(ssh_map)).fit
+    assert kept is not None
+    assert best.fit is not None
+    known = [rival_of(m, nats) for nats, m in found]
+    moved = rivals_of(problem, misfit, best, turn("estimated rivals").most, len(old))
+    weighed = Weighed(
+        bound=max(nats_of(cost, theory) for cost in _costs(ssh_map)) + kept.chi2 / 2,
+        within=0.0,
+        rivals=(known[0], *(replace(rival, estimated=True) for rival in known[1:]), *moved),
+        searched=best.fit.p >= IMPROBABLE and not may_join_more(problem, known),
+        broken=existing.broken,
+        doubt=doubt_of(problem, best),
+        gaps=gaps_of(problem),
+        drives=drives_of(joint),
+    )
+    return best, weighed
+
+
+def _is_kept(ssh_map: SSHMap, found: SSHMap) -> bool:
+    """Whether a joint map joins no two dstates or places of a map of the first drives."""
+    labels = found.dstate_at[: len(ssh_map.dstate_at)]
+    places = {found.dstates[s].place for s in labels}
+    return len({*labels}) == len(ssh_map.dstates) and len(places) == max(len(ssh_map.places), 1)
+
+
+def _costs(ssh_map: SSHMap) -> Iterator[Cost]:
+    """Yield the cost of each piece of a map, without paths."""
+    for piece in ssh_map.pieces:
+        places = {ssh_map.dstates[s].place for s in piece} - {None}
+        yield replace(Cost.of(ssh_map), dstates=len(piece), places=len(places), paths=0)
+
+
+def _joint_maps(
+    existing: ExistingMap, old: Trace, ssh_map: SSHMap, trace: Trace, problem: Problem
+) -> Iterator[SSHMap]:
+    """Yield joint maps that keep each piece of the old map. The caller has to check them."""
+    digest = Digest.of(old, ssh_map, short=True)
+    short = existing.with_displacements(digest.trace, digest.labels)
+    with warnings.catch_warnings():  # ignore that a digest may equal the new drives
+        warnings.simplefilter("ignore")
+        part = together([replace(short, odometry=old.odometry), trace])
+    theory, labels = problem.theory, ssh_map.dstate_at
+    # The joint map is checked against all that a user asserts.
+    asserted = theory.replace(
+        same=(),
+        different=tuple(digest.moved(theory.different, labels)),
+        elsewhere=tuple(digest.moved(theory.elsewhere, labels)),
+        same_place=(),
+    )
+    for found in existing.maps(Problem.of(part, asserted), digest.labels):
+        if whole := _of_all(found, digest.labels_of_all(found, ssh_map), problem):
+            yield whole
+
+
+def _of_all(found: SSHMap, labels: tuple[int, ...], problem: Problem) -> SSHMap | None:
+    """Make a map of all drives from a map of a digest and labels; None if it breaks an axiom."""
+    order = [found.dstates[s] for s in dict.fromkeys(labels)]
+    facing = [-math.pi / 2 * (s.heading or 0) for s in order]  # only star=frame uses them
+    places = numbered(s.place for s in order)
+    whole = completed(problem.trace, problem.theory, numbered(labels), places, facing)
+    return replace(whole, starts=starts_of(problem.trace)) if whole else None
+
+
+@dataclass(frozen=True)
+class Digest:
+    """A short trace that the solver gets instead of the old drives.
+
+    Attributes:
+        trace: The short trace.
+        labels: For each step, its dstate in the existing map.
+        kept: For each dstate, the part of the existing map that must be kept; empty if the whole
+            map must be kept.
+    """
+
+    trace: Trace
+    labels: tuple[int, ...]
+    kept: Mapping[int, int] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, trace: Trace, ssh_map: SSHMap, *, short: bool) -> Digest:
+        """Make a digest of the drives of a map. If it is `short`, each link occurs only once."""
+        if not short:
+            return cls(trace, ssh_map.dstate_at)
+        shown = _observations(trace, ssh_map)
+        actions = {action.name: action for action in trace.actions}
+        steps: list[Step] = []
+        labels: list[int] = []
+        for trail in _trails(ssh_map):
+            if steps:
+                steps[-1] = replace(steps[-1], action=Action(f"standing {len(steps)}", "start"))
+            for s, action in trail:
+                done = None if action is None else actions[action]
+                steps.append(replace(shown[s][0], action=done))
+                labels.append(s)
+        for s, seen in shown.items():
+            for step in seen[1:]:
+                steps[-1] = replace(steps[-1], action=Action(f"standing {len(steps)}", "start"))
+                steps.append(replace(step, action=None))
+                labels.append(s)
+        return cls(Trace(tuple(steps), drive="standing"), tuple(labels))
+
+    def must_differ(self, dstate: int, other: int) -> bool:
+        """Whether two dstates of the existing map must stay two, and their places as they are."""
+        return dstate != other and self.kept.get(dstate) == self.kept.get(other)
+
+    def moved(
+        self, pairs: Iterable[tuple[int, int]], labels: Sequence[int]
+    ) -> list[tuple[int, int]]:
+        """Move pairs of steps of all drives to the trace of this digest and the new drives.
+
+        `labels` has the dstate of each step of the old drives. A pair of such steps at one dstate
+        is left out.
+        """
+        first, shift = first_index_of(self.labels), len(self.labels) - len(labels)
+        steps = (
+            tuple(first[labels[t]] if t < len(labels) else t + shift for t in pair)
+            for pair in pairs
+        )
+        return [(i, j) for i, j in steps if i != j]
+
+    def labels_of_all(self, found: SSHMap, ssh_map: SSHMap) -> tuple[int, ...]:
+        """Return the dstate of each step of all drives in the map `found`."""
+        number = dict(zip(self.labels, found.dstate_at, strict=False))
+        new = found.dstate_at[len(self.labels) :]
+        return (*(number[s] for s in ssh_map.dstate_at), *new)
+
+
+def _observations(trace: Trace, ssh_map: SSHMap) -> dict[int, list[Step]]:
+    """For each dstate, list the different observations made there, those with a view first."""
+    shown: dict[int, dict[object, Step]] = {s.id: {} for s in ssh_map.dstates}
+    for step, label in zip(trace.steps, ssh_map.dstate_at, strict=True):
+        shown[label].setdefault((step.view, step.star), step)
+    return {
+        s: sorted(
+            (Step(view=step.view, star=step.star) for step in seen.values()),
+            key=lambda step: step.view is None,
+        )
+        for s, seen in shown.items()
+    }
+
+
+def _trails(ssh_map: SSHMap) -> list[list[tuple[int, str | None]]]:
+    """Cover the links of a map by few trails, so that each link is in one trail.
+
+    A trail has pairs of a dstate and the action that leads to the next dstate, None at the end. A
+    dstate without links is a trail of its own.
+    """
+    leaving: dict[int, list[tuple[str, int]]] = {s.id: [] for s in ssh_map.dstates}
+    excess = dict.fromkeys(leaving, 0)
+    for s, action, x in sorted(ssh_map.links, reverse=True):
+        leaving[s].append((action, x))
+        excess[s] += 1
+        excess[x] -= 1
+    trails: list[list[tuple[int, str | None]]] = []
+    # First start trails at dstates that more links leave than reach: a trail must start there.
+    for start in sorted(leaving, key=lambda s: -excess[s]):
+        while leaving[start]:
+            trail: list[tuple[int, str | None]] = []
+            here = start
+            while leaving[here]:
+                action, there = leaving[here].pop()
+                trail.append((here, action))
+                here = there
+            trails.append([*trail, (here, None)])
+    visited = {s for trail in trails for s, _ in trail}
+    return trails + [[(s, None)] for s in leaving if s not in visited]

@@ -174,15 +174,10 @@ class Parts:
     def _engine_after(self, after: Parts) -> Engine:
         """Return the engine of an earlier search if it can take more steps, else a new engine."""
         before = after.prefixes.engine
-        is_outgrown = isinstance(before, StepEngine) and may_name(self.task)
         # A search that was interrupted may have stopped while clingo grounded a step.
-        is_partial = after.known.stopped == "interrupted" or not before.asker.intact
-        if (
-            isinstance(before, GrowingEngine)
-            and before.grows
-            and not is_outgrown
-            and not is_partial
-        ):
+        is_whole = after.known.stopped != "interrupted" and before.asker.intact
+        is_outgrown = isinstance(before, StepEngine) and may_name(self.task)
+        if is_whole and not is_outgrown and isinstance(before, GrowingEngine) and before.grows:
             return before.over(self.task)
         return new_engine(self.task)
 
@@ -191,11 +186,11 @@ class Parts:
         known, before = self.known, after.known
         if self.task.speedups.prefixes:
             known.bound, known.lower = before.bound, before.lower
-            solved, engine = before.status is Status.OPTIMAL, self.prefixes.engine
+            engine = self.prefixes.engine
             first = engine.size if isinstance(engine, StepEngine) else engine.next_size(engine.size)
-            self.prefixes.start = (
-                len(self.task.trace) if solved else max(prefixes.FIRST_PREFIX, first)
-            )
+            is_solved = before.status is Status.OPTIMAL
+            least = len(self.task.trace) if is_solved else prefixes.FIRST_PREFIX
+            self.prefixes.start = least if is_solved else max(least, first)
         if start.minimal is not None:
             known.status, known.best, known.cost = Status.OPTIMAL, start.minimal, before.cost
             known.raise_bound(known.cost[0] if known.cost else None)
@@ -315,7 +310,7 @@ class Answer:
         warning = None
         if self._first and self._first.fit:
             warning = units_warning(trace) or noise_warning(self._first, trace)
-        return Support(self._basis or self._basis_of(size), warning)
+        return Support(self._basis or self._basis_of(size)).warning_of(warning)
 
     def in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:
         """Sort the maps of each level into an order that is the same in each run.

@@ -17,8 +17,6 @@ from typing import NamedTuple
 
 from ssh_abduction.solver.asp.limits import RESERVE, Watch
 
-COUNT, COST, LATE = "maps are counted", "maps are weighed by cost", "after the search"
-
 
 @dataclass(frozen=True, slots=True)
 class SourceTurn:
@@ -26,7 +24,6 @@ class SourceTurn:
 
     Attributes:
         name: The name of the source.
-        when: The part of a search: COUNT, COST or LATE.
         problems: For which problems the source runs.
         why: Why it gets this share.
         share: The source ends when this share of the work left at its begin is done.
@@ -35,7 +32,6 @@ class SourceTurn:
     """
 
     name: str
-    when: str
     problems: str
     why: str
     share: float = 1.0
@@ -54,30 +50,19 @@ class SourceTurn:
         return watch.elapsed() + self.work(watch)
 
 
-TABLE = (
+COUNTED = (
     SourceTurn(
         "greedy merging",
-        COUNT,
         "causal theories, more than 24 steps",
         "It takes milliseconds, and clingo then only has to find a better map.",
     ),
     SourceTurn(
         "mending",
-        COUNT,
         "theories with faults, more than 24 steps",
         "It finds the fewest faults by solving traces without them.",
     ),
     SourceTurn(
-        "prefixes, first try",
-        COUNT,
-        "theories without frames, more than 24 steps",
-        "Most traces are solved by then. Later sources load numpy, which takes longer.",
-        share=0.4,
-        most=0.15,
-    ),
-    SourceTurn(
-        "prefixes, second try",
-        COUNT,
+        "prefixes",
         "theories without frames, more than 24 steps",
         "A trace that is not solved by then is seldom solved step by step.",
         share=0.4,
@@ -85,7 +70,6 @@ TABLE = (
     ),
     SourceTurn(
         "maps with frames",
-        COUNT,
         "the same, with the speed-up `framing`",
         "They are only candidates. Without any map they may take twice as long.",
         share=0.4,
@@ -93,84 +77,74 @@ TABLE = (
     ),
     SourceTurn(
         "exact search",
-        COUNT,
         "all",
         "It proves the minimum and lists all maps: prefixes, dstates first, or names.",
     ),
+)
+WEIGHED = (
     SourceTurn(
         "sketch",
-        COST,
         "all",
         "There must be a map before any long source begins.",
         share=0.4,
     ),
     SourceTurn(
         "smoothing",
-        COST,
         "displacements, no lifts or faults within a drive",
         "After a long way, poses that fit all closures are better than a beam.",
         until=0.3,
     ),
     SourceTurn(
         "joint drives",
-        COST,
         "several drives",
         "Joining the maps of single drives is cheaper than a beam over all drives.",
         until=0.5,
     ),
-    SourceTurn("beam of 1", COST, "up to 2,000 steps", "It finds most true maps.", until=0.7),
+    SourceTurn("beam of 1", "up to 2,000 steps", "It finds most true maps.", until=0.7),
     SourceTurn(
         "beam of 4",
-        COST,
         "up to 2,000 steps",
         "A map that a broad beam ends with is nearly always the best one.",
         until=0.6,
     ),
     SourceTurn(
         "beam of 16",
-        COST,
         "one drive on one floor",
         "With several drives or floors, a beam of 4 keeps as many hypotheses.",
         until=0.7,
     ),
     SourceTurn(
         "beams of logs",
-        COST,
         "logs of robots: all beams",
         "Smoothing has mostly found the best map there, and bounds need the work.",
         until=0.5,
     ),
     SourceTurn(
         "beams with wrong displacements",
-        COST,
         "theories with `jumped`: all beams",
         "They often drop the best map. The search for wrong displacements finds it.",
         until=0.4,
     ),
     SourceTurn(
         "beam without axioms",
-        COST,
         "a broad beam ended",
         "It says how much cheaper a map that breaks axioms would be.",
         until=0.8,
     ),
     SourceTurn(
         "fewest dstates, map known",
-        COST,
         "a map is known, and no faults are allowed",
         "It only finds the least number of dstates, if that is easy.",
         share=0.05,
     ),
     SourceTurn(
         "fewest dstates",
-        COST,
         "no map is known, or faults are allowed",
         "A map with the fewest dstates is the only one then.",
         share=0.4,
     ),
     SourceTurn(
         "forced joins",
-        COST,
         "no faults, up to 2,500 steps",
         "They raise the bound most. Without a limit, more than 10 units seldom help.",
         share=0.4,
@@ -178,46 +152,43 @@ TABLE = (
     ),
     SourceTurn(
         "scatter",
-        COST,
         "logs of robots, no wrong displacements",
         "It adds 5 to 22 % of the cost to the bound of logs, and cannot prove a map.",
         share=0.5,
     ),
     SourceTurn(
         "wrong displacements",
-        COST,
         "theories with `jumped`, more than 60 steps",
         "A local search over which displacements are wrong. No source proves such maps.",
     ),
     SourceTurn(
         "Benders cuts",
-        COST,
         "all but long traces with faults",
         "Clingo lists maps by counts, and each misfit excludes many. This is the proof.",
     ),
+)
+LATE = (
     SourceTurn(
         "estimated rivals",
-        LATE,
         "maps are weighed by cost",
         "The confidence counts rivals that no source found.",
         most=0.5,
     ),
     SourceTurn(
         "backbone",
-        LATE,
         "not all minimal maps are listed",
         "What all minimal maps share needs a search of its own.",
         share=0.2,
     ),
     SourceTurn(
         "reserve",
-        LATE,
         "no map is known",
         "The last part of the limit is for a sketch, so that there always is a map.",
         share=RESERVE,
     ),
 )
-TURNS = {turn.name: turn for turn in TABLE}
+TABLE = {"If maps are counted": COUNTED, "If maps are weighed by cost": WEIGHED, "In the end": LATE}
+TURNS = {turn.name: turn for part in TABLE.values() for turn in part}
 
 
 def turn(name: str) -> SourceTurn:

@@ -17,7 +17,7 @@ from functools import partial
 from itertools import groupby, zip_longest
 from typing import TYPE_CHECKING, Any, get_args
 
-from ssh_abduction.data.checks import an_instance, one_of
+from ssh_abduction.data.checks import one_of
 from ssh_abduction.data.drives import Drive, drives_of, with_floors, with_named_faults
 from ssh_abduction.data.errors import SolverError, TheoryError, brief
 from ssh_abduction.data.maps import SSHMap, checked_maps
@@ -98,6 +98,7 @@ class Search:
         theory: The theory. Each "auto" in it is replaced by the value that is used.
         limits: The limits of the search.
         clash: Consecutive steps that have no map by themselves; None if none are known.
+        parts: What the sources of the search share. A search for more steps may begin after it.
     """
 
     def __init__(
@@ -139,58 +140,19 @@ class Search:
             self.clash: range | None = None
             self._begun = False
             self._reasons, self._known_maps = begin.reasons, begin.known
-            self._parts = Parts(
+            self.parts = Parts(
                 problem, self.limits, checked_speedups(speedups), on_progress, begin, began
             )
             goes_on = begin.after is not None
-            self._counting = Counting(self._parts, self._solve_mended, goes_on=goes_on)
-            self._answer = Answer(self._parts)
+            self._counting = Counting(self.parts, self._solve_mended, goes_on=goes_on)
+            self._answer = Answer(self.parts)
             self._weighing: Weighing | None = None
             if self.theory.weigh == "cost":
                 from ssh_abduction.solver.costs.weighing import Weighing  # loads numpy
 
-                self._weighing = Weighing(self._parts)
+                self._weighing = Weighing(self.parts)
                 self._reasons = False  # what clingo proves about minimal maps is about counts
-                self._parts.rivals.reasons = False
-
-    @classmethod
-    def continuing(
-        cls,
-        after: Search | None,
-        trace: Trace,
-        theory: Theory,
-        *,
-        time_limit: float | None,
-        max_maps: int | None,
-        work_limit: float | None = None,
-        speedups: Speedups = ALL,
-        minimal: SSHMap | None = None,
-    ) -> Search:
-        """Make a search for a trace that has grown, which goes on from an earlier search.
-
-        Args:
-            after: The search for the first steps of the trace, which has ended; None to begin anew.
-            trace: The trace that has grown.
-            theory: The axioms and the preference, as in the search `after`.
-            time_limit: Seconds of wall-clock time; None for no limit.
-            work_limit: Units of work, as in `solve`; None for no limit.
-            max_maps: List at most this many maps; None lists all.
-            speedups: The speed-ups that are on.
-            minimal: A map of the trace that costs what `after` proved to be minimal, if there is
-                one. Then the minimal cost is known, and the search only lists maps.
-        """
-        if after is not None:
-            mend = "give the search of the steps before, or leave it out"
-            an_instance("after", after, Search, SolverError, mend=mend)
-        return cls(
-            trace,
-            theory,
-            time_limit=time_limit,
-            work_limit=work_limit,
-            max_maps=max_maps,
-            speedups=speedups,
-            _start=Start(after=after._parts if after else None, minimal=minimal),
-        )
+                self.parts.rivals.reasons = False
 
     def __repr__(self) -> str:
         best = f", best {counted(len(self.best.dstates), 'dstates')}" if self.best else ""
@@ -200,32 +162,32 @@ class Search:
     @property
     def status(self) -> Status:
         """What is proven so far, such as that `best` is minimal."""
-        return self._parts.known.status
+        return self.parts.known.status
 
     @property
     def bound(self) -> Bound:
         """The proven lower bounds so far on the counts of any map."""
-        return self._parts.known.bound
+        return self.parts.known.bound
 
     @property
     def best(self) -> SSHMap | None:
         """The best map of the whole trace so far; None before there is one."""
-        return self._parts.known.best
+        return self.parts.known.best
 
     @property
     def stopped(self) -> Stop | None:
         """Why the search ended before it was complete; None if it did not."""
-        return self._parts.known.stopped
+        return self.parts.known.stopped
 
     @property
     def complete(self) -> bool:
         """Whether all maps were given: all minimal ones and, with `within`, all others."""
-        return self._parts.known.complete
+        return self.parts.known.complete
 
     @property
     def count(self) -> int:
         """The number of maps given to the caller so far."""
-        return self._parts.known.count
+        return self.parts.known.count
 
     @property
     def cost(self) -> Cost | None:
@@ -241,17 +203,17 @@ class Search:
     @property
     def backbone(self) -> Backbone | None:
         """The backbone: what the minimal maps known so far share; None if none is known."""
-        return self._parts.rivals.backbone
+        return self.parts.rivals.backbone
 
     @property
     def prefix(self) -> int:
         """The number of first steps of the trace that were given to clingo."""
-        return self._parts.engine.size
+        return self.parts.engine.size
 
     @property
     def grounding(self) -> Grounding:
         """The numbers of rules and atoms of the ground program that clingo solved last."""
-        return self._parts.engine.asker.grounding
+        return self.parts.engine.asker.grounding
 
     def __iter__(self) -> Iterator[SSHMap]:
         from ssh_abduction.solver.derived_regions import (
@@ -272,7 +234,7 @@ class Search:
 
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
         """Yield the maps. `ranking` sorts maps of one cost; None keeps their order."""
-        drives, late = drives_of(self.trace), partial(_late, self._parts)
+        drives, late = drives_of(self.trace), partial(_late, self.parts)
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
             for ssh_map in ranking.ranked(maps, self.over, late) if ranking else maps:
@@ -287,7 +249,7 @@ class Search:
                 "search: expected to be iterated once, got a second time; make another Search"
             )
         self._begun = True
-        parts, known, watch = self._parts, self._parts.known, self._parts.watch
+        parts, known, watch = self.parts, self.parts.known, self.parts.watch
         engine = type(parts.engine).__name__
         _log.info("search of %r under %r, with %s", self.trace, self.theory, engine)
         watch.start()
@@ -316,7 +278,7 @@ class Search:
 
     def _searched(self) -> Iterator[Priced]:
         """Yield the maps of the search until it is complete. Store why it stops earlier, if so."""
-        parts, known, watch = self._parts, self._parts.known, self._parts.watch
+        parts, known, watch = self.parts, self.parts.known, self.parts.watch
         try:
             _begin_with(self._known_maps, parts, self._weighing)
             with heeding(watch.check):
@@ -339,7 +301,7 @@ class Search:
 
     def _find_least(self) -> None:
         """Find the least counts, or cost, of the maps."""
-        parts = self._parts
+        parts = self.parts
         # Some map by greedy merging: clingo then has to find a better one.
         if self.status is not Status.OPTIMAL and len(self.trace) > FEW_STEPS:
             parts.candidates.merge()
@@ -352,7 +314,7 @@ class Search:
 
     def _weighed_sources(self, weighing: Weighing) -> Iterator[Source]:
         """Yield the sources of a search that weighs maps: guesses, the fewest dstates, proofs."""
-        parts, watch = self._parts, self._parts.watch
+        parts, watch = self.parts, self.parts.watch
 
         def clashes() -> bool:
             twos = (range(t, t + 2) for t in range(len(self.trace) - 1))
@@ -389,7 +351,7 @@ class Search:
 
     def _run(self, sources: Iterable[Source], weighing: Weighing | None = None) -> None:
         """Run sources one after the other, each within its turn, while a map may be found."""
-        parts, watch = self._parts, self._parts.watch
+        parts, watch = self.parts, self.parts.watch
         for source in sources:
             if source.suits():
                 _log.debug("%s", source.turn.name)
@@ -415,8 +377,8 @@ class Search:
             mended,
             theory,
             max_maps=most or None,
-            speedups=self._parts.speedups,
-            _start=Start(around=None if late else self._parts.watch),
+            speedups=self.parts.speedups,
+            _start=Start(around=None if late else self.parts.watch),
             **limits,
         )
         maps = tuple(search.unranked())
@@ -432,7 +394,7 @@ class Search:
 
         Signal handlers and other threads may call this method.
         """
-        self._parts.watch.interrupted = True
+        self.parts.watch.interrupted = True
 
     def over(self) -> bool:
         """Whether a limit is reached or the search was interrupted.
@@ -440,13 +402,13 @@ class Search:
         If the clock stands still, restart it, as further work with the maps is under the same time
         limit.
         """
-        watch = self._parts.watch
+        watch = self.parts.watch
         if not watch.running:
             watch.start()
         try:
             watch.check()
         except LimitError as limit:
-            self._parts.known.stopped = limit.reason
+            self.parts.known.stopped = limit.reason
             return True
         return False
 
@@ -465,7 +427,7 @@ class Search:
             return replace(solution, support=replace(solution.support, weighed=weighed))
         if self._asked_weigh != "cost":
             return solution
-        return replace(solution, support=replace(solution.support, weigh_warning=COUNTED))
+        return replace(solution, support=solution.support.warning_of(COUNTED))
 
     def snapshot(self, stopped: Stop) -> Solution:
         """Make an answer while another thread still searches and cannot be stopped.
@@ -476,7 +438,7 @@ class Search:
             stopped: The reason to name in the answer, such as "time limit".
         """
         one_of("stopped", stopped, get_args(Stop), SolverError)
-        parts, known = self._parts, self._parts.known
+        parts, known = self.parts, self.parts.known
         # The other thread may change data that the sketch (a map without a search) reads. If this
         # raises an exception, the answer has no sketch.
         with suppress(Exception):
@@ -493,7 +455,7 @@ class Search:
             stopped: The reason to name in the answer, if the search ends now.
         """
         one_of("stopped", stopped, get_args(Stop), SolverError)
-        known = self._parts.known
+        known = self.parts.known
         best, status = known.best, known.status
         if best is not None and status is Status.UNKNOWN:
             status = Status.FEASIBLE

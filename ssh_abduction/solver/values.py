@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from typing import Any
 
@@ -51,13 +51,9 @@ class Cost:
         """Count the dstates, places, paths, excuses and faults of a map."""
         checked_map(ssh_map)
         faults = sum(round(10 * fault.cost) for fault in ssh_map.faults) / 10
-        return Cost(
-            len(ssh_map.dstates),
-            len(ssh_map.places),
-            len(ssh_map.paths),
-            len(ssh_map.excused),
-            faults,
-        )
+        kinds = (ssh_map.dstates, ssh_map.places, ssh_map.paths, ssh_map.excused)
+        dstates, places, paths, excuses = map(len, kinds)
+        return Cost(dstates, places, paths, excuses, faults)
 
     @property
     def tenths(self) -> int:
@@ -70,13 +66,8 @@ class Cost:
 
     def to_dict(self) -> dict[str, float]:
         """Return the counts by name. Excuses and faults are left out if there are none."""
-        counts: dict[str, float] = {
-            "dstates": self.dstates,
-            "places": self.places,
-            "paths": self.paths,
-        }
-        counts |= {"excuses": self.excuses} if self.excuses else {}
-        return {**counts, "faults": self.faults} if self.faults else counts
+        counts: dict[str, float] = asdict(self)
+        return {k: v for k, v in counts.items() if v or k not in ("excuses", "faults")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,14 +138,9 @@ class Bound:
 
     def to_dict(self) -> dict[str, float]:
         """Return the bounds that are proven, by name. "cost" is `tenths` in dstates."""
-        counts: dict[str, float | None] = {
-            "dstates": self.dstates,
-            "places": self.places,
-            "paths": self.paths,
-            "excuses": self.excuses,
-        }
-        counts["cost"] = None if self.tenths is None else self.tenths / 10
-        return {k: v for k, v in counts.items() if v is not None}
+        known = {name: bound for name, bound in asdict(self).items() if bound is not None}
+        tenths = known.pop("tenths", None)
+        return known if tenths is None else {**known, "cost": tenths / 10}
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,14 +225,11 @@ class Progress:
     @property
     def sentence(self) -> str:
         """The progress on one line, in words."""
-        best = (
-            "best "
-            + ", ".join(counted(getattr(self.cost, k), k) for k in ("dstates", "places", "paths"))
-            if self.cost
-            else "no map yet"
-        )
+        counts = ((getattr(self.cost, k), k) for k in ("dstates", "places", "paths") if self.cost)
+        best = ", ".join(counted(number, k) for number, k in counts)
         bound = ", ".join(f"{k} ≥ {v}" for k, v in self.bound.to_dict().items()) or "no bound yet"
         return (
-            f"clingo has {self.prefix} of {counted(self.steps, 'steps')}; {best}; {bound}; "
+            f"clingo has {self.prefix} of {counted(self.steps, 'steps')}; "
+            f"{f'best {best}' if best else 'no map yet'}; {bound}; "
             f"{counted(self.maps, 'maps')} listed; {self.seconds:.1f} s"
         )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -25,81 +25,61 @@ from ssh_abduction.theory.theory import Theory
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
-    """The parts of a solution's file that do not follow from its maps alone.
-
-    Attributes:
-        certificate: The proof that no map has fewer dstates; None if the file has none.
-        written_certificate: The certificate as in the file, with the actions that distinguish its
-            steps; None if the file has none.
-        warnings: Sentences that say what makes the trace suspicious.
-        explanation: Why there is no map, as in the file; None if the file does not say.
-        joins: The joins (pairs of steps at one place or dstate) of the first map that rest on
-            minimality alone.
-        drives: The drives of the trace; empty if the file does not say.
-        onto: The names of the old drives whose map had to be kept; empty if there are none.
-    """
-
-    certificate: Certificate | None
-    written_certificate: Mapping[str, Any] | None
-    warnings: tuple[str, ...]
-    explanation: Mapping[str, Any] | None
-    joins: tuple[Join, ...]
-    drives: tuple[Drive, ...]
-    onto: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Recorded:
-        """Read these parts from the record of a solution. Raises MapError if a field is wrong."""
-        may_be_object = read.maybe(read.mapping)
-        written, explanation = (
-            may_be_object(record.get(name), name) for name in ("certificate", "explanation")
-        )
-        drives = drives_in(read, record, steps)
-        return cls(
-            certificate=None if written is None else _certificate(read, written, steps),
-            written_certificate=written,
-            warnings=warnings_in(read, record),
-            explanation=explanation,
-            joins=joins_in(read, record, steps, drives),
-            drives=drives,
-            onto=tuple(map(str, read.list(record, "onto", optional=True))),
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class Support:
     """The data behind a solution's certificate and its warnings.
 
     Attributes:
         basis: The data for the certificate. None if the theory lacks an axiom that the
             certificate needs, or if the solution was read from a file.
-        odometry_warning: A sentence that warns of wrong odometry; None if there is nothing to warn
-            of.
-        weigh_warning: A sentence that says why maps were compared by counts instead of costs;
-            None if there is nothing to say.
+        warnings: Sentences that warn of wrong odometry, that say why maps were compared by counts
+            instead of costs, and that a corrected gateway keeps drives apart or a name is not used.
         weighed: The costs in nats and the rival maps, if maps were compared by cost; else None.
-        recorded: The certificate and warnings of the file, if the solution was read from a file;
-            else None.
         onto: The names of the old drives whose map had to be kept; empty if there are none.
-        correction_warnings: Warnings that a corrected gateway keeps drives apart, or that a name is
-            not used.
+        proof: The certificate of the file, if the solution was read from one that has it.
+        joins: The joins (pairs of steps at one place or dstate) of the first map that rest on
+            minimality alone, as in the file; None if the solution was not read from one.
+        drives: The drives of the trace, as in the file.
+        written: The fields "certificate", with the actions that distinguish its steps, and
+            "explanation", which says why there is no map, as far as they are in the file.
     """
 
     basis: Basis | None = None
-    odometry_warning: str | None = None
-    weigh_warning: str | None = None
+    warnings: tuple[str, ...] = ()
     weighed: Weighed | None = None
-    recorded: Recorded | None = None
     onto: tuple[str, ...] = ()
-    correction_warnings: tuple[str, ...] = ()
+    proof: Certificate | None = None
+    joins: tuple[Join, ...] | None = None
+    drives: tuple[Drive, ...] = ()
+    written: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @classmethod
+    def of_file(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Support:
+        """Read these data from the record of a solution. Raises MapError if a field is wrong."""
+        drives, weighed = drives_in(read, record, steps), record.get("weighed")
+        written = {
+            name: read.mapping(record[name], name)
+            for name in ("certificate", "explanation")
+            if record.get(name) is not None
+        }
+        proof = written.get("certificate")
+        return cls(
+            warnings=read.each(record, "warnings", read.text_called("a sentence"), True),
+            weighed=Weighed.from_dict(read, weighed, steps, drives) if weighed else None,
+            onto=read.each(record, "onto", read.text, True),
+            proof=None if proof is None else _certificate(read, proof, steps),
+            joins=_joins(read, record, steps, drives),
+            drives=drives,
+            written=written,
+        )
 
     @property
     def certificate(self) -> Certificate | None:
         """The proof that no map has fewer dstates, computed at first use; None if there is none."""
-        if self.recorded is not None:
-            return self.recorded.certificate
-        return self.basis.certificate if self.basis else None
+        return self.basis.certificate if self.basis else self.proof
+
+    def warning_of(self, *warnings: str | None) -> Support:
+        """Return the same data with more warnings. A warning that is None is left out."""
+        return replace(self, warnings=(*self.warnings, *filter(None, warnings)))
 
 
 def trace_in(record: Mapping[str, Any], where: str) -> Trace | None:
@@ -125,13 +105,7 @@ def drives_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> tuple
     return found
 
 
-def warnings_in(read: FieldReader, record: Mapping[str, Any]) -> tuple[str, ...]:
-    """Read the warnings about the trace. Raises MapError if one is not a text."""
-    sentence = read.text_called("a sentence")
-    return read.each(record, "warnings", sentence, optional=True)
-
-
-def joins_in(
+def _joins(
     read: FieldReader, record: Mapping[str, Any], steps: int, drives: tuple[Drive, ...]
 ) -> tuple[Join, ...]:
     """Read the joins of the first map that rest on minimality alone. Raises MapError."""
@@ -174,22 +148,28 @@ def theory_in(value: Any, where: str) -> Theory:
 
 def cost_in(read: FieldReader, value: Any, name: str) -> Cost:
     """Read the cost of a map from the field `name`. Raises MapError."""
-    record = read.mapping(value, name)
-    if unknown := set(record) - {*COUNTS, "faults"}:
-        raise read.wrong(name, f"numbers of {', '.join(COUNTS)} and faults", sorted(unknown))
-    counts = {k: read.whole(record.get(k, 0), f"{name}.{k}") for k in COUNTS}
-    return Cost(**counts, faults=read.not_negative(record.get("faults", 0.0), f"{name}.faults"))
+    counts, faults = _counts(read, value, name, "faults")
+    return Cost(**(dict.fromkeys(COUNTS, 0) | counts), faults=faults or 0.0)
 
 
 def bound_in(read: FieldReader, value: Any) -> Bound:
     """Read the proven lower bounds. Raises MapError."""
-    record = read.mapping(value, "bound")
-    counts = {str(k): read.whole(v, f"bound.{k}") for k, v in record.items() if k in COUNTS}
-    if unknown := set(record) - {*counts, "cost"}:
-        raise read.wrong("bound", f"numbers of {', '.join(COUNTS)}, or a cost", sorted(unknown))
-    if "cost" in record:
-        counts["tenths"] = round(10 * read.not_negative(record["cost"], "bound.cost"))
-    return Bound(**counts)
+    counts, cost = _counts(read, value, "bound", "cost")
+    return Bound(**counts, tenths=None if cost is None else round(10 * cost))
+
+
+def _counts(
+    read: FieldReader, value: Any, name: str, other: str
+) -> tuple[dict[str, int], float | None]:
+    """Read some counts of a map by name, and one other number. Raises MapError."""
+    record = read.mapping(value, name)
+    if unknown := set(record) - {*COUNTS, other}:
+        expected = f"numbers of {', '.join(COUNTS)} and {other}"
+        raise read.wrong(name, expected, sorted(map(str, unknown)))
+    counts: dict[str, int] = {
+        k: read.whole(record[k], f"{name}.{k}") for k in COUNTS if k in record
+    }
+    return counts, read.maybe(read.not_negative)(record.get(other), f"{name}.{other}")
 
 
 def effort_in(read: FieldReader, record: Mapping[str, Any]) -> Effort:

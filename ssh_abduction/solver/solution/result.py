@@ -37,7 +37,6 @@ from ssh_abduction.output import cards
 from ssh_abduction.solver.asp.limits import Stop
 from ssh_abduction.solver.geometry.ranking import weights
 from ssh_abduction.solver.solution.recorded import (
-    Recorded,
     Support,
     bound_in,
     cost_in,
@@ -108,10 +107,11 @@ class Solution(MapSequence):
 
     def _repr_html_(self) -> str:
         """Return the HTML for notebooks: how the search ended, the summary, and the first map."""
-        parts = [] if self.status is Status.UNSATISFIABLE else [cards.paragraph(self.summary)]
-        parts += [cards.paragraph(self.joined)] if self.joined else []
-        warnings = () if self.stopped == "interrupted" else self.warnings
-        parts += [cards.paragraph(f"warning: {warning}") for warning in warnings]
+        sentences = [] if self.status is Status.UNSATISFIABLE else [self.summary]
+        sentences += [self.joined] if self.joined else []
+        if self.stopped != "interrupted":
+            sentences += [f"warning: {warning}" for warning in self.warnings]
+        parts = [cards.paragraph(sentence) for sentence in sentences]
         if self.count > 1:
             title = f"{counted(self.count, 'maps')}; the first is shown below"
             parts.append(cards.folded(title, table_of_maps(self)))
@@ -119,33 +119,28 @@ class Solution(MapSequence):
             parts.append(cards.map_card(self.maps[0]))
         elif self.partial is not None:
             steps = counted(len(self.partial.dstate_at), "steps")
-            parts.append(
-                cards.paragraph(f"the best map of the first {steps}:")
-                + cards.map_card(self.partial)
-            )
-        took = (
-            f"{self.seconds.total:.2f} s, {self.effort.prefix} of {counted(self.steps, 'steps')} "
-            "given to clingo"
-        )
-        return cards.card(self.headline, *parts, cards.paragraph(took))
+            parts += [cards.paragraph(f"the best map of the first {steps}:")]
+            parts += [cards.map_card(self.partial)]
+        given = f"{self.effort.prefix} of {counted(self.steps, 'steps')} given to clingo"
+        took = cards.paragraph(f"{self.seconds.total:.2f} s, {given}")
+        return cards.card(self.headline, *parts, took)
 
     @property
     def drives(self) -> tuple[Drive, ...]:
         """The drives of the trace; empty if they are unknown."""
-        recorded = self.support.recorded.drives if self.support.recorded else ()
-        return recorded if self.trace is None else drives_of(self.trace)
+        return self.support.drives if self.trace is None else drives_of(self.trace)
 
     @property
     def headline(self) -> str:
         """A line with the status, the cost, and the number of minimal maps or the bound."""
         why = f" ({self.stopped})" if self.stopped else ""
-        steps = counted(self.steps, "steps")
+        steps, status = counted(self.steps, "steps"), self.status.value
         bounds = [f"{k} ≥ {v:g}" for k, v in self.bound.to_dict().items()]
         bound = ", ".join(bounds) or "no bound"
         if self.status is Status.UNSATISFIABLE:
-            return f"{self.status.value}: no map of {steps} satisfies the axioms"
+            return f"{status}: no map of {steps} satisfies the axioms"
         if self.cost is None:
-            return f"{self.status.value}{why}: no map of {steps} yet; {bound}"
+            return f"{status}{why}: no map of {steps} yet; {bound}"
         # Count only what maps by the theory have.
         has = {"places": self.theory.level != "causal", "paths": self.theory.has_paths}
         counts = ", ".join(
@@ -153,20 +148,17 @@ class Solution(MapSequence):
             for k, v in self.cost.to_dict().items()
             if has.get(k, True)
         )
+        least = self.levels[0].count if self.levels else self.count
+        minimal = "minimal maps"
         if self.weighed is not None:
-            counts += f"; {self.weighed.nats:.1f} nats"
+            counts, minimal = f"{counts}; {self.weighed.nats:.1f} nats", "maps"
             bound = f"each map costs {self.weighed.bound:.1f} or more"
         if self.status is Status.FEASIBLE:
-            return f"{self.status.value}{why}: {counts}; {bound}"
-        least = self.levels[0].count if self.levels else self.count
+            return f"{status}{why}: {counts}; {bound}"
+        of_cost = "" if self.weighed is None else " of least cost"
         more = f" and {counted(self.count - least, 'maps')} with more" if self.count > least else ""
         perhaps = "" if self.complete else f", perhaps more{why}"
-        minimal = (
-            counted(least, "minimal maps")
-            if self.weighed is None
-            else f"{counted(least, 'maps')} of least cost"
-        )
-        return f"{self.status.value}: {counts}; {minimal}{more}{perhaps}"
+        return f"{status}: {counts}; {counted(least, minimal)}{of_cost}{more}{perhaps}"
 
     @property
     def weighed(self) -> Weighed | None:
@@ -190,8 +182,8 @@ class Solution(MapSequence):
         follow from those listed are left out. Empty if maps are compared by cost, as then
         `probability` says how sure a join is, unless the search was stopped before.
         """
-        if self.support.recorded is not None:
-            return self.support.recorded.joins
+        if self.support.joins is not None:
+            return self.support.joins
         if self.theory.weigh == "cost" or self.trace is None or not self.maps:
             return ()
         return joins_by_minimality(self.trace, self.maps[0], self.theory)
@@ -306,11 +298,8 @@ class Solution(MapSequence):
         They are about a step that looks like noise, about the noise or the units of the odometry,
         about drives that a corrected gateway keeps apart, and about names that are not used.
         """
-        if self.support.recorded is not None:
-            return self.support.recorded.warnings
         noise = [self.noise.sentence(self.trace)] if self.noise and self.trace else []
-        others = (self.support.odometry_warning, self.support.weigh_warning)
-        return (*noise, *filter(None, others), *self.support.correction_warnings)
+        return (*noise, *self.support.warnings)
 
     @property
     def noise(self) -> Noise | None:
@@ -410,8 +399,8 @@ class Solution(MapSequence):
         if (false := next(contradictions(record, maps, steps, theory), None)) is not None:
             raise MapError(f"{where}: {false}; it was changed by hand, or cut")
         _check_steps(where, maps, steps, theory, trace)
-        recorded = Recorded.of(read, record, steps)
-        maps = tuple(with_named_faults(ssh_map, recorded.drives) for ssh_map in maps)
+        support = Support.of_file(read, record, steps)
+        maps = tuple(with_named_faults(ssh_map, support.drives) for ssh_map in maps)
         return cls(
             status=Status(record["status"]),
             maps=maps,
@@ -431,12 +420,7 @@ class Solution(MapSequence):
             if record.get("backbone") is None
             else Backbone.from_dict(record["backbone"], steps, f"{where}: backbone"),
             trace=trace,
-            support=Support(
-                recorded=recorded,
-                weighed=Weighed.from_dict(read, record["weighed"], steps, recorded.drives)
-                if record.get("weighed")
-                else None,
-            ),
+            support=support,
         )
 
 
@@ -539,13 +523,11 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
 
     `count` maps were written. The solution need not hold them.
     """
-    recorded, effort = solution.support.recorded, solution.effort
-    drives = () if recorded is None else recorded.drives
-    if recorded is None and solution.trace is not None:
-        drives = with_fingerprints(solution.trace)
-    certificate: Any = solution.certificate and solution.certificate.to_dict(solution.trace)
-    if recorded is not None and recorded.written_certificate is not None:
-        certificate = recorded.written_certificate
+    support, effort, trace = solution.support, solution.effort, solution.trace
+    drives, certificate = support.drives, dict[str, Any](support.written.get("certificate", {}))
+    if support.joins is None:  # not from a file
+        drives = () if trace is None else with_fingerprints(trace)
+        certificate = solution.certificate.to_dict(trace) if solution.certificate else {}
     listed = solution.minimal_listed
     end: dict[str, Any] = {
         "status": solution.status.value,
@@ -561,7 +543,7 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
     }
     # These fields are left out if they would say nothing.
     more: dict[str, Any] = {
-        "onto": solution.support.onto or (recorded and recorded.onto),
+        "onto": support.onto,
         "drives": drives,
         "backbone": None if listed and count == 1 else backbone,
         "levels": solution.within and [*solution.levels],
@@ -573,12 +555,12 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         "partial": solution.partial,
         "evidence": effort.evidence,
         "warnings": solution.warnings,
-        "explanation": recorded and recorded.explanation,
+        "explanation": support.written.get("explanation"),
     }
     # The levels of an answer without maps are an empty list.
     said = {name: value for name, value in more.items() if value or value == []}
-    written: dict[str, Any] = plain(end | said)
-    return written
+    plain_data: dict[str, Any] = plain(end | said)
+    return plain_data
 
 
 def table_of_maps(solution: Solution) -> str:

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any, Literal, TypeAlias
 
-from ssh_abduction.data.checks import a_text, a_whole_number
+from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.drives import Drive, DriveStep, named_steps
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.groups import first_index_of, indices_of, numbered
@@ -35,6 +35,17 @@ Pair: TypeAlias = tuple[int, int]
 Sort: TypeAlias = Literal["dstates", "places", "paths", "courses"]
 
 SORTS: tuple[Sort, ...] = ("dstates", "places", "paths", "courses")
+# What two steps that share a thing of each sort are; and the thing of one step, and of several.
+WORDS: dict[Sort, tuple[str, str, str]] = {
+    "dstates": ("one dstate", "dstate", "dstates"),
+    "places": ("at one place", "place", "places"),
+    "paths": ("along one path", "path", "paths"),
+    "courses": (
+        "along one path in one direction",
+        "direction along the path",
+        "directions along paths",
+    ),
+}
 PRINTED = 1000  # write at most this many pairs of steps to a file
 NAMED = 6  # name at most this many stretches of steps in a sentence
 REMEMBERED = 10_000  # remember this many assignments of names to classes, to compare each only once
@@ -178,27 +189,21 @@ class Backbone:
         Raises:
             MapError: A field is wrong. The message names it.
         """
-        a_text("where", where, MapError)
         a_whole_number("steps", steps, MapError, 1)
-        if (
-            not isinstance(data, Mapping)
-            or not isinstance(data.get("proven"), bool)
-            or "dstates" not in data
-        ):
+        read = FieldReader(where)
+        record = data if isinstance(data, Mapping) else {}
+        if not isinstance(proven := record.get("proven"), bool) or "dstates" not in record:
             raise MapError(
                 f"{where}: expected an object with proven and dstates, got {brief(data)}; write "
                 "it with solve --json"
             )
-        read = FieldReader(where)
-        dstates = _read_shared(read, data, "dstates", steps)
+        dstates = _read_shared(read, record, "dstates", steps)
         rest = {
-            sort: _read_shared(read, data, sort, steps, dstates.always)
+            sort: _read_shared(read, record, sort, steps, dstates.always)
             for sort in SORTS[1:]
-            if sort in data
+            if sort in record
         }
-        return cls(
-            dstates, rest.get("places"), rest.get("paths"), rest.get("courses"), data["proven"]
-        )
+        return cls(dstates, rest.get("places"), rest.get("paths"), rest.get("courses"), proven)
 
 
 class Sharing:
@@ -332,7 +337,7 @@ def _read_shared(
     step = read.within(0, steps - 1, f"a step from 0 to {steps - 1}")
     pairs = f"pairs of steps from 0 to {steps - 1}"
     count = len(set(of_step)) or steps
-    record = read.mapping(data[sort], sort)
+    record = read.mapping(data.get(sort), sort)
     shared = read.record(
         Shared,
         record,
@@ -377,25 +382,13 @@ def key_of(dstate: DState, sort: Sort) -> Hashable:
 
 def _differing_in_words(sort: Sort, shared: Shared, steps: Sequence[int]) -> str:
     """Say at which steps maps differ in dstates, places or another sort. `steps` has the names."""
+    one, whose, several = WORDS[sort]
     if len(shared.differing) == len(shared.sometimes) == 1:
-        one = {
-            "dstates": "one dstate",
-            "places": "at one place",
-            "paths": "along one path",
-            "courses": "along one path in one direction",
-        }[sort]
         first, later = (steps[t] for t in shared.sometimes[0])
         return f"steps {first} and {later} are {one} in some of them"
-    whose = {
-        "dstates": "dstate",
-        "places": "place",
-        "paths": "path",
-        "courses": "direction along the path",
-    }[sort]
     if len(shared.differing) == 1:
         return f"the {whose} of step {steps[shared.differing[0]]} differs"
-    whose = {"courses": "directions along paths"}.get(sort, f"{whose}s")
-    return f"the {whose} of steps {stretches([steps[t] for t in shared.differing])} differ"
+    return f"the {several} of steps {stretches([steps[t] for t in shared.differing])} differ"
 
 
 def stretches(steps: Sequence[int]) -> str:
@@ -406,19 +399,17 @@ def stretches(steps: Sequence[int]) -> str:
     """
     runs: list[list[int]] = []
     for step in steps:
-        goes_on = runs and step == runs[-1][-1] + 1
-        if goes_on and not (isinstance(step, DriveStep) and step == step.first):
+        begins_drive = isinstance(step, DriveStep) and step == step.first
+        if runs and step == runs[-1][-1] + 1 and not begins_drive:
             runs[-1].append(step)
         else:
             runs.append([step])
-    parts = [f"{s[0]}–{_bare(s[-1])}" if len(s) > 1 else str(s[0]) for s in runs[:NAMED]]
+    parts = []
+    for first, *_, last in ([*run, run[-1]] for run in runs[:NAMED]):
+        in_drive = last - last.first if isinstance(last, DriveStep) else last
+        parts.append(str(first) if first == last else f"{first}–{in_drive}")
     more = sum(map(len, runs[NAMED:]))
     return _listed([*parts, f"{more} more"] if more else parts)
-
-
-def _bare(step: int) -> int:
-    """Return the number of a step in its drive."""
-    return step - step.first if isinstance(step, DriveStep) else step
 
 
 def _listed(words: Sequence[str]) -> str:

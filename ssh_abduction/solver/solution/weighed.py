@@ -57,6 +57,11 @@ class Rival:
     estimated: bool = False
     faults: tuple[tuple[str, int], ...] = ()
 
+    @property
+    def at(self) -> tuple[int, ...]:
+        """The place of each step; the dstate of each step for a causal map."""
+        return self.places or self.dstates
+
     def to_dict(self) -> dict[str, Any]:
         """Return the rival as plain data."""
         written: dict[str, Any] = {"nats": round(self.nats, 6), "dstates": list(self.dstates)}
@@ -129,14 +134,9 @@ class Weighed:
         best, starts = self.rivals[0], sorted({*self.gaps, *(d.first for d in self.drives)})
         part = [bisect_right(starts, t) for t in range(len(best.dstates))]
         both = [*zip(best.dstates, rival.dstates, strict=True)]
+        named = (rival.at, best.at, both, best.dstates)
         groups, of_best, common, dstates = (
-            groups_of(at, part, range(len(starts) + 1))
-            for at in (
-                rival.places or rival.dstates,
-                best.places or best.dstates,
-                both,
-                best.dstates,
-            )
+            groups_of(names, part, range(len(starts) + 1)) for names in named
         )
         return groups == of_best and common == dstates
 
@@ -166,13 +166,9 @@ class Weighed:
         It is that of all rivals with the same places, computed as `confidence`. Equal to
         `confidence` for a causal map.
         """
-        best = self.rivals[0]
-        alike = (
-            w
-            for w, rival in zip(self.weights, self.rivals, strict=True)
-            if rival is best or (best.places and rival.places == best.places)
-        )
-        return self._confidence(math.fsum(alike))
+        best, rivals = self.rivals[0], zip(self.weights, self.rivals, strict=True)
+        share = math.fsum(w for w, r in rivals if r is best or r.places == best.places != ())
+        return self._confidence(share)
 
     def _confidence(self, share: float) -> float | None:
         """Return the confidence in maps that have this share of the weights of all rivals."""
@@ -189,16 +185,9 @@ class Weighed:
             second: The number of another step.
             of: What the steps may share: "dstate" or "place".
         """
-        are_one = self._are_one(first, second, of)
-        return math.fsum(w for w, is_one in zip(self.weights, are_one, strict=True) if is_one)
-
-    def _are_one(self, first: int, second: int, of: str) -> list[bool]:
-        """Return for each rival whether two steps are at one dstate, or at one place.
-
-        Without places, `of` "place" compares dstates.
-        """
-        named = (r.dstates if of == "dstate" or not r.places else r.places for r in self.rivals)
-        return [names[first] == names[second] for names in named]
+        named = (r.dstates if of == "dstate" else r.at for r in self.rivals)
+        weighed = zip(self.weights, named, strict=True)
+        return math.fsum(w for w, names in weighed if names[first] == names[second])
 
     @cached_property
     def joins(self) -> tuple[tuple[int, int, float], ...]:
@@ -210,13 +199,12 @@ class Weighed:
         """
         if self.doubt is not None:
             return ()
-        best = self.rivals[0]
-        at, of = (best.places, "place") if best.places else (best.dstates, "dstate")
+        at = self.rivals[0].at
         last: dict[int, int] = {}
         joins = list[tuple[int, int, float]]()
         for step, name in zip(named_steps(self.drives, len(at)), at, strict=True):
             if step - last.get(name, step) > 1:
-                joins.append((last[name], step, self.probability(last[name], step, of)))
+                joins.append((last[name], step, self.probability(last[name], step, "place")))
             last[name] = step
         return tuple(sorted(joins, key=lambda join: round(join[2], TOLD)))
 
@@ -227,7 +215,7 @@ class Weighed:
         Each step is given by its name, and the third value is the probability. None if no rival has
         such steps at one place, or if there is a `doubt`.
         """
-        best = self.rivals[0].places or self.rivals[0].dstates
+        best = self.rivals[0].at
         apart = [told for told in self._pairs("place") if best[told[0]] != best[told[1]]]
         return self._named(max(apart, key=lambda told: round(told[2], TOLD), default=None))
 
@@ -281,43 +269,40 @@ class Weighed:
         # Name one pair of steps: the one for which it is least sure whether they are one dstate.
         doubted = 1 - self.joins[0][2] if self.joins else 0.0
         if self.missed and self.missed[2] > max(doubted, DOUBTED):
-            first, second, probability = self.missed
-            sure = probability_in_words(probability) + given
-            return f"{text}; steps {first} and {second} may be at one place, too ({sure})"
+            steps, sure = _told(self.missed)
+            return f"{text}; {steps} may be at one place, too ({sure}{given})"
         if self.unsure and doubted <= DOUBTED <= self.unsure[2] <= 1 - DOUBTED:
-            first, second, probability = self.unsure
-            sure = probability_in_words(probability) + given
+            steps, sure = _told(self.unsure)
             two = "two dstates of one place" if self.rivals[0].places else "two dstates"
-            return (
-                f"{text}; steps {first} and {second} are one dstate with probability {sure}, "
-                f"else {two}"
-            )
+            return f"{text}; {steps} are one dstate with probability {sure}{given}, else {two}"
         if not self.joins:
             return f"{text}; the best map joins no two visits"
-        first, second, probability = self.joins[0]
-        sure = probability_in_words(probability)
         if not self.finished:
             if len(self.rivals) == 1:
                 return f"{text}; no other map was found, so it is unknown which joins are doubtful"
             given = f" among the {len(self.rivals)} maps found"
-        join = f"the most doubtful join, of steps {first} and {second}"
-        return f"{text}; {join}, has probability {sure}{given}"
+        steps, sure = _told(self.joins[0])
+        return f"{text}; the most doubtful join, of {steps}, has probability {sure}{given}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the costs as plain data."""
-        return {
-            "nats": round(self.nats, 6),
-            "bound": round(self.bound, 6),
-            "within": round(self.within, 6),
+        names = ("nats", "bound", "within", "broken", "excess", "confidence", "place_confidence")
+        numbers = {name: getattr(self, name) for name in names}
+        written = {
+            **{name: None if x is None else round(x, 6) for name, x in numbers.items()},
             "searched": self.searched,
-            **({"broken": round(self.broken, 6)} if math.isfinite(self.broken) else {}),
-            **({"excess": round(self.excess, 6)} if self.excess > 1 else {}),
-            **({} if self.doubt is None else {"doubt": self.doubt}),
-            **({"gaps": list(self.gaps)} if self.gaps else {}),
-            "confidence": _rounded(self.confidence),
-            "place_confidence": _rounded(self.place_confidence),
+            "doubt": self.doubt,
+            "gaps": list(self.gaps),
             "rivals": [rival.to_dict() for rival in self.rivals],
         }
+        # These fields are left out if they would say nothing.
+        told = {
+            "broken": math.isfinite(self.broken),
+            "excess": self.excess > 1,
+            "doubt": self.doubt is not None,
+            "gaps": self.gaps,
+        }
+        return {name: value for name, value in written.items() if told.get(name, True)}
 
     @classmethod
     def from_dict(
@@ -356,9 +341,9 @@ class Weighed:
         return replace(found, drives=drives)
 
 
-def _rounded(probability: float | None) -> float | None:
-    """Round a probability to six decimals, as files have it."""
-    return None if probability is None else round(probability, 6)
+def _told(pair: tuple[int, int, float]) -> tuple[str, str]:
+    """Name two steps, and say the probability that they are one, in words."""
+    return f"steps {pair[0]} and {pair[1]}", probability_in_words(pair[2])
 
 
 def probability_in_words(probability: float) -> str:

@@ -83,18 +83,17 @@ class Certificate:
             trace: The trace, for the words. If it is None, or the words have more than WRITTEN
                 actions together, there are no words.
         """
+        written: dict[str, Any] = {"clique": list(self.clique), "refuted": list(self.refuted)}
         if trace is None:
-            return {"clique": list(self.clique), "refuted": list(self.refuted)}
+            return written
         checked_trace(trace)
-        words: list[list[Any]] = []
-        written = 0
+        words, actions = list[list[Any]](), 0
         for i, j in self._pairs_alike(trace):
-            word = _word(trace, i, j)
-            words.append([i, j, list(word)])
-            written += len(word)
-            if written > WRITTEN:
-                return {"clique": list(self.clique), "refuted": list(self.refuted)}
-        return {"clique": list(self.clique), "words": words, "refuted": list(self.refuted)}
+            words.append([i, j, list(_word(trace, i, j))])
+            actions += len(words[-1][2])
+            if actions > WRITTEN:
+                return written
+        return {**written, "words": words}
 
     def _pairs_alike(self, trace: Trace) -> Iterator[tuple[int, int]]:
         """Yield only the pairs of steps of the clique that show the same view, in order."""

@@ -21,7 +21,7 @@ them (`intransitive`). Without them clingo solves a relaxation, so its bounds ho
 
 *Few visits.* Of a long trace, clingo first gets the visits of the clique, and some of the first
 visits, such that few pairs of them may be at one place. Mostly an answer also determines the places
-of all other visits (`steps/localising.py`). If not, clingo gets further visits. Fewer visits are a
+of all other visits (`steps/chart.py`). If not, clingo gets further visits. Fewer visits are a
 relaxation, and an answer that locates all visits is an answer for all of them.
 """
 
@@ -50,8 +50,7 @@ from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.fitting import Member
 from ssh_abduction.solver.steps.apart import clique
-from ssh_abduction.solver.steps.chart import Chart, FramedChart
-from ssh_abduction.solver.steps.localising import Located, State, faced, located
+from ssh_abduction.solver.steps.chart import Chart, FramedChart, Located, State, faced, located
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.pairs import pairs_in
