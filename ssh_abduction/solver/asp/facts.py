@@ -236,76 +236,34 @@ CAUSAL = Theory.causal()
 
 def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
     """Make a map from an answer set of the readable encodings, perhaps of the first steps only."""
-    is_at: dict[int, int] = {}
-    place: dict[int, int] = {}
-    course: dict[int, tuple[int, int]] = {}
-    heading: dict[int, int] = {}
-    shape: dict[int, int] = {}
-    before: list[tuple[int, int, int]] = []
-    excused: list[tuple[int, int]] = []
+    # 1. Read the atoms. They name dstates and places by steps.
+    found: dict[str, list[tuple[int, ...]]] = {}
     faults: list[tuple[int, str]] = []
     for name, args in map(read_atom, model.symbols(shown=True)):
-        if name == "is":
-            is_at[args[0]] = args[1]
-        elif name == "at":
-            place[args[0]] = args[1]
-        elif name == "along":
-            course[args[0]] = (args[1], args[2])
-        elif name == "before":
-            before.append((args[0], args[1], args[2]))
-        elif name == "heading":
-            heading[args[0]] = args[1]
-        elif name == "shape":
-            shape[args[0]] = args[1]
-        elif name == "excused":
-            excused.append((args[0], args[1]))
-        elif name in FAULTS:
+        found.setdefault(name, []).append(args)
+        if name in FAULTS:
             faults.append((args[0], name))
+    is_at, place, heading, shape = (
+        {args[0]: args[1] for args in found.get(name, ())}
+        for name in ("is", "at", "heading", "shape")
+    )
+    course = {t: (path, direction) for t, path, direction in found.get("along", ())}
     if theory.star == "gateways":
-        found = frames.Frames(trace, len(is_at), changes=bool(theory.changed)).frames
+        seen = frames.Frames(trace, len(is_at), changes=bool(theory.changed)).frames
         heading = {
-            t: frames.heading(found[shape[p]], found[shape[t]], heading[t])
-            for t, p in place.items()
+            t: frames.heading(seen[shape[p]], seen[shape[t]], heading[t]) for t, p in place.items()
         }
-    read = _map(trace, is_at, place, course, heading, before, excused, faults, theory)
-    return with_changes(read, trace, theory) or read
-
-
-def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
-    """Read the dstate and the place (or None) of each step from an answer that may break axioms."""
-    found: dict[str, dict[int, int]] = {"is": {}, "at": {}}
-    for name, args in map(read_atom, model.symbols(shown=True)):
-        if name in found:
-            found[name][args[0]] = args[1]
-    steps = range(len(found["is"]))
-    return tuple(found["is"][t] for t in steps), tuple(found["at"].get(t) for t in steps)
-
-
-def _map(
-    trace: Trace,
-    is_at: Mapping[int, int],
-    place: Mapping[int, int],
-    course: Mapping[int, tuple[int, int]],
-    heading: Mapping[int, int],
-    before: Iterable[tuple[int, int, int]],
-    excused: Iterable[tuple[int, int]],
-    faults: Sequence[tuple[int, str]],
-    theory: Theory,
-) -> SSHMap:
-    """Make a map from the atoms of an answer, which name a dstate or place by its first step.
-
-    `course` has the path and the direction of each step that is along a path. `heading` has the
-    heading of each step, if places have frames or gateways. `before` has triples of a path and two
-    places on it, the earlier one first. The theory has the costs of faults.
-    """
-    # Atoms name things by steps. A map numbers them from 0, in the order of these names.
+    # 2. Number dstates, places and paths from 0, in the order of these names.
     views = views_of(is_at, trace, faults)
     names = sorted(set(is_at.values()))
-    dstate_of = {name: i for i, name in enumerate(names)}
-    place_of = {name: i for i, name in enumerate(sorted({place[s] for s in names if s in place}))}
-    path_of = {
-        name: i for i, name in enumerate(sorted({course[s][0] for s in names if s in course}))
-    }
+    dstate_of, place_of, path_of = (
+        {name: i for i, name in enumerate(sorted(set(some)))}
+        for some in (
+            names,
+            (place[s] for s in names if s in place),
+            (course[s][0] for s in names if s in course),
+        )
+    )
     dstates = tuple(
         DState(
             id=dstate_of[s],
@@ -318,22 +276,40 @@ def _map(
         for s in names
     )
     labels = tuple(dstate_of[is_at[t]] for t in range(len(is_at)))
-    pairs = [
-        (path_of[h], place_of[p], place_of[q])
-        for h, p, q in before
-        if h in path_of and p in place_of and q in place_of
-    ]
-    return SSHMap(
+    # 3. Sort the places of each path.
+    on: list[set[int]] = [set() for _ in path_of]
+    for dstate in dstates:
+        if dstate.path is not None and dstate.place is not None:
+            on[dstate.path].add(dstate.place)
+    before: list[list[tuple[int, int]]] = [[] for _ in path_of]
+    for h, p, q in found.get("before", ()):
+        pair = place_of.get(p, -1), place_of.get(q, -1)
+        if h in path_of and on[path_of[h]].issuperset(pair):
+            before[path_of[h]].append(pair)
+    excused = ((path_of.get(h, -1), path_of.get(g, -1)) for h, g in found.get("excused", ()))
+    ssh_map = SSHMap(
         dstate_at=labels,
         dstates=dstates,
         links=links_of(labels, trace, faults),
         places=tuple(place_of.values()),
-        paths=_paths(len(path_of), dstates, pairs),
-        excused=tuple(
-            sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)
+        paths=tuple(
+            MapPath(path, tuple(places_in_order(some, before[path])))
+            for path, some in enumerate(on)
         ),
+        excused=tuple(sorted(pair for pair in excused if min(pair) >= 0)),
         faults=faults_of(faults, is_at, views, trace, theory),
     )
+    return with_changes(ssh_map, trace, theory) or ssh_map
+
+
+def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
+    """Read the dstate and the place (or None) of each step from an answer that may break axioms."""
+    found: dict[str, dict[int, int]] = {"is": {}, "at": {}}
+    for name, args in map(read_atom, model.symbols(shown=True)):
+        if name in found:
+            found[name][args[0]] = args[1]
+    steps = range(len(found["is"]))
+    return tuple(found["is"][t] for t in steps), tuple(found["at"].get(t) for t in steps)
 
 
 def views_of(
@@ -369,23 +345,6 @@ def causal_map(
         tuple(DState(i, view) for i, view in views.items()),
         links_of(found, trace, faults),
         faults=faults_of(faults, is_at, views, trace, theory),
-    )
-
-
-def _paths(
-    count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]
-) -> tuple[MapPath, ...]:
-    """Make paths from triples of a path and two of its places, the earlier place first."""
-    on: list[set[int]] = [set() for _ in range(count)]
-    for s in dstates:
-        if s.path is not None and s.place is not None:
-            on[s.path].add(s.place)
-    pairs: list[list[tuple[int, int]]] = [[] for _ in range(count)]
-    for path, p, q in before:
-        if p in on[path] and q in on[path]:
-            pairs[path].append((p, q))
-    return tuple(
-        MapPath(path, tuple(places_in_order(found, pairs[path]))) for path, found in enumerate(on)
     )
 
 

@@ -95,11 +95,12 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
                 f"{where}: expected rules, got {_short(statement)}; "
                 "what is minimised and shown is chosen by the theory"
             )
-        for function in _functions_of_python(statement):
-            raise TheoryError(
-                f"{where}: expected rules without functions of Python, got {function}; "
-                "write rules that derive its value"
-            )
+        for node, _ in _walk(statement):
+            if node.ast_type is ast.ASTType.Function and node.external:
+                raise TheoryError(
+                    f"{where}: expected rules without functions of Python, got {node}; "
+                    "write rules that derive its value"
+                )
         if statement.ast_type is ast.ASTType.Rule:
             _check_head(statement, where, predicates, {axiom.name for axiom in rules.axioms})
             _check_body((statement, part, parameter), where, predicates, own)
@@ -117,14 +118,16 @@ def _check_head(
                 f"{where}: expected a rule that reads {name}, got one that defines it; "
                 "derive violation(name,t), or an atom of your own"
             )
-    for atom in _derived(rule.head):
-        if atom.name == "violation" and len(atom.arguments) not in numbers["violation"]:
+    violations = [atom for atom in _derived(rule.head) if atom.name == "violation"]
+    for atom in violations:
+        if len(atom.arguments) not in numbers["violation"]:
             raise TheoryError(
                 f"{where}: {atom}: expected {_counted(numbers['violation'])}, "
                 f"got {len(atom.arguments)}; derive violation(name,t)"
             )
-    for violated in _violations(rule):
-        if violated not in axioms:
+    for violated in (atom.arguments[0] for atom in violations):
+        is_name = violated.ast_type is ast.ASTType.SymbolicTerm
+        if is_name and str(violated) not in axioms:
             raise TheoryError(
                 f"{where}: violation({violated},…): expected a sentence for it; "
                 f"write % @axiom({violated}) and what it says, on a line before"
@@ -268,22 +271,11 @@ def _heads(statement: ast.AST) -> Iterator[str]:
         yield from (atom.name for atom, _ in _atoms_in(statement.atom))
 
 
-def _violations(statement: ast.AST) -> Iterator[str]:
-    """Yield the names of the axioms whose violations a rule derives."""
-    for atom in _derived(statement.head):
-        if (
-            atom.name == "violation"
-            and atom.arguments
-            and atom.arguments[0].ast_type is ast.ASTType.SymbolicTerm
-        ):
-            yield str(atom.arguments[0])
-
-
 def _derived(head: ast.AST) -> Iterator[ast.AST]:
     """Yield the atoms that the head of a rule derives, without the atoms of its conditions."""
     if head.ast_type is ast.ASTType.ConditionalLiteral:
-        yield from (atom for atom, _ in _atoms_in(head.literal))
-    elif head.ast_type is ast.ASTType.Literal:
+        head = head.literal
+    if head.ast_type is ast.ASTType.Literal:
         yield from (atom for atom, _ in _atoms_in(head))
     else:
         yield from (atom for child in _children(head) for atom in _derived(child))
@@ -301,18 +293,23 @@ def _atoms(statement: ast.AST) -> Iterator[tuple[ast.AST, bool]]:
     )
 
 
-def _atoms_in(node: ast.AST, positive: bool = True) -> Iterator[tuple[ast.AST, bool]]:
+def _atoms_in(tree: ast.AST) -> Iterator[tuple[ast.AST, bool]]:
     """Yield all atoms in a syntax tree, each with a flag: False if `not` stands before it."""
-    if node.ast_type is ast.ASTType.SymbolicAtom:
-        term = node.symbol
-        while term.ast_type is ast.ASTType.UnaryOperation:  # classical negation
-            term = term.argument
-        if term.ast_type is ast.ASTType.Function:
-            yield term, positive
-        return
+    for node, positive in _walk(tree):
+        if node.ast_type is ast.ASTType.SymbolicAtom:
+            term = node.symbol
+            while term.ast_type is ast.ASTType.UnaryOperation:  # classical negation
+                term = term.argument
+            if term.ast_type is ast.ASTType.Function:
+                yield term, positive
+
+
+def _walk(node: ast.AST, positive: bool = True) -> Iterator[tuple[ast.AST, bool]]:
+    """Yield all nodes of a syntax tree, each with a flag: False if `not` stands before it."""
+    yield node, positive
     negated = node.ast_type is ast.ASTType.Literal and node.sign != ast.Sign.NoSign
     for child in _children(node):
-        yield from _atoms_in(child, positive and not negated)
+        yield from _walk(child, positive and not negated)
 
 
 def _children(node: ast.AST) -> Iterator[ast.AST]:
@@ -326,14 +323,6 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
         )
 
 
-def _functions_of_python(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield all terms in a syntax tree that call Python functions."""
-    if node.ast_type is ast.ASTType.Function and node.external:
-        yield node
-    for child in _children(node):
-        yield from _functions_of_python(child)
-
-
 def _counted(numbers: frozenset[int]) -> str:
     """Say how many arguments are possible, such as "2 or 3 arguments"."""
     return f"{' or '.join(map(str, sorted(numbers)))} arguments"
@@ -341,9 +330,9 @@ def _counted(numbers: frozenset[int]) -> str:
 
 def _is_settled(term: ast.AST, parameter: str) -> bool:
     """Whether a term contains neither a variable nor the parameter of its program part."""
-    if term.ast_type is ast.ASTType.Variable or str(term) == parameter:
-        return False
-    return all(_is_settled(child, parameter) for child in _children(term))
+    return not any(
+        node.ast_type is ast.ASTType.Variable or str(node) == parameter for node, _ in _walk(term)
+    )
 
 
 def _short(statement: ast.AST) -> str:
