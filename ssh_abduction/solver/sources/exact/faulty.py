@@ -349,7 +349,11 @@ class FaultyControl:
         self._most_faults, self._on_bound = most_faults, on_bound
         free = most_faults is not None
         self._price = {kind: [0] * len(some) if free else some for kind, some in price.items()}
-        self.forget()
+        # What the present control was given: names and full steps, steps in their order, batches,
+        # and the number of forbidden sets.
+        self._began: tuple[dict[int, int], set[int]] = {}, set()
+        self._steps: list[int] = []
+        self._batches = self._ruled_out = 0
 
     @property
     def has_all(self) -> bool:
@@ -380,10 +384,7 @@ class FaultyControl:
 
     def forget(self) -> None:
         """Use a new control for the next question. Clingo was stopped, and may lack rules."""
-        # What the present control was given: names and full steps, steps in their order, batches,
-        # and the number of forbidden sets.
-        self._began: tuple[dict[int, int], set[int]] = {}, set()
-        self._steps: list[int] = []
+        self._began, self._steps = ({}, set()), []
         self._batches = self._ruled_out = 0
 
     def _prepare(self) -> None:

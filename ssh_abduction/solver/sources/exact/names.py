@@ -348,6 +348,9 @@ class NameProgram:
         asker.watch.check()
         self._one = pairs_in(task.log.pairs.one)
         self._spares: dict[int, int] = {}  # the number of spare names of each view, without rest
+        # The spare names of each view, the last of which is the rest, and the names of each node.
+        self._spare: dict[int, list[int]] = {}
+        self._choices: list[list[int]] = []
         # Dstates for whose paths clingo has the axioms of order and sides.
         self._sides: dict[_Key, None] = {}
         # What the present control was given: links and nodes; for each view the last node that may
@@ -394,8 +397,7 @@ class NameProgram:
         """Make a control with the present names, some links, and the rules that exclude labels."""
         with self._asker.grounding_timed():
             seen, number = self.chart.seen, len(self.clique)
-            # The spare names of each view. The last one is the rest.
-            self._spare: dict[int, list[int]] = {}
+            self._spare = {}
             for view, count in self._spares.items():
                 self._spare[view] = list(range(number, number + count + 1))
                 number += count + 1
