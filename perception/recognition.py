@@ -472,16 +472,10 @@ class TellingFeatures:
     if no feature helps. The module describes the methods.
     """
 
-    margin: Floats  # (d,) shares by margin
-    permutation: Floats  # (d,) shares by permutation
-    linear: Floats  # (d,) shares by logistic regression
+    methods: dict[str, Floats]  # (d,) shares by method: margin, permutation, linear
     # Share of images whose nearest other image is of their own dstate, from 0 to 1. At about 0.5
     # the dstates look the same, and the shares above mean nothing.
     recognised: float
-
-    @property
-    def methods(self) -> dict[str, Floats]:
-        return {"margin": self.margin, "permutation": self.permutation, "linear": self.linear}
 
 
 def telling_features(
@@ -527,12 +521,13 @@ def telling_features(
     far = np.linalg.norm(images - images[miss], axis=1) - np.linalg.norm(
         images - images[hit], axis=1
     )
-    return TellingFeatures(
-        _shares(margin),
-        _shares(_permuted(images, second, random_state)),
-        _shares(_linear(images, second)),
-        float(np.mean(far > 0)),
-    )
+    weights = {
+        "margin": margin,
+        "permutation": _permuted(images, second, random_state),
+        "linear": _linear(images, second),
+    }
+    shares = {method: _shares(found) for method, found in weights.items()}
+    return TellingFeatures(shares, float(np.mean(far > 0)))
 
 
 def strongest(shares: ArrayLike, most: float = 0.5) -> str:

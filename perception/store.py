@@ -23,18 +23,20 @@ from perception.appearance import PanoramaTransformer, ReciprocalTransformer
 from perception.errors import PerceptionError
 from perception.images import refuse_huge
 from perception.recognition import ImageLikelihood, PlaceRecogniser
-from perception.views import ViewClusterer
+from perception.views import Predictor, ViewClusterer
 from ssh_abduction.data.errors import brief, is_whole
 from ssh_abduction.data.files import save_file
 
 FORMAT, VERSION = "ssh-recogniser", 1
-OURS = (
-    *(
-        f"{kind.__module__}.{kind.__qualname__}"
-        for kind in (PlaceRecogniser, PanoramaTransformer, ReciprocalTransformer, ViewClusterer)
-    ),
-    "perception.views.Predictor",
-    "perception.views.Tried",
+OURS = tuple(
+    f"{kind.__module__}.{kind.__qualname__}"
+    for kind in (
+        PlaceRecogniser,
+        PanoramaTransformer,
+        ReciprocalTransformer,
+        ViewClusterer,
+        Predictor,
+    )
 )
 
 

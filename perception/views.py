@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.distance import cdist
 from sklearn.base import BaseEstimator, ClusterMixin, clone
 from sklearn.cluster import KMeans
@@ -24,17 +24,9 @@ from sklearn.neighbors import KNeighborsClassifier, NearestNeighbors
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from perception import quality
 from perception.errors import ImageWarning, PerceptionError, equal_length
-from perception.quality import (
-    NOISE,
-    Floats,
-    Integers,
-    cluster_quality,
-    confidence,
-    sample_indices,
-    spanning_tree,
-    trimmed_quality,
-)
+from perception.quality import NOISE, Floats, Integers
 from ssh_abduction.data.checks import a_number, a_whole_number, one_of
 from ssh_abduction.data.errors import brief
 from ssh_abduction.runtime.threads import one_thread
@@ -64,28 +56,6 @@ ISOLATED = 10.0
 
 
 @dataclass(frozen=True)
-class Tried:
-    """The clusterings that a ViewClusterer tried, and its choice."""
-
-    k: int  # the chosen number of views
-    # For each number of views k that was tried, M: the gap between clusters divided by their width
-    # (`perception.quality.cluster_quality`).
-    quality: dict[int, float]
-    # The same, but with quantiles instead of extremes (`trimmed_quality`).
-    trimmed: dict[int, float]
-    labels: dict[int, Integers]  # for each k that was tried, the view of each image, (n,)
-
-    @property
-    def runner_up(self) -> int | None:
-        """Another k whose views may make a better map; see `ViewClusterer.runner_up_`."""
-        others = {k: worth for k, worth in self.trimmed.items() if k != self.k}
-        if others and self.trimmed[self.k] < NEAR * max(others.values()):
-            return smallest_good(others)
-        finer = {k: worth for k, worth in others.items() if k > self.k and worth >= APART}
-        return max(finer, key=finer.__getitem__, default=None)
-
-
-@dataclass(frozen=True)
 class Predictor:
     """Gives views to new images."""
 
@@ -101,18 +71,6 @@ class Predictor:
         if 0 < self.reach < math.inf:
             views[to_neighbour(images, self.inside, 0) > self.reach] = NOISE
         return views
-
-
-def single(fitted: Any, images: Floats, trim: float) -> tuple[Any, Tried]:
-    """Return a fitted clusterer, and a `Tried` that holds its clustering alone."""
-    labels = cluster_labels(fitted, images)
-    inside = labels != NOISE
-    k = len(set(labels[inside].tolist()))
-    measures = math.nan, math.nan
-    if inside.any():
-        some = images[inside], labels[inside]
-        measures = cluster_quality(*some), trimmed_quality(*some, trim)
-    return fitted, Tried(k, {k: measures[0]}, {k: measures[1]}, {k: labels})
 
 
 def smallest_good(worth: dict[int, float]) -> int:
@@ -174,7 +132,12 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         confidence_: (n,) how surely each image belongs to its view, in [0, 1]; 0 for noise
             (`perception.quality`).
         clusterer_: The fitted clusterer.
-        tried_: The clusterings that were tried, which the properties below read.
+        k_: Number of views without noise.
+        quality_: For each number of views k that was tried, M (`cluster_quality`), without noise.
+            It has one entry if k is given or if the clusterer finds k itself.
+        trimmed_: The same, but M is computed with medians (`trimmed_quality`). M is the gap between
+            clusters divided by their width. Larger is better.
+        labels_by_k_: For each number of views k that was tried, the view of each image, (n,).
         predictor_: Gives views to new images.
     """
 
@@ -215,11 +178,15 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             # If all images that are left are equal, nothing distinguishes them. Isolate none.
             if (images[inside] == images[inside][0]).all():
                 inside[:] = True
-        self.clusterer_, tried = self._fitted(images[inside])
-        labels = {k: _with_noise(inside, found) for k, found in tried.labels.items()}
-        self.tried_ = replace(tried, labels=labels)
-        self.labels_ = labels[tried.k]
-        self.confidence_ = confidence(images, self.labels_)
+        self.quality_, self.trimmed_ = dict[int, float](), dict[int, float]()
+        self.labels_by_k_ = dict[int, Integers]()
+        self.clusterer_, self.k_ = self._fitted(images[inside])
+        for k, found in self.labels_by_k_.items():
+            self.labels_by_k_[k] = np.full(len(images), NOISE, np.intp)
+            self.labels_by_k_[k][inside] = found
+        self.labels_ = self.labels_by_k_[self.k_]
+        self.confidence_ = quality.confidence(images, self.labels_)
+        # A clusterer that cannot predict is replaced by a classifier.
         model = self.clusterer_
         if not hasattr(model, "predict"):
             model = KNeighborsClassifier(1, algorithm="brute")
@@ -227,15 +194,15 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         self.predictor_ = Predictor(model, images[inside] if self.isolated else images[:0], reach)
         return self
 
-    def _fitted(self, images: Floats) -> tuple[Any, Tried]:
-        """Return the fitted clusterer, and the clusterings that were tried."""
+    def _fitted(self, images: Floats) -> tuple[Any, int]:
+        """Return the fitted clusterer, and its number of views. Keep the clusterings tried."""
         if (images == images[0]).all():
             warnings.warn(
                 f"all {len(images)} images are equal: they are taken as one view",
                 ImageWarning,
                 stacklevel=3,
             )
-            return single(KMeans(1, n_init=1, random_state=0).fit(images), images, self.trim)
+            return self._single(KMeans(1, n_init=1, random_state=0).fit(images), images)
         seed = int(check_random_state(self.random_state).randint(2**31 - 1))
         if self.k is None and (
             self.clusterer is None or _count_parameter(self.clusterer) is not None
@@ -243,7 +210,17 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             return self._search(images, seed)
         if self.k is not None and self.k > 1:
             _check_distinct(self.k, images)
-        return single(self._cluster(images, self.k, seed), images, self.trim)
+        return self._single(self._cluster(images, self.k, seed), images)
+
+    def _single(self, fitted: Any, images: Floats) -> tuple[Any, int]:
+        """Measure the only clustering."""
+        labels = cluster_labels(fitted, images)
+        inside = labels != NOISE
+        some, k = (images[inside], labels[inside]), len(set(labels[inside].tolist()))
+        self.labels_by_k_[k] = labels
+        self.quality_[k] = quality.cluster_quality(*some) if k else math.nan
+        self.trimmed_[k] = quality.trimmed_quality(*some, self.trim) if k else math.nan
+        return fitted, k
 
     def predict(self, X: ArrayLike) -> Integers:
         """Predict the views of images.
@@ -274,33 +251,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         """
         views, images = self.predict(X), np.asarray(X, float)
         seen = views != NOISE
-        return cluster_quality(images[seen], views[seen]) if seen.any() else math.nan
-
-    @property
-    def k_(self) -> int:
-        """Number of views without noise."""
-        return self.tried_.k
-
-    @property
-    def quality_(self) -> dict[int, float]:
-        """For each number of views k that was tried, M (`cluster_quality`), without noise.
-
-        It has one entry if k is given or if the clusterer finds k itself.
-        """
-        return self.tried_.quality
-
-    @property
-    def trimmed_(self) -> dict[int, float]:
-        """For each number of views k that was tried, M computed with medians (`trimmed_quality`).
-
-        M is the gap between clusters divided by their width. Larger is better.
-        """
-        return self.tried_.trimmed
-
-    @property
-    def labels_by_k_(self) -> dict[int, Integers]:
-        """For each number of views k that was tried, the view of each image, (n,)."""
-        return self.tried_.labels
+        return quality.cluster_quality(images[seen], views[seen]) if seen.any() else math.nan
 
     @property
     def runner_up_(self) -> int | None:
@@ -310,7 +261,11 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         runner-up is the smallest other k with a trimmed M of at least 0.95 T. Otherwise it is the k
         above k_ with the largest trimmed M, if that is at least 2.3.
         """
-        return self.tried_.runner_up
+        others = {k: worth for k, worth in self.trimmed_.items() if k != self.k_}
+        if others and self.trimmed_[self.k_] < NEAR * max(others.values()):
+            return smallest_good(others)
+        finer = {k: worth for k, worth in others.items() if k > self.k_ and worth >= APART}
+        return max(finer, key=finer.__getitem__, default=None)
 
     @property
     def runner_up_labels_(self) -> Integers | None:
@@ -322,29 +277,26 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         """(k, d) centres of the views, if the clusterer has them."""
         return np.asarray(self.clusterer_.cluster_centers_)
 
-    def _search(self, images: Floats, seed: int) -> tuple[Any, Tried]:
-        """Try each k. Return the clusterer of the best k, and the clusterings that were tried."""
-        tree, chosen = spanning_tree(images), sample_indices(len(images))
+    def _search(self, images: Floats, seed: int) -> tuple[Any, int]:
+        """Try each k. Return the clusterer of the best k, and this k."""
+        tree, chosen = quality.spanning_tree(images), quality.sample_indices(len(images))
         distances = cdist(images[chosen], images[chosen])
         most = min(20, len(images) - 1) if self.k_max is None else self.k_max
         most = min(max(most, self.k_min), tree.distinct)
         _check_distinct(self.k_min, images, tree.distinct)
         fitted: dict[int, Any] = {}
-        found = Tried(0, {}, {}, {})
         for k in range(self.k_min, most + 1):
             tried = self._cluster(images, k, seed)
             labels = cluster_labels(tried, images)
             if fitted and len(set(labels.tolist())) < k:
                 continue  # A mixture left some of its components empty.
-            fitted[k], found.labels[k] = tried, labels
-            found.quality[k] = cluster_quality(images, labels, tree)
-            found.trimmed[k] = trimmed_quality(images[chosen], labels[chosen], self.trim, distances)
-        best = (
-            smallest_good(found.trimmed)
-            if self.by == "trimmed"
-            else max(found.quality, key=found.quality.__getitem__)
-        )
-        return fitted[best], replace(found, k=best)
+            fitted[k], self.labels_by_k_[k] = tried, labels
+            self.quality_[k] = quality.cluster_quality(images, labels, tree)
+            some = images[chosen], labels[chosen]
+            self.trimmed_[k] = quality.trimmed_quality(*some, self.trim, distances)
+        best = max(self.quality_, key=self.quality_.__getitem__)
+        best = smallest_good(self.trimmed_) if self.by == "trimmed" else best
+        return fitted[best], best
 
     def _cluster(self, images: Floats, k: int | None, seed: int) -> Any:
         """Fit a clusterer with k views. If k is None, the clusterer chooses the number."""
@@ -438,13 +390,6 @@ def _check_distinct(k: int, images: Floats, distinct: int | None = None) -> None
             f"k: expected at most {found}, as there are {found} different images among "
             f"{len(images)}, got {k}; take fewer views"
         )
-
-
-def _with_noise(inside: NDArray[np.bool_], labels: Integers) -> Integers:
-    """Label all images, (n,): those in the mask `inside` by `labels`, all others as noise."""
-    every = np.full(len(inside), NOISE, np.intp)
-    every[inside] = labels
-    return every
 
 
 def _count_parameter(clusterer: Any) -> str | None:

@@ -76,4 +76,4 @@ def test_track_without_closures_keeps_its_covariances() -> None:
     track, visits, closings = driven(4.0, seed=0)
     assert factor_of(track, visits, []) == 1
     factor = factor_of(track, visits, closings)
-    assert replace(track, factor=factor).corrected(1, 2)[0, 0, 0] > STATED[0] ** 2
+    assert replace(track, factor=factor).corrected[1:2][0, 0, 0] > STATED[0] ** 2

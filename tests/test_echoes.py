@@ -13,8 +13,8 @@ import pytest
 from coarse import every_second_beam, hall
 
 from perception.errors import LogError
-from perception.places.agreement import disagreement
 from perception.places.importing import tracked
+from perception.places.odometers import disagreement
 from perception.readers.echoes import MEANINGS, Array, LaserOptions, interpret_log, interpret_scan
 from perception.readers.logs import read_log
 from perception.readers.scans import RobotLog, Scan

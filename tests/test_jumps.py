@@ -19,7 +19,7 @@ from perception.places import importing
 from perception.places.distinctive import Visit
 from perception.places.following import turned_wrongly
 from perception.places.importing import import_log, tracked
-from perception.places.jumps import Unknown, describe_cuts, keep_one_source, unknown_steps
+from perception.places.odometers import Doubt, describe_cuts, doubts_of, keep_one_source
 from perception.places.tracing import starts_of_drives
 from perception.places.track import Track
 from perception.readers.scans import RobotLog, Scan
@@ -122,7 +122,7 @@ def test_standing_robot_is_not_called_carried(scans: tuple[Scan, ...]) -> None:
         replace(scans[60], ranges=scans[60].ranges + 0.02 * rng.normal(size=len(scans[60].ranges)))
         for _ in range(10)
     ]
-    assert unknown_steps(RobotLog((*scans[:60], *stands, *scans[60:]))) == Unknown()
+    assert doubts_of(RobotLog((*scans[:60], *stands, *scans[60:]))) == ({}, [])
 
 
 def test_robot_that_is_carried_without_a_pause_is_not_called_standing(
@@ -171,11 +171,11 @@ def test_note_says_that_a_second_drive_may_begin_at_a_jump(scans: tuple[Scan, ..
 def test_restart_after_a_pause_may_be_a_second_drive(scans: tuple[Scan, ...]) -> None:
     parts = stepwise(scans, lambda i, step: None if i == 60 else step)
     late = tuple(replace(scan, time=(scan.time or 0.0) + 600) for scan in parts[60:])
-    assert unknown_steps(RobotLog((*parts[:60], *late))) == Unknown(seams=frozenset({60}))
+    assert doubts_of(RobotLog((*parts[:60], *late))) == ({60: Doubt.SEAM}, [])
 
 
 def test_missing_scans_with_good_odometry_are_no_jump(scans: tuple[Scan, ...]) -> None:
-    assert unknown_steps(RobotLog((*scans[:60], *scans[75:]))) == Unknown()
+    assert doubts_of(RobotLog((*scans[:60], *scans[75:]))) == ({}, [])
 
 
 def test_odometry_in_another_unit_is_converted(scans: tuple[Scan, ...], metres: float) -> None:

@@ -19,7 +19,6 @@ from test_log_checks import (
     in_degrees,
     of_two_clocks,
     with_poses,
-    with_stuck_laser,
 )
 
 from perception.errors import LogError
@@ -155,7 +154,6 @@ def mirrored(scans: Scans) -> Scans:
         (lambda scans: with_poses(scans, lambda x, y, h: (100 * x, 100 * y, h)), "as centimetres"),
         (of_two_clocks, "The clock starts anew before scan 60"),
         (mirrored, "the laser hangs upside down"),
-        (with_stuck_laser, "The laser repeats one scan"),
     ],
 )
 def test_stream_gets_the_warnings_of_a_log(

@@ -100,10 +100,6 @@ def of_two_clocks(scans: Scans) -> Scans:
     return [*scans[:60], *(replace(s, time=(s.time or 0.0) - 1e4) for s in scans[60:120])]
 
 
-def with_stuck_laser(scans: Scans) -> Scans:
-    return [*scans[:40], *(replace(s, ranges=scans[40].ranges) for s in scans[40:46])]
-
-
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -128,21 +124,6 @@ def test_warning_for_each_kind_of_bad_log(
     scans: tuple[Scan, ...], change: Callable[[Scans], Scans], told: str
 ) -> None:
     assert told in notes_of(change(scans))
-
-
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        (with_stuck_laser, "The laser repeats one scan"),
-        (lambda scans: [*scans[:40], *[scans[40]] * 10], None),  # A robot may stand.
-    ],
-)
-def test_track_of_a_stuck_laser_is_unreliable(
-    scans: tuple[Scan, ...], change: Callable[[Scans], Scans], told: str | None
-) -> None:
-    _, track, notes = tracked(RobotLog(tuple(change(scans)), source="drive"))
-    assert track.is_reliable is (told is None)
-    assert any(told in note for note in notes) if told else notes == ()
 
 
 @pytest.mark.parametrize(("points", "found"), [(60, [3]), (12, [])])
@@ -253,32 +234,6 @@ def test_odometry_of_scans_a_metre_apart_is_converted(scans: Scans) -> None:
     notes = notes_of(with_poses(scans[:160:2], lambda x, y, h: (100 * x, 100 * y, h)))
     assert "It is read as centimetres" in notes
     assert "unreliable" not in notes
-
-
-@pytest.mark.parametrize(
-    ("step", "count", "digits", "warns"),
-    [
-        (0.01, 3.28, 2, True),
-        (0.001, 3.28084, 4, True),
-        (0.01, 1.0, 2, False),
-        (0.001, 3.28084, 2, False),  # rounding hides the steps
-        (1e-9, 3.28, 9, False),
-    ],
-)
-def test_steps_of_ranges_show_feet(
-    scans: Scans, step: float, count: float, digits: int, warns: bool
-) -> None:
-    some = [
-        replace(
-            scan,
-            ranges=np.round(count * step * np.round(scan.ranges / step), digits),
-            laser=replace(scan.laser, reach=count * scan.laser.reach),
-            odometry=(count * scan.odometry[0], count * scan.odometry[1], scan.odometry[2]),
-        )
-        for scan in scans
-    ]
-    notes = log_checks.describe_feet(RobotLog(tuple(some)))
-    assert ["in feet" in note for note in notes] == [True] * warns
 
 
 def test_scans_out_of_order_are_not_taken_for_two_sources(scans: Scans) -> None:

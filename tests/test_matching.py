@@ -196,10 +196,7 @@ def test_match_against_the_odometer_gets_a_large_covariance(share: float, is_wid
     assert bool(covariance[2, 2] > 0.4**2) is is_wide
 
 
-@pytest.mark.parametrize("block", [1, 2, 3, 4, 7, 8, 9])
-def test_covariance_of_a_point_sums_all_increments(
-    monkeypatch: pytest.MonkeyPatch, block: int
-) -> None:
+def test_covariance_of_a_point_sums_all_increments() -> None:
     """Each increment is an arm that ends at the point; the sum is computed one by one."""
     rng = np.random.default_rng(1)
     poses = np.column_stack([np.cumsum(rng.normal(0, 1, (9, 2)), axis=0), rng.normal(0, 1, 9)])
@@ -212,7 +209,6 @@ def test_covariance_of_a_point_sums_all_increments(
         arm = np.array([[cos, -sin, -y], [sin, cos, x], [0.0, 0.0, 1.0]])
         expected += arm @ track.covariances[i] @ arm.T
     assert uncertainty(track, 2, 7, end) == pytest.approx(expected)
-    monkeypatch.setattr("perception.places.track.BLOCK", block)
     assert uncertainty(replace(track, factor=2.0), 7, 2, end) == pytest.approx(2 * expected)
 
 

@@ -670,7 +670,7 @@ def test_telling_features_find_the_feature_that_differs() -> None:
         assert (shares >= 0).all()
     assert telling_features(images[:, [0, 1, 3]], labels, 3, 8).recognised == 1
     assert telling_features(images, labels, 3, 5).recognised < 0.8
-    assert strongest(found.permutation) == "1"
+    assert strongest(found.methods["permutation"]) == "1"
     assert (strongest([0.2, 0.2, 0.0, 0.15, 0.2, 0.25], 0.8), strongest([0.0, 0.0])) == (
         "0–1, 4–5",
         "–",

@@ -46,6 +46,7 @@ from perception.places.distinctive import Visit, patches_of
 from perception.places.local_map import MOST, LocalScene, Match, PackedPatch, Turned, match
 from perception.places.track import Array, Track, points_moved, points_turned
 from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.odometry import Pose, moved
 
 # A match is reliable with at least this score and share of area that both maps observed.
 SCORE, MUTUAL = 0.75, 0.5
@@ -121,17 +122,21 @@ def find_closures(
     def scene(visit: int) -> LocalScene:
         return LocalScene.of(patches[visit], visits[visit].middle)
 
-    gates, corrected = _Gates(track, visits, apart), _Corrected(visits)
-    found: list[VisitMatch] = []
-    for last in range(len(visits)):
-        corrected.predict(last)
+    gates, found = _Gates(track, visits, apart), list[VisitMatch]()
+    placed: list[Pose] = []  # the visits by the track. Each closure corrects later visits.
+    for last, visit in enumerate(visits):
+        x, y = visit.middle - visits[last - 1].middle if last else visit.middle
+        placed.append(moved(placed[-1], (x, y, 0.0)) if last else (x, y, 0.0))
+        # Match with the earlier visits that are nearest.
         earlier = gates.earlier(last)
-        near = corrected.nearest(last, earlier)
+        far = [math.dist(placed[k][:2], placed[last][:2]) for k in earlier]
+        near = sorted((np.argsort(far, kind="stable")[:MATCHES] + earlier.start).tolist())
         asked = gates.allowed(last, near)
         here = sorted(_closings(scene, asked, last), key=lambda closing: -closing.match.score)
         found += here[:KEPT]
         if here:
-            corrected.correct(here[0])
+            best = here[0].match
+            placed[last] = moved(placed[here[0].first], (*best.shift.tolist(), best.turn))
     return found
 
 
@@ -222,34 +227,6 @@ class _Gates:
         return [(some[k], _Gate(there[:, k], spreads[k])) for k in np.flatnonzero(near).tolist()]
 
 
-class _Corrected:
-    """The positions of visits by the track. Each closure corrects the positions of later visits."""
-
-    def __init__(self, visits: Sequence[Visit]) -> None:
-        self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
-        self._places = self._middles.copy()
-        self._turns = np.zeros(len(visits))
-
-    def predict(self, visit: int) -> None:
-        """Compute the position of a visit from the position before it and the track."""
-        if visit:
-            turn = self._turns[visit - 1]
-            onward = points_turned(turn, self._middles[visit] - self._middles[visit - 1])
-            self._places[visit], self._turns[visit] = self._places[visit - 1] + onward, turn
-
-    def correct(self, closing: VisitMatch) -> None:
-        """Compute the position of the later visit of a closure from the earlier visit."""
-        turn = self._turns[closing.first]
-        onward = points_turned(turn, closing.match.shift)
-        self._places[closing.last] = self._places[closing.first] + onward
-        self._turns[closing.last] = turn + closing.match.turn
-
-    def nearest(self, visit: int, some: range) -> list[int]:
-        """List the MATCHES visits of a range that are nearest to a visit, in ascending order."""
-        far = np.hypot(*(self._places[some.start : some.stop] - self._places[visit]).T)
-        return sorted((np.argsort(far, kind="stable")[:MATCHES] + some.start).tolist())
-
-
 def seen_from(first: Array, last: Array) -> Array:
     """Compute the poses `last` in the frames of the poses `first`.
 
@@ -291,7 +268,7 @@ def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
     # An error of an increment rotates and shifts all later poses. The point moves as the end of an
     # arm that begins there.
     first, last = min(first, last), max(first, last)
-    return at_end(end, track.spread(last) - track.spread(first))
+    return at_end(end, track.spreads[last] - track.spreads[first])
 
 
 def at_end(end: Array, covariance: Array) -> Array:

@@ -17,8 +17,8 @@ kept.
 
 from __future__ import annotations
 
-import heapq
 import math
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
@@ -29,7 +29,7 @@ from perception.places.following import Followed
 from perception.places.local_map import LocalMaps, PackedPatch, Recent
 from perception.places.skeleton import Junction, junctions
 from perception.places.track import Array, Track
-from perception.readers.scans import RobotLog, Scan, in_turn
+from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.odometry import Pose, radians_between
 
 # Two ways out whose bearings differ by less than this, in radians, are one.
@@ -177,10 +177,7 @@ def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visi
     The width of the robot is in metres.
     """
     breaks = set(track.breaks)
-    posed = (
-        Followed(scan, track.pose(i), broken=i in breaks)
-        for i, scan in enumerate(in_turn(log.scans))
-    )
+    posed = (Followed(scan, track.pose(i), broken=i in breaks) for i, scan in enumerate(log.scans))
     return tuple(visits_of(posed, width))
 
 
@@ -207,11 +204,11 @@ class _Detector:
         self._recent = Recent()
         self._maps = LocalMaps(self._recent, WINDOW)
         self._stays = Stays(self._recent, self._maps, HALF)
-        self._milestones: list[int] = []  # scans; those after the first _seen have no local map yet
-        self._first = self._seen = 0  # numbers of the first milestone that is kept, and of the next
+        self._milestones: list[int] = []  # scans
+        self._seen = 0  # the number of the next milestone, which has no local map yet
         self._open: list[_Chain] = []
         self._numbers = count()
-        self._found: list[tuple[int, int, int, Visit]] = []  # a heap by scan, chain and pass
+        self._found: list[tuple[int, int, int, Visit]] = []  # by scan, chain and pass
 
     def add(self, scan: Scan, pose: Pose) -> Iterator[Visit]:
         """Add the next scan, and yield the visits that are final now."""
@@ -237,13 +234,12 @@ class _Detector:
     @property
     def _next(self) -> int | None:
         """The scan of the next milestone; None if the robot has not reached it."""
-        k = self._seen - self._first
-        return self._milestones[k] if k < len(self._milestones) else None
+        return self._milestones[self._seen] if self._seen < len(self._milestones) else None
 
     @property
     def _horizon(self) -> int:
         """The earliest scan at which a visit that is not found yet can begin."""
-        last = self._recent.way(self._milestones[self._seen - self._first - 1])
+        last = self._recent.way(self._milestones[self._seen - 1])
         first = min([last, *(chain.sightings[0].way for chain in self._open)])
         return self._recent.at(first - GAP * EVERY)
 
@@ -286,22 +282,19 @@ class _Detector:
         self._open.remove(chain)
         if len(chain.sightings) > 1:
             for k, visit in enumerate(self._passes(chain)):
-                heapq.heappush(self._found, (visit.scan, chain.number, k, visit))
+                self._found.append((visit.scan, chain.number, k, visit))
 
     def _released(self, horizon: int) -> list[Visit]:
         """Remove and return the visits before a scan, in order."""
-        released = []
-        while self._found and self._found[0][0] < horizon:
-            released.append(heapq.heappop(self._found)[-1])
-        return released
+        self._found.sort(key=lambda found: found[:3])
+        count = bisect_left(self._found, horizon, key=lambda found: found[0])
+        released, self._found = self._found[:count], self._found[count:]
+        return [visit for *_, visit in released]
 
     def _forget(self) -> None:
-        """Forget scans and milestones that are too old for any further visit."""
+        """Forget scans that are too old for any further visit."""
         oldest = self._recent.way(min(self._horizon, self._stays.oldest))
         self._recent.drop_before(self._recent.at(oldest - AROUND))
-        while self._milestones[0] < self._recent.begin:
-            del self._milestones[0]
-            self._first += 1
 
     def _passes(self, chain: _Chain) -> Iterator[Visit]:
         """Yield a visit for each time that the robot drives through the disc of a junction."""
@@ -321,10 +314,10 @@ class _Detector:
 
     def _near(self, scan: int, middle: Array) -> set[int]:
         """The numbers of the milestones near a scan at which the middle of a place can be seen."""
-        way = self._recent.way(scan)
+        way, first = self._recent.way(scan), bisect_left(self._milestones, self._recent.begin)
         return {
             number
-            for number, at in enumerate(self._milestones, self._first)
+            for number, at in enumerate(self._milestones[first:], first)
             if abs(self._recent.way(at) - way) <= BESIDE
             and math.dist(self._recent.poses(at, at + 1)[0, :2], middle) < SEEN - 0.5
         }

@@ -6,7 +6,7 @@ not show how far the robot went, so the odometer decides. An increment is the mo
 to the next. There is no global map, so errors of increments accumulate along the trajectory. Each
 increment has a covariance.
 
-If the odometer jumps (`jumps`), the scan is matched near the previous pose without odometry. If it
+If the odometer jumps, the scan is matched near the previous pose without odometry. If it
 matches, the track goes on, and only the increment is unknown: this is a cut. If nothing in the scan
 was seen before, the robot may be anywhere. Then the track is broken, and a new trajectory begins.
 
@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from perception.places.jumps import Doubt, Unknown, is_missing, unknown_steps
+from perception.places.odometers import Doubt, doubts_of, is_missing
 from perception.places.track import (
     Array,
     Track,
@@ -37,7 +37,7 @@ from perception.places.track import (
     points_turned,
     wrapped,
 )
-from perception.readers.scans import RobotLog, Scan, in_turn
+from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 
 # Longer beams are not matched, in metres, since neighbouring beams are too far apart to show a
@@ -97,21 +97,22 @@ def follow(log: RobotLog) -> Track:
 
     Corrected poses are not read.
     """
-    steps = unknown_steps(log)
-    track = _track_of(log, steps)
+    doubts, still = doubts_of(log)
+    track = _track_of(log, doubts)
     # People or an arm of the robot can change what the laser sees while the robot stands.
-    standing = frozenset(
+    standing = {
         k
-        for first, last in steps.still
+        for first, last in still
         if _stands(log, track, first, last)
         for k in range(first, last + 1)
-    )
+        if doubts[k] is not Doubt.CARRIED
+    }
     if standing:
-        steps = steps.without(standing)
-        track = _track_of(log, steps)
+        doubts = {k: doubt for k, doubt in doubts.items() if k not in standing}
+        track = _track_of(log, doubts)
     # If matching fails in much of the log, contradictions do not show that the robot was carried.
     if share_failing(track) <= FAILING and (more := scans_after_a_carry(log, track)):
-        track = _track_of(log, replace(steps, carried=steps.carried.union(more)))
+        track = _track_of(log, {**doubts, **dict.fromkeys(more, Doubt.CARRIED)})
     return track
 
 
@@ -139,10 +140,10 @@ def _stands(log: RobotLog, track: Track, first: int, last: int) -> bool:
     return float(np.median(shares)) >= (SURE if np.median(turns) <= HELD else WELL)
 
 
-def _track_of(log: RobotLog, steps: Unknown) -> Track:
+def _track_of(log: RobotLog, doubts: Mapping[int, Doubt]) -> Track:
     """Make the track, which is broken before each scan to which the robot was carried."""
     done = GrowingTrack()
-    for one in poses_of_scans(in_turn(log.scans), lambda i, _: steps.doubt_of(i)):
+    for one in poses_of_scans(log.scans, lambda i, _: doubts.get(i, Doubt.NONE)):
         done.add(one)
     return done.track
 

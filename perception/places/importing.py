@@ -10,10 +10,10 @@ factor that makes the errors at the closures most probable. A steady drift of th
 estimated at the same time and removed from these errors, as the covariances do not include it.
 
 A log may also be imported while it is read or recorded (`LiveLog`). Then the scans are processed
-one at a time. Only the track, the visits with their local maps, and about 90 bytes per scan for the
-checks at the end are kept. The first scans wait until the units of the odometry are recognised.
-Then the scans get the checks of a whole log, but in stretches of 1,600 scans. Each stretch is
-checked four times: when it has 200, 400, 800 and 1,600 scans.
+one at a time. The track, the visits with their local maps, and about 600 bytes per scan are kept in
+memory, and ranges in temporary files. The first scans wait until the units of the odometry are
+recognised. Then the scans get the checks of a whole log, but in stretches of 1,600 scans. Each
+stretch is checked four times: when it has 200, 400, 800 and 1,600 scans.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import math
 import re
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -32,29 +31,12 @@ import numpy as np
 
 from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning, LogError
-from perception.places import following, jumps, log_checks
-from perception.places.agreement import disagreement
-from perception.places.closures import (
-    agreeing,
-    closures_across_cuts,
-    factor_of,
-    find_closures,
-    fitted_poses,
-)
+from perception.places import closures, following, log_checks, odometers
 from perception.places.distinctive import WIDTH, WINDOW, Visit, find_visits, patches_of, visits_of
-from perception.places.following import (
-    Followed,
-    GrowingTrack,
-    follow,
-    poses_of_scans,
-    share_failing,
-    turned_wrongly,
-)
-from perception.places.log_checks import HOPELESS, LEAST_WAY, Units, units_of
 from perception.places.partings import with_partings
 from perception.places.tracing import starts_of_drives, to_trace
 from perception.places.track import Array, Track
-from perception.readers.scans import Damage, RobotLog, Scan, ScanTable, without_ranges
+from perception.readers.scans import Damage, RobotLog, Scan, ScanTable
 from perception.views import ViewClusterer
 from ssh_abduction.data.checks import a_function, a_number
 from ssh_abduction.data.errors import brief, named
@@ -63,9 +45,6 @@ from ssh_abduction.runtime.loggers import log_of
 
 # The number of first scans over which the track is compared with the odometry.
 COMPARED = 400
-# The checks at the end need the ranges of the scans before and after a poor match. They are kept
-# for at most this many poor matches.
-MOST_POOR = 200
 # The first SAID notes on cuts of the track are given at once. The others come at the end.
 SAID = 3
 # Units are recognised when the robot has moved in MOVES steps and by LEAST_WAY metres, or when MOST
@@ -146,9 +125,9 @@ def import_live(
 ) -> tuple[RobotLog, Imported]:
     """Import a log as a trace while it is read or recorded.
 
-    Memory hardly grows: each scan leaves about 200 bytes, and each visit its local map. If the
-    odometry is good, the trace is that of `import_log`. They can differ because each step of the
-    odometer is judged by earlier steps only.
+    Memory hardly grows: each scan leaves about 600 bytes, and each visit its local map. The ranges
+    are kept in temporary files. If the odometry is good, the trace is that of `import_log`. They
+    can differ because each step of the odometer is judged by earlier steps only.
 
     Args:
         items: The scans with odometry, in order, for example those of `stream_log` or `live_log`.
@@ -160,7 +139,7 @@ def import_live(
         source: Name of the log, for errors.
 
     Returns:
-        The log, in which hardly any scan has ranges, and the result of the import, with the trace.
+        The log, and the result of the import, with the trace.
 
     Raises:
         LogError: As `import_log`, or an item is no scan.
@@ -178,27 +157,37 @@ def import_live(
     return log, _imported((log, track, notes), tuple(visits), width, name, seconds)
 
 
-def _refuse_bad(log: RobotLog, track: Track, notes: Sequence[str]) -> None:
-    """Raise a LogError if the track shows no drive. The error carries the notes on the log."""
+def _refuse_bad(
+    log: RobotLog, track: Track, notes: Sequence[str], visits: Sequence[Visit] | None = None
+) -> None:
+    """Raise a LogError if a track, or its visits, show no drive.
+
+    The error carries the notes on the log. They are not in its text, as they were already printed.
+    """
+    failing, way = following.share_failing(track), track.way[-1]
     if len(track.breaks) > MOST_BREAKS * len(log):
-        raise _noted(
-            f"{named(log.source)}: expected a log of one drive, got {len(log)} scans of which "
-            f"{len(track.breaks)} show nothing that the previous scan shows; sort it by "
-            "time, or cut it into drives",
-            notes,
+        said = (
+            f"expected a log of one drive, got {len(log)} scans of which {len(track.breaks)} show "
+            "nothing that the previous scan shows; sort it by time, or cut it into drives"
         )
-    if (failing := share_failing(track)) > HOPELESS:
-        raise _noted(
-            f"{named(log.source)}: expected scans that show what the scans before them showed, got "
-            f"{len(log)}, and {100 * failing:.0f} % of them do not; {log_checks.advice(log)}",
-            notes,
+    elif failing > log_checks.HOPELESS:
+        said = (
+            f"expected scans that show what the scans before them showed, got {len(log)}, and "
+            f"{100 * failing:.0f} % of them do not; {log_checks.advice(log)}"
         )
-    if track.way[-1] < 1.0:
-        raise _noted(
-            f"{named(log.source)}: expected a robot that drives, got a drive of "
-            f"{track.way[-1]:.1f} m; take a longer log",
-            notes,
+    elif way < 1.0:
+        said = f"expected a robot that drives, got a drive of {way:.1f} m; take a longer log"
+    elif visits == ():
+        said = (
+            f"expected a way past junctions or turning points, got {way:.0f} m without any; take "
+            "a longer log"
         )
+    else:
+        return
+    error = LogError(f"{named(log.source)}: {said}")
+    for note in notes:
+        error.add_note(note)
+    raise error
 
 
 def _imported(
@@ -206,19 +195,14 @@ def _imported(
 ) -> Imported:
     """Make the trace of the visits, and gather the result of an import. Raises LogError."""
     log, track, notes = found
-    if not visits:
-        raise _noted(
-            f"{named(log.source)}: expected a way past junctions or turning points, got "
-            f"{track.way[-1]:.0f} m without any; take a longer log",
-            notes,
-        )
+    _refuse_bad(log, track, notes, visits)
     with _timed(seconds, "trace"):
-        closings = find_closures(track, visits, patches_of(visits), 2 * WINDOW)
-        closings = agreeing(track, visits, closings)
-        track = replace(track, factor=factor_of(track, visits, closings))
+        closings = closures.find_closures(track, visits, patches_of(visits), 2 * WINDOW)
+        closings = closures.agreeing(track, visits, closings)
+        track = replace(track, factor=closures.factor_of(track, visits, closings))
         visits, closings = with_partings(track, visits, closings)
-        poses = fitted_poses(track, visits, closings)
-        closings += closures_across_cuts(track, visits, poses)
+        poses = closures.fitted_poses(track, visits, closings)
+        closings += closures.closures_across_cuts(track, visits, poses)
         trace = to_trace(log, track, visits, closings, name)
     with _timed(seconds, "views"):
         trace = with_views(trace)
@@ -275,25 +259,16 @@ def tracked(log: RobotLog, tell: Tell = tell_nobody) -> Tracked:
             tell(note)
 
     log, corrected, whole = log_checks.checked(log)
-    stuck = log_checks.describe_stuck_laser(log)
-    say([*corrected, *whole, *stuck])
-    track = follow(log)
-    say(jumps.describe_cuts(log, track, turned_wrongly(log, track)))
+    say([*corrected, *whole])
+    track = following.follow(log)
+    say(odometers.describe_cuts(log, track, following.turned_wrongly(log, track)))
     # If the odometry is wrong throughout, that explains all differences between the trajectories.
-    doubt = None if whole or stuck else disagreement(log, track)
+    doubt = None if whole else odometers.disagreement(log, track)
     say([doubt] if doubt else [])
-    explained = bool(whole or stuck or doubt or track.cuts)
+    explained = bool(whole or doubt or track.cuts)
     track, doubts = log_checks.judged(log, track, explained)
     say(doubts)
-    return log, replace(track, is_reliable=track.is_reliable and not (stuck or doubt)), tuple(notes)
-
-
-def _noted(message: str, notes: Sequence[str]) -> LogError:
-    """Make an error that carries notes. They are not in its text, as they were already printed."""
-    error = LogError(message)
-    for note in notes:
-        error.add_note(note)
-    return error
+    return log, replace(track, is_reliable=track.is_reliable and not doubt), tuple(notes)
 
 
 def with_views(trace: Trace) -> Trace:
@@ -350,10 +325,7 @@ class LiveLog:
         self._tell = Teller(tell)
         self._damaged: list[Damage] = []
         self._scans = ScanTable()
-        self._begun: list[Scan] = []  # the first COMPARED scans, with their ranges
-        self._latest: deque[Scan] = deque(maxlen=following.BESIDE + 1)
-        self._poor = self._wanted = 0  # poor matches so far, and scans to keep after the last one
-        self._done = GrowingTrack()
+        self._done = following.GrowingTrack()
 
     def visits(self) -> Iterator[Visit]:
         """Yield each visit with its local map, in order, when it is final."""
@@ -362,22 +334,25 @@ class LiveLog:
     def result(self) -> Tracked:
         """Return the log, its track and notes. Call this after `visits` has yielded all visits.
 
-        Hardly any scan has ranges. Raises LogError if there is no scan.
+        Raises LogError if there is no scan.
         """
         log, track = self._log, self._done.track
         if not len(log):
             raise LogError(f"{named(self._source)}: expected scans, got none; record the laser")
         explained = bool(self._tell.notes)
-        self._tell(jumps.describe_cuts(log, track, turned_wrongly(log, track)))
+        self._tell(odometers.describe_cuts(log, track, following.turned_wrongly(log, track)))
         track, doubts = log_checks.judged(log, track, explained)
         self._tell(doubts)
         return log, track, tuple(self._tell.notes)
 
-    def _followed(self) -> Iterator[Followed]:
-        """Follow the robot, and keep what is needed of each scan."""
+    def _followed(self) -> Iterator[following.Followed]:
+        """Follow the robot, and keep its scans and its track."""
         scans = watched(self._scans_of(), self._tell, self._source)
-        for one in poses_of_scans(scans, jumps.LiveJumps()):
-            self._keep(one)
+        for one in following.poses_of_scans(scans, odometers.LiveJumps()):
+            self._scans.append(one.scan)
+            self._done.add(one)
+            if one.cut and len(self._done.cuts) <= SAID:
+                self._tell(odometers.describe_cuts(self._log, self._done.track, []))
             if len(self._scans) == COMPARED:
                 self._compare()
             yield one
@@ -397,30 +372,12 @@ class LiveLog:
                     "; take the scans of stream_log"
                 )
 
-    def _keep(self, one: Followed) -> None:
-        """Keep a scan with its pose, and its ranges only if a check needs them."""
-        number = len(self._scans)
-        self._scans.append(without_ranges(one.scan))
-        self._done.add(one)
-        if number < COMPARED:
-            self._begun.append(one.scan)
-        self._latest.append(one.scan)
-        if one.share < following.POORLY and self._poor < MOST_POOR:
-            self._poor, self._wanted = self._poor + 1, following.BESIDE
-            for back, scan in enumerate(reversed(self._latest), 1):
-                self._scans[-back] = scan
-        elif self._wanted:
-            self._scans[-1], self._wanted = one.scan, self._wanted - 1
-        if one.cut and len(self._done.cuts) <= SAID:
-            self._tell(jumps.describe_cuts(self._log, self._done.track, []))
-
     def _compare(self) -> None:
-        """Compare the track with the odometry over the first scans, and forget their ranges."""
-        if len(self._begun) > 1 and not self._tell.notes:
-            begun = RobotLog(tuple(self._begun), source=self._source)
-            note = disagreement(begun, self._done.track)
+        """Compare the track with the odometry over the first scans."""
+        if len(self._scans) > 1 and not self._tell.notes:
+            begun = replace(self._log, scans=self._scans[:COMPARED])
+            note = odometers.disagreement(begun, self._done.track)
             self._tell([note] if note else [])
-        self._begun.clear()
 
     @property
     def _log(self) -> RobotLog:
@@ -457,22 +414,17 @@ def watched(scans: Iterable[Scan], tell: Teller, source: str = "") -> Iterator[S
         return
     units = _units_of(RobotLog(tuple(first), source=source), tell)
     stretch: list[Scan] = []
-    last, begin, standing = first[-1:], 0, jumps.StandstillCheck()
-    laser = log_checks.StuckLaser()
+    begin = 0
     for number, scan in enumerate(map(units.converted, chain(first, coming))):
         # Checks look at a stretch of scans several times as it grows. Then a new one begins.
         if len(stretch) == LOOKS[-1]:
-            stretch, begin, standing = last, number - 1, jumps.StandstillCheck()
-        stretch.append(without_ranges(scan))
-        standing.add(scan)
-        laser.add(number, scan)
-        tell(laser.notes)
+            stretch, begin = stretch[-1:], number - 1
+        stretch.append(scan)
         if len(stretch) in LOOKS:
-            tell(_checked(stretch, begin, standing.moved, source))
-        last = [scan]
+            tell(_checked(stretch, begin, source))
         yield scan
     if len(stretch) > 1 and len(stretch) not in LOOKS:
-        tell(_checked(stretch, begin, standing.moved, source))
+        tell(_checked(stretch, begin, source))
 
 
 def _first_of(coming: Iterator[Scan]) -> list[Scan]:
@@ -484,30 +436,27 @@ def _first_of(coming: Iterator[Scan]) -> list[Scan]:
             far = math.dist(first[-1].odometry[:2], scan.odometry[:2])
             moves, way = moves + (far > 0), way + far
         first.append(scan)
-        if (moves >= MOVES and way >= LEAST_WAY) or len(first) == MOST:
+        if (moves >= MOVES and way >= log_checks.LEAST_WAY) or len(first) == MOST:
             break
     return first
 
 
-def _units_of(log: RobotLog, tell: Teller) -> Units:
+def _units_of(log: RobotLog, tell: Teller) -> log_checks.Units:
     """Recognise the units of the odometry of the first scans of a drive. Raises LogError."""
     log_checks.refuse_lengths(log)
     log_checks.refuse_shuffled(log)
-    if jumps.keep_one_source(log)[1]:
+    if odometers.keep_one_source(log)[1]:
         raise LogError(
             f"{named(log.source)}: expected odometry of one source, got poses of several sources "
             "in turn; let only one source publish odometry, or import the log from a file"
         )
-    units, notes = units_of(log)
-    tell([*notes, *log_checks.describe_feet(log)])
+    units, notes = log_checks.units_of(log)
+    tell(notes)
     return units
 
 
-def _checked(scans: Sequence[Scan], begin: int, unseen: bool, source: str) -> list[str]:
-    """Check a stretch of scans, but not their ranges. Raises LogError for a random order.
-
-    `unseen` says whether the robot moves while its odometer stands still.
-    """
+def _checked(scans: Sequence[Scan], begin: int, source: str) -> list[str]:
+    """Check a stretch of scans. Raises LogError for a random order."""
     log = RobotLog(tuple(scans), source=source)
     log_checks.refuse_shuffled(log)
-    return log_checks.describe_drive(log, begin, unseen)
+    return log_checks.describe_drive(log, begin)

@@ -118,7 +118,7 @@ def _joint_track(tracks: Sequence[Track], begins: Sequence[int]) -> tuple[Track,
 
     return Track(
         np.concatenate(poses),
-        np.concatenate([track.corrected(0, len(track.poses)) for track in tracks]),
+        np.concatenate([track.corrected for track in tracks]),
         np.concatenate([track.shares for track in tracks]),
         joint([track.cuts for track in tracks]),
         joint([track.breaks for track in tracks]),

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perception.errors import LogError
-from perception.places import jumps
+from perception.places import odometers
 from perception.places.following import FAILING, contradicting_scans, follow, share_failing
 from perception.places.track import Track, odometer_covariance, wrapped
-from perception.readers.scans import RobotLog, Scan, in_turn
+from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.data.words import counted
@@ -52,8 +52,6 @@ TO_AND_FRO = 0.8
 # A robot returns if it comes near a point where it was before, and drove at least AWAY metres in
 # between. Near is within NEAR metres, plus DRIFT metres for each metre driven in between.
 NEAR, DRIFT, AWAY = 3.0, 0.02, 15.0
-# A laser is stuck if it repeats one scan while the robot drives this many metres.
-STUCK = 2.0
 # The laser is dark if DARK scans in a row show no wall.
 DARK = 5
 # Beams that meet walls are at most this many metres long, in the median of a log. Good logs have up
@@ -61,20 +59,12 @@ DARK = 5
 FAR_WALLS = 50.0
 # In more than half of the scans of good logs, more than this share of the beams meets a wall.
 MEETING = 0.02
-# Lasers measure in STEPS of metres. In feet, their ranges below CLOSE are multiples of a step times
-# FEET: at least to the degree IN_STEP, which is 1 for exact multiples and about 0 for other ranges.
-# DISTINCT ranges show that. In most scans the nearest wall is then more than APART away. In good
-# logs it is 0.7 to 1.3 m away (docs/measurements/robustness.md).
-STEPS, FEET = (0.01, 0.001), 3.28084
-CLOSE, IN_STEP, DISTINCT, APART = 8.0, 0.3, 100, 1.7
-# At most about this many scans are looked at.
-SAMPLED = 200
 
 
 def refuse_lengths(log: RobotLog) -> None:
     """Raise a LogError if the ranges of a log are too long to be metres."""
     lengths, shares = [], []
-    for scan in in_turn(log.scans):
+    for scan in log.scans:
         met = scan.ranges[(scan.ranges > 0) & (scan.ranges < scan.laser.reach)]
         lengths += [float(np.median(met))] if len(met) else []
         shares.append(len(met) / len(scan.ranges))
@@ -94,61 +84,6 @@ def refuse_lengths(log: RobotLog) -> None:
         )
 
 
-def describe_feet(log: RobotLog) -> list[str]:
-    """Describe ranges that are in feet. Their steps and their lengths show it together."""
-    near, shortest = [np.zeros(0)], [0.0]
-    for scan in in_turn(log.scans[:: 1 + len(log) // SAMPLED]):
-        met = scan.ranges[(scan.ranges > 0) & (scan.ranges < min(scan.laser.reach, CLOSE))]
-        near.append(met)
-        shortest += [float(met.min())] if len(met) else []
-    ranges = np.unique(np.concatenate(near))
-    steps = [FEET * step for step in STEPS]
-    # The ranges are angles on a circle as long as the step. Multiples of the step are one angle.
-    fits = [float(abs(np.exp(2j * np.pi * ranges / step).mean())) for step in steps]
-    if len(ranges) < DISTINCT or np.median(shortest) < APART or max(fits) < IN_STEP:
-        return []
-    return [
-        "The lengths seem to be in feet: the ranges are multiples of "
-        f"{steps[int(np.argmax(fits))]:.4f}, which is a step of a laser in feet, and the nearest "
-        f"wall is {np.median(shortest):.1f} away in most scans. Divide ranges and positions by "
-        f"{FEET:.3f}."
-    ]
-
-
-class StuckLaser:
-    """Notices whether the laser repeats one scan while the robot drives on."""
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []  # a note on the first such stretch, if there is one
-        self._last: Scan | None = None
-        self._metres = 0.0
-
-    def add(self, number: int, scan: Scan) -> None:
-        """Add the next scan, with odometry in metres."""
-        last, self._last = self._last, scan
-        met = (scan.ranges > 0) & (scan.ranges < scan.laser.reach)
-        if last is None or not (
-            met.any() and np.array_equal(scan.ranges, last.ranges, equal_nan=True)
-        ):
-            self._metres = 0.0
-            return
-        self._metres += math.dist(scan.odometry[:2], last.odometry[:2])
-        if self._metres > STUCK and not self.notes:
-            self.notes.append(
-                f"The laser repeats one scan while the robot drives on, up to scan {number} (line "
-                f"or message {scan.line}) at least. So these scans do not show the building. Look "
-                "at the laser and its driver, and record again."
-            )
-
-
-def describe_stuck_laser(log: RobotLog) -> list[str]:
-    """Describe a laser that repeats one scan while the robot drives on."""
-    laser = StuckLaser()
-    for number, scan in enumerate(in_turn(log.scans)):
-        laser.add(number, scan)
-    return laser.notes
-
-
 def refuse_shuffled(log: RobotLog) -> None:
     """Raise a LogError if the scans of a log are in random order."""
     if len(log) < 4 * max(LAGS):
@@ -159,8 +94,8 @@ def refuse_shuffled(log: RobotLog) -> None:
     )
     if next_to == 0 or not all(next_to / ALIKE < far < next_to * ALIKE for far in apart):
         return
-    back = jumps.times_back(log)
-    clock = f", and their times run back {jumps.times(back)}" if back else ""
+    back = odometers.times_back(log)
+    clock = f", and their times run back {odometers.times(back)}" if back else ""
     raise LogError(
         f"{named(log.source)}: expected scans in the order of the drive, got {len(log)} in random "
         f"order: by the odometry, a scan is as far from the next one as from the eighth after it"
@@ -176,30 +111,28 @@ def checked(log: RobotLog) -> tuple[RobotLog, list[str], list[str]]:
     """
     refuse_lengths(log)
     refuse_shuffled(log)
-    log, alternating = jumps.keep_one_source(log)
+    log, alternating = odometers.keep_one_source(log)
     units, converted = units_of(log)
     log = units.convert(log)
-    return log, [*alternating, *converted, *describe_feet(log)], describe_drive(log)
+    return log, [*alternating, *converted], describe_drive(log)
 
 
-def describe_drive(log: RobotLog, begin: int = 0, unseen: bool | None = None) -> list[str]:
+def describe_drive(log: RobotLog, begin: int = 0) -> list[str]:
     """Describe a log that is reversed, has several drives, or has scans far apart.
 
-    If `unseen` is given, the ranges of the scans are not read. It says whether the robot moves
-    while its odometer stands still; None finds it from the ranges. `begin` is the number of the
-    first scan.
+    `begin` is the number of the first scan.
     """
     return [
         *_about_order(log),
-        *_about_odometry(log, unseen),
-        *(_about_seam(log, scan, begin, what) for scan, what in jumps.seams_of(log)),
+        *_about_odometry(log),
+        *(_about_seam(log, scan, begin, what) for scan, what in odometers.seams_of(log)),
     ]
 
 
 def _about_seam(log: RobotLog, scan: int, begin: int, what: str) -> str:
     """Describe a scan at which a second drive may begin."""
     where = f"{what} before scan {begin + scan} (line or message {log.scans[scan].line})"
-    if math.dist(log.scans[scan - 1].odometry[:2], log.scans[scan].odometry[:2]) <= jumps.FAR:
+    if math.dist(log.scans[scan - 1].odometry[:2], log.scans[scan].odometry[:2]) <= odometers.FAR:
         return (
             f"{where}, while the odometry goes on. If the file holds two drives, cut it there and "
             "map each part."
@@ -212,18 +145,18 @@ def _about_seam(log: RobotLog, scan: int, begin: int, what: str) -> str:
 
 def _about_order(log: RobotLog) -> list[str]:
     """Describe scans that are in reverse order, out of order, or too far apart."""
-    notes, usual = [], jumps.usual_step(log)
+    notes, usual = [], odometers.usual_step(log)
     # Between scans that are far apart, the robot may have turned in any way.
     if usual <= FAR_OFF and way_of(log) >= LEAST_WAY and ahead(log) < -SIDEWAYS:
         notes.append(
             "The robot drives backwards all the way by its odometry, so the scans are probably in "
             "reverse order. Reverse the log, or turn the headings by half a circle."
         )
-    back = jumps.times_back(log)
-    if back > jumps.RUNS_BACK * len(log):
+    back = odometers.times_back(log)
+    if back > odometers.RUNS_BACK * len(log):
         notes.append(
-            f"The times of the scans run back {jumps.times(back)} in {len(log)} scans. If the log "
-            "is not in the order of time, sort it."
+            f"The times of the scans run back {odometers.times(back)} in {len(log)} scans. If the "
+            "log is not in the order of time, sort it."
         )
     if usual > FAR_OFF:
         notes.append(
@@ -234,12 +167,12 @@ def _about_order(log: RobotLog) -> list[str]:
     return notes
 
 
-def _about_odometry(log: RobotLog, unseen: bool | None) -> list[str]:
+def _about_odometry(log: RobotLog) -> list[str]:
     """Describe odometry that is missing, alternates, or does not fit its own headings."""
-    straight, usual = ahead(log), jumps.usual_step(log)
-    back_and_forth = jumps.goes_back_and_forth(log)
-    if jumps.is_missing(log) and (jumps.moves_unseen(log) if unseen is None else unseen):
-        missing = jumps.stands_still(log)
+    straight, usual = ahead(log), odometers.usual_step(log)
+    back_and_forth = odometers.goes_back_and_forth(log)
+    if odometers.is_missing(log) and odometers.moves_unseen(log):
+        missing = odometers.stands_still(log)
         steps = f"{missing.sum()} of {counted(len(missing), 'steps')}"
         return [
             f"The odometry stands still in {steps}, while the scans show that the robot "
@@ -272,11 +205,12 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
     is_reliable = failing <= FAILING and overriding <= OVERRIDING
     notes = _about_darkness(log, track)
     if not is_reliable:
+        is_explained = explained and _beams_of(log) >= FEW_BEAMS
         notes.append(
             f"The track is unreliable: scan matching fails in {100 * failing:.0f} % of the scans, "
             f"and contradicts the odometry in {100 * overriding:.0f} % of the steps, where good "
             f"logs have 2 % at most. It is {track.way[-1]:.0f} m long. The map may be "
-            f"wrong.{'' if explained and not _has_few_beams(log) else f' Do this: {advice(log)}.'}"
+            f"wrong.{'' if is_explained else f' Do this: {advice(log)}.'}"
         )
     # If matching fails in much of the log, single contradictions say nothing more.
     elif contradictions := contradicting_scans(log, track):
@@ -328,13 +262,13 @@ def _about_darkness(log: RobotLog, track: Track) -> list[str]:
 
 def advice(log: RobotLog) -> str:
     """Say what to do about a log whose scans match badly."""
-    usual = jumps.usual_step(log)
-    if _has_few_beams(log):
+    usual = odometers.usual_step(log)
+    if _beams_of(log) < FEW_BEAMS:
         return (
             f"record at least {FEW_BEAMS} beams per scan, as matching needs them; these scans have "
             f"{_beams_of(log):.0f}"
         )
-    if jumps.is_missing(log):
+    if odometers.is_missing(log):
         return (
             "record the odometry, or name its topic (--set odom_topic); matching alone needs "
             "scans that are a few centimetres apart"
@@ -349,10 +283,6 @@ def advice(log: RobotLog) -> str:
         "direction of the beams (--set fov, --set mount). If these are right, record more scans "
         "per metre, or take a laser whose ranges are off by less than 5 cm"
     )
-
-
-def _has_few_beams(log: RobotLog) -> bool:
-    return _beams_of(log) < FEW_BEAMS
 
 
 def _beams_of(log: RobotLog) -> float:
@@ -420,7 +350,7 @@ def units_of(log: RobotLog) -> tuple[Units, list[str]]:
 
 def _length(log: RobotLog) -> tuple[float, list[str]]:
     """Recognise from a stretch of the log how many units make a metre. Also return notes."""
-    usual = jumps.usual_step(log)
+    usual = odometers.usual_step(log)
     if usual <= SPARSE:
         return 1.0, []
     far = np.hypot(*np.diff(log.odometry[:, :2], axis=0).T)
@@ -459,7 +389,7 @@ def ahead(log: RobotLog) -> float:
     poses = log.odometry
     steps = np.diff(poses[:, :2], axis=0)
     length = np.hypot(*steps.T)
-    length[length > max(jumps.FAR, jumps.UNUSUAL * jumps.usual_step(log))] = 0.0
+    length[length > max(odometers.FAR, odometers.UNUSUAL * odometers.usual_step(log))] = 0.0
     if not length.any():
         return 1.0
     turns = (np.diff(poses[:, 2]) + math.pi) % math.tau - math.pi

@@ -408,12 +408,8 @@ def _with_neighbours(lines: Bools, steps: Sequence[int], counts: range) -> NDArr
 
 def _parts(mask: Bools) -> list[list[int]]:
     """The connected parts of a mask, each as the numbers of its cells, ascending."""
-    labels, count = ndimage.label(mask, EIGHT)
-    parts: list[list[int]] = [[] for _ in range(count)]
-    cells = np.flatnonzero(mask)
-    for cell, label in zip(cells.tolist(), labels.ravel()[cells].tolist(), strict=True):
-        parts[label - 1].append(cell)
-    return parts
+    found = ndimage.value_indices(ndimage.label(mask, EIGHT)[0], ignore_value=0)
+    return [np.ravel_multi_index(at, mask.shape).tolist() for at in found.values()]
 
 
 def _in_order(cells: Sequence[int], ends: Set[int], steps: Sequence[int]) -> list[int]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -80,6 +79,8 @@ def to_trace(
             pose = (float(visit.middle[0]), float(visit.middle[1]), heading)
             steps.append(_step(log, track, number, visit, pose, last))
             last = (visit, pose)
+        if len(headings) > 1 and (turned := steps[-1].displacement) is not None:
+            steps[-2] = replace(steps[-2], action=_turn(-math.degrees(turned[2]), visit))
         if number < len(visits) - 1:
             extra = dict(steps[-1].extra)
             if not track.cuts_between(visit.scan, visits[number + 1].scan):
@@ -89,7 +90,7 @@ def to_trace(
                 onward = Action(f"{name} part {drive}" if name else f"drive {drive}", "start")
             steps[-1] = replace(steps[-1], action=onward, extra=extra)
     return Trace(
-        tuple(_with_turns(steps, visits)),
+        tuple(steps),
         name=name,
         odometry=Odometry(scale=SCALE, bend=DRIFT, offset=MIDDLE, facing=DIRECTION),
         extra={"beams": {"first": -90, "step": 1}},
@@ -173,7 +174,7 @@ def _step(
     # The ranges that a laser in the middle of the place would measure: (181,), metres.
     image, _ = _free_along(visit.patch, visit.middle, pose[2] + BEAMS)
     return Step(
-        image=tuple(map(_millimetres, image.tolist())),
+        image=tuple(round(metres, 3) for metres in image.tolist()),
         star=_star(visit, pose[2]),
         displacement=onward,
         covariance=covariance,
@@ -260,30 +261,12 @@ def _free_along(
     return far[end], np.any(near, axis=0) & ~free.all(axis=1)
 
 
-@lru_cache(4096)
-def _millimetres(metres: float) -> float:
-    """Round a range. Images share their few different ranges, and so need less memory."""
-    return round(metres, 3)
-
-
 def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> Covariance:
     """The covariance of the displacement between two steps, in the frame of the first step."""
     total = uncertainty(track, begin, end, np.array(last[:2]))
     found = covariance_turned(-first[2], total) + np.diag(FLOOR) ** 2
     found = (found + found.T) / 2
     return tuple(tuple(round(float(v), 8) for v in row) for row in found)  # type: ignore[return-value]
-
-
-def _with_turns(steps: list[Step], visits: Sequence[Visit]) -> list[Step]:
-    """Give each step without an action the turn to the next step of its visit."""
-    done = list(steps)
-    for i, step in enumerate(steps[:-1]):
-        if step.action is None:
-            turned = steps[i + 1].displacement
-            assert turned is not None
-            visit = visits[int(step.extra["visit"])]
-            done[i] = replace(step, action=_turn(-math.degrees(turned[2]), visit))
-    return done
 
 
 def _turn(clockwise: float, visit: Visit) -> Action:

@@ -18,8 +18,6 @@ Array = NDArray[np.float64]
 # The error of the heading, in radians, is TURNING times the turn, DRIFT for each metre, and ANGLE.
 WAY, OFFSET = 0.1, 0.03
 TURNING, DRIFT, ANGLE = 0.1, 0.02, 0.02
-# The sums of covariances are kept for each BLOCK-th scan.
-BLOCK = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,40 +51,26 @@ class Track:
         """The distance travelled up to each scan: (n,), metres."""
         return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.poses[:, :2], axis=0).T))])
 
-    def corrected(self, begin: int, end: int) -> Array:
-        """The corrected covariances of the motions to scans begin … end - 1: (n, 3, 3)."""
-        return self.covariances[begin:end] * self.factor
+    @property
+    def corrected(self) -> Array:
+        """The corrected covariances of the motions to each scan: (n, 3, 3)."""
+        return self.covariances * self.factor
 
-    def spread(self, scan: int) -> Array:
-        """The sum of the corrected covariances of all increments up to a scan: (3, 3).
+    @cached_property
+    def spreads(self) -> Array:
+        """The sum of the corrected covariances of all increments up to each scan: (n, 3, 3).
 
         The covariance of each increment is first expressed as an error at the origin of the frame.
         """
-        if scan not in self._spreads:
-            begin = (scan - 1) // BLOCK * BLOCK
-            self._spreads[scan] = self._added(begin, scan, self._spreads[begin])
-        return self._spreads[scan]
-
-    @cached_property
-    def _spreads(self) -> dict[int, Array]:
-        """The spreads at each BLOCK-th scan, and at scans that were asked for."""
-        known = {0: np.zeros((3, 3))}
-        for begin in range(0, len(self.poses) - BLOCK, BLOCK):
-            known[begin + BLOCK] = self._added(begin, begin + BLOCK, known[begin])
-        return known
-
-    def _added(self, begin: int, end: int, before: Array) -> Array:
-        """The spread at scan `end`, from the spread at scan `begin`."""
-        x, y, _ = self.poses[begin + 1 : end + 1].T
-        heading = self.poses[begin:end, 2]
+        x, y, _ = self.poses[1:].T
+        heading = self.poses[:-1, 2]
         cos, sin = np.cos(heading), np.sin(heading)
         arms = np.zeros((len(x), 3, 3))
         arms[:, 0] = np.stack([cos, -sin, y], axis=1)
         arms[:, 1] = np.stack([sin, cos, -x], axis=1)
         arms[:, 2, 2] = 1.0
-        steps = arms @ self.corrected(begin + 1, end + 1) @ arms.transpose(0, 2, 1)
-        steps[0] += before
-        return np.asarray(np.cumsum(steps, axis=0)[-1].copy())
+        steps = arms @ self.corrected[1:] @ arms.transpose(0, 2, 1)
+        return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
 
     def cuts_between(self, first: int, last: int) -> list[int]:
         """List the cuts after scan `first` and up to scan `last`."""

@@ -15,14 +15,13 @@ import re
 import sqlite3
 import struct
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 from urllib.parse import quote
 
 from perception.errors import LogError
@@ -46,26 +45,19 @@ SCHEMA, CHANNEL, MCAP_MESSAGE, MCAP_CHUNK = 3, 4, 5, 6
 ROS1_MESSAGE, ROS1_CHUNK, CONNECTION = 2, 5, 7
 
 
-class Message(NamedTuple):
-    """A message of a bag."""
-
-    connection: int  # number of the connection, which is one sender's messages to one topic
-    topic: str  # name of the topic
-    msgtype: str  # message kind, such as sensor_msgs/msg/LaserScan
-    sender: str  # name of the sender; empty if the format does not store it
-    time: int  # time of recording in nanoseconds
-    data: bytes  # the serialised message
-
-
-@dataclass(frozen=True)
+@dataclass
 class Connection:
     """The messages of one sender to one topic, with the fields of rosbags' connections."""
 
     id: int
     topic: str
-    msgtype: str
-    msgcount: int
+    msgtype: str  # message kind, such as sensor_msgs/msg/LaserScan
     ext: SimpleNamespace  # of a ROS 1 bag: `callerid`, the name of the node that sends
+    msgcount: int = 0
+
+
+# A message: its connection, the time of recording in nanoseconds, and the serialised message.
+Message = tuple[Connection, int, bytes]
 
 
 class Salvage:
@@ -76,32 +68,22 @@ class Salvage:
 
     def __init__(self, path: Path, format: str) -> None:
         self._path, self._read = path, READERS[format]
-        found: dict[int, tuple[str, str, str]] = {}
-        counts: Counter[int] = Counter()
-        first, last = None, 0
-        for message in self._messages():
-            found.setdefault(message.connection, (message.topic, message.msgtype, message.sender))
-            counts[message.connection] += 1
-            first, last = message.time if first is None else first, message.time
-        self.connections = [  # those with intact messages
-            Connection(number, topic, kind, counts[number], SimpleNamespace(callerid=sender))
-            for number, (topic, kind, sender) in found.items()
-        ]
-        self.count = counts.total()  # number of intact messages
+        found: dict[int, Connection] = {}
+        times: list[int] = []
+        for connection, time, _ in self._messages():
+            found.setdefault(connection.id, connection).msgcount += 1
+            times = [*times[:1], time]
+        self.connections = [*found.values()]  # those with intact messages
+        self.count = sum(one.msgcount for one in self.connections)  # number of intact messages
         # From the first to the last intact message.
-        self.seconds = (last - (first or 0)) / NANOSECONDS
+        self.seconds = (times[-1] - times[0]) / NANOSECONDS if times else 0.0
 
-    def messages(
-        self, connections: Collection[Connection]
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield each message: connection, time of recording in nanoseconds, and bytes."""
+    def messages(self, connections: Collection[Connection]) -> Iterator[Message]:
+        """Yield each message of these connections."""
         asked = {connection.id: connection for connection in connections}
-        for message in self._messages():
-            if message.connection in asked:
-                yield asked[message.connection], message.time, message.data
-
-    def close(self) -> None:
-        """Do nothing: no file is open between two calls. Readers of rosbags have this method."""
+        for connection, time, data in self._messages():
+            if connection.id in asked:
+                yield asked[connection.id], time, data
 
     def _messages(self) -> Iterator[Message]:
         try:
@@ -113,7 +95,7 @@ class Salvage:
 def _mcap(path: Path) -> Iterator[Message]:
     """The intact messages of an MCAP file."""
     kinds: dict[int, str] = {}
-    channels: dict[int, tuple[str, str]] = {}
+    channels: dict[int, Connection] = {}
     with path.open("rb") as file:
         file.seek(8)
         for kind, data in _mcap_records(file, os.fstat(file.fileno()).st_size):
@@ -124,11 +106,11 @@ def _mcap(path: Path) -> Iterator[Message]:
                 number, schema = struct.unpack_from("<HH", data)
                 topic, end = _text(data, 4)
                 if _text(data, end)[0] == "cdr":
-                    channels[number] = topic, kinds.get(schema, "")
+                    channels[number] = _connection(number, topic, kinds.get(schema, ""))
             elif kind == MCAP_MESSAGE:
                 number, _, time = struct.unpack_from("<HIQ", data)
                 if number in channels:
-                    yield Message(number, *channels[number], "", time, data[22:])
+                    yield channels[number], time, data[22:]
 
 
 def _mcap_records(stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
@@ -148,7 +130,7 @@ def _mcap_records(stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
 
 def _ros1(path: Path) -> Iterator[Message]:
     """The intact messages of a ROS 1 bag."""
-    connections: dict[int, tuple[str, str, str]] = {}
+    connections: dict[int, Connection] = {}
     with path.open("rb") as file:
         file.readline()
         for header, data in _ros1_records(file, os.fstat(file.fileno()).st_size):
@@ -160,14 +142,12 @@ def _ros1(path: Path) -> Iterator[Message]:
             if kind == CONNECTION:
                 fields = _fields(data)
                 package, _, name = fields[b"type"].decode().partition("/")
-                connections[number] = (
-                    header[b"topic"].decode(),
-                    f"{package}/msg/{name}",
-                    fields.get(b"callerid", b"").decode(),
-                )
+                sender = fields.get(b"callerid", b"").decode()
+                topic = header[b"topic"].decode()
+                connections[number] = _connection(number, topic, f"{package}/msg/{name}", sender)
             elif number in connections:
                 seconds, nano = struct.unpack("<II", header[b"time"])
-                yield Message(number, *connections[number], seconds * NANOSECONDS + nano, data)
+                yield connections[number], seconds * NANOSECONDS + nano, data
 
 
 def _ros1_records(stream: IO[bytes], size: int) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
@@ -202,14 +182,14 @@ def _sqlite(path: Path) -> Iterator[Message]:
         # Without this, SQLite rejects a file that is shorter than its first page says.
         database.execute("PRAGMA writable_schema=ON")
         topics = {
-            number: (topic, kind)
-            for number, topic, kind in database.execute("SELECT id, name, type FROM topics")
+            row[0]: _connection(*row)
+            for row in database.execute("SELECT id, name, type FROM topics")
         }
         for number, time, data in database.execute(
             "SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"
         ):
             if number in topics and isinstance(data, bytes):
-                yield Message(number, *topics[number], "", time, data)
+                yield topics[number], time, data
 
 
 READERS: dict[str, Callable[[Path], Iterator[Message]]] = {
@@ -217,6 +197,10 @@ READERS: dict[str, Callable[[Path], Iterator[Message]]] = {
     "ros1": _ros1,
     "ros2": _sqlite,
 }
+
+
+def _connection(number: int, topic: str, kind: str, sender: str = "") -> Connection:
+    return Connection(number, topic, kind, SimpleNamespace(callerid=sender))
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
@@ -423,33 +407,28 @@ class Bag:
         deserialize = store.deserialize_ros1 if self.format == "ros1" else store.deserialize_cdr
         for reader in self.readers:
             connections = [c for c in reader.connections if c.topic in topics]
-            stored = reader.messages(connections=connections) if connections else iter(())
-            while True:
-                try:
-                    connection, time, raw = next(stored)
-                except StopIteration:
-                    break
-                except Exception as error:  # Damaged bytes can raise any error in the library.
-                    raise_if_disk_is_full(error, self.source)
-                    number = sum(numbers.values()) + 1
-                    where = " and ".join(sorted(topics))
-                    what = (
-                        f"{where}: expected a message, got damaged data ({cause(error)}); what "
-                        "follows was not read"
-                    )
-                    yield connections[0], number, 0.0, Damage(number, what)
-                    break
-                topic = connection.topic
-                numbers[topic] += 1
-                try:
-                    message = deserialize(raw, connection.msgtype)
-                    yield connection, numbers[topic], time * NANO, message
-                except (SerdeError, ValueError, IndexError) as error:
-                    what = (
-                        f"{topic}: expected a message {connection.msgtype.rpartition('/')[2]}, "
-                        f"got damaged data ({cause(error)})"
-                    )
-                    yield connection, numbers[topic], time * NANO, Damage(numbers[topic], what)
+            try:
+                for connection, time, raw in reader.messages(connections) if connections else ():
+                    numbers[connection.topic] += 1
+                    number = numbers[connection.topic]
+                    try:
+                        message = deserialize(raw, connection.msgtype)
+                    except (SerdeError, ValueError, IndexError) as error:
+                        what = (
+                            f"{connection.topic}: expected a message "
+                            f"{connection.msgtype.rpartition('/')[2]}, got damaged data "
+                            f"({cause(error)})"
+                        )
+                        message = Damage(number, what)
+                    yield connection, number, time * NANO, message
+            except Exception as error:  # Damaged bytes can raise any error in the library.
+                raise_if_disk_is_full(error, self.source)
+                number = sum(numbers.values()) + 1
+                what = (
+                    f"{' and '.join(sorted(topics))}: expected a message, got damaged data "
+                    f"({cause(error)}); what follows was not read"
+                )
+                yield connections[0], number, 0.0, Damage(number, what)
 
 
 def format_of(head: bytes) -> str | None:

@@ -206,14 +206,13 @@ def _ahead(times: Array, begin: float, every: float) -> tuple[Array, Array]:
     )
 
 
-def sources_of(track: RecordedTrack) -> list[NDArray[np.intp]]:
-    """Separate the poses of sources that alternate, such as two programs with the same transform.
+def sources_of(poses: Array) -> list[NDArray[np.intp]]:
+    """Separate poses, (n, 3), of sources that alternate, such as two programs with one transform.
 
     Each pose is given to the source whose last pose is nearest. If no source is near, the pose
     starts a new source. The source with the most poses comes first. If poses do not alternate, all
     are of one source.
     """
-    poses = track.table()[:, 2:]
     if len(poses) < 10:
         return [np.arange(len(poses))]
     over = np.abs(poses[2:] - poses[:-2])
@@ -418,11 +417,11 @@ def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Recor
 
 def _of_one_source(track: RecordedTrack, called: str, notes: list[str]) -> RecordedTrack:
     """If the poses of several sources alternate, keep those of the largest one, and note it."""
-    sources = sources_of(track)
+    table = track.table()
+    sources = sources_of(table[:, 2:])
     if len(sources) == 1:
         return track
     # For the note, measure how far the poses of the two largest sources differ.
-    table = track.table()
     first, second = (RecordedTrack(array("d", table[some].ravel())) for some in sources[:2])
     here, there = TimedPoses.of(first, False), TimedPoses.of(second, False)
     apart = max(math.dist(here.at(time)[:2], there.at(time)[:2]) for time in there.times)
@@ -449,20 +448,20 @@ class _ScanPoses:
     # Whether times come from the headers of messages; otherwise, they are times of recording.
     by_stamp: bool
 
-    def at(self, time: float) -> tuple[Pose, Pose | None]:
-        """The odometer's and the corrected pose (if any) at a time in seconds. Raises Damaged."""
+    def scan(self, message: Any, recorded: float, number: int) -> Scan:
+        """Make the scan of a message. Raises Damaged."""
+        time = stamp_of(message.header) if self.by_stamp else recorded
         if not self.odometry.covers(time):
             begin, end = self.odometry.times[[0, -1]]
             raise Damaged(
                 f"expected odometry at the time of the scan, {time:.3f} s, got it from "
                 f"{begin:.3f} to {end:.3f} s"
             )
-        pose = self.odometry.at(time)
-        corrected: Pose | None = pose if self.corrections else None
+        pose = corrected = self.odometry.at(time)
         for correction in self.corrections:
-            assert corrected is not None
             corrected = moved(correction.at(time), corrected)
-        return pose, corrected
+        ranges, laser = _measured(message, *self.mounts[frame_name(message.header.frame_id)])
+        return Scan(ranges, laser, pose, corrected if self.corrections else None, time, number)
 
 
 def _scans(
@@ -471,14 +470,9 @@ def _scans(
     """Yield the scans of a bag, and `Damage` for what cannot be read."""
     yield from damaged
     for connection, number, recorded, message in bag.messages(topics):
-        if isinstance(message, Damage):
-            yield message
-            continue
         try:
-            time = stamp_of(message.header) if where.by_stamp else recorded
-            pose, corrected = where.at(time)
-            ranges, laser = _measured(message, *where.mounts[frame_name(message.header.frame_id)])
-            yield Scan(ranges, laser, pose, corrected, time, number)
+            is_damaged = isinstance(message, Damage)
+            yield message if is_damaged else where.scan(message, recorded, number)
         except Damaged as damage:
             yield Damage(number, f"{connection.topic}: {damage}")
 

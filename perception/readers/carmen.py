@@ -44,15 +44,7 @@ from typing import IO
 
 from perception.errors import LogError
 from perception.readers import carmen_survey
-from perception.readers.carmen_survey import (
-    KINDS,
-    Findings,
-    Meaning,
-    Odom,
-    ScanLine,
-    pose_at,
-    time_at,
-)
+from perception.readers.carmen_survey import KINDS, Findings, ScanLine
 from perception.readers.lines import LONGEST_LINE, lines
 from perception.readers.scans import (
     Array,
@@ -184,14 +176,14 @@ class _OdometerPoses:
     """Computes the pose of the odometer at each scan, from the lines of the log up to that scan."""
 
     found: Findings  # findings of the first pass
-    meaning: Meaning  # meaning of the poses of the scans
+    meaning: carmen_survey.Meaning  # meaning of the poses of the scans
     is_corrected: bool  # whether poses of vertices count as corrected
     # Pose by odometry, computed by adding up the motions between ODOM lines.
     chain: Pose = (0.0, 0.0, 0.0)
     # Value of `chain` before the last ODOM line, or at the last scan if that came later.
     behind: Pose = (0.0, 0.0, 0.0)
-    last: Odom | None = None  # the last ODOM line
-    before: Odom | None = None  # the ODOM line before the last
+    last: carmen_survey.Odom | None = None  # the last ODOM line
+    before: carmen_survey.Odom | None = None  # the ODOM line before the last
     # Whether the next ODOM line starts from a corrected pose, and gives no motion.
     restarts: bool = False
     vertex: int | None = None  # index of the last vertex
@@ -204,17 +196,18 @@ class _OdometerPoses:
         """Process a line that is no scan. Raises Damaged."""
         carmen_survey.refuse_cut(tag, len(tokens), self.found.usual_length(tag))
         if tag == b"ODOM":
-            pose = pose_at(tokens, 1)
+            pose = carmen_survey.pose_at(tokens, 1)
             self.behind = self.chain
             if self.last is not None and not self.restarts:
                 self.chain = moved(self.chain, displacement_between(self.last[0], pose))
-            self.before, self.last, self.restarts = self.last, (pose, time_at(tokens, 7)), False
+            self.before, self.last = self.last, (pose, carmen_survey.time_at(tokens, 7))
+            self.restarts = False
         elif tag == b"NEFF":
             # The last ODOM line repeated the pose of a scan, so it is no motion. The line of that
             # scan may be missing.
             self.chain = self.behind
         elif tag == b"TRUEPOS":
-            self.truth = pose_at(tokens, 1), pose_at(tokens, 4)
+            self.truth = carmen_survey.pose_at(tokens, 1), carmen_survey.pose_at(tokens, 4)
         elif tag == b"PARAM":
             # The survey already has parameters and edges. Reading them again reports damaged lines.
             carmen_survey.parameters_of(tokens)
@@ -249,7 +242,7 @@ class _OdometerPoses:
                     f"expected the pose of a vertex in {line.kind}, got another; the line of "
                     "its vertex is missing or damaged"
                 )
-            return self.found.graph.chain[0][index], second if self.is_corrected else None
+            return self.found.graph.chain[index], second if self.is_corrected else None
         if self.meaning == "restarts":
             self.last, self.restarts, self.behind = (second, line.time), True, self.chain
             return self.chain, second

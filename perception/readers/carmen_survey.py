@@ -11,7 +11,7 @@ from array import array
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import pairwise
 from typing import IO, Any, Literal, TypeAlias
 
@@ -236,7 +236,7 @@ class PoseGraph:
         >>> graph.vertices += [(0, (0.0, 0.0, 0.0)), (1, (1.1, 0.0, 0.0)), (2, (2.2, 0.0, 0.0))]
         >>> graph.edges |= {(0, 1): (1.0, 0.0, 0.0), (1, 2): (1.0, 0.0, 0.0)}
         >>> graph.chain
-        ([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 0.0, 0.0)], [])
+        [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 0.0, 0.0)]
         >>> graph.index_at((2.2, 0.0, 0.0))
         2
     """
@@ -247,42 +247,30 @@ class PoseGraph:
     edges: dict[tuple[int, int], Pose] = field(default_factory=dict)
 
     @cached_property
-    def chain(self) -> tuple[list[Pose], list[int]]:
-        """The poses by odometry at the vertices, from (0, 0, 0) on, and the gaps between them.
+    def chain(self) -> list[Pose]:
+        """The poses by odometry at the vertices, from (0, 0, 0) on.
 
-        Poses add up the motions along the edges. Gaps are the numbers of vertices to which no edge
-        leads from the vertex before. There, the robot is taken to have stood still.
+        Poses add up the motions along the edges. The robot is taken to have stood still if no edge
+        leads to a vertex from the vertex before. A few vertices between may be missing.
         """
         poses: list[Pose] = [(0.0, 0.0, 0.0)]
-        gaps: list[int] = []
         for (start, _), (end, _) in pairwise(self.vertices):
-            motion = self._motion(start, end)
-            if motion is None:
-                gaps.append(end)
+            motion = self.edges.get((start, end))
+            if motion is None and (back := self.edges.get((end, start))) is not None:
+                motion = displacement_between(back, (0.0, 0.0, 0.0))
+            between = range(start, end) if motion is None and end <= start + MOST_BETWEEN else ()
+            steps = [self.edges.get((vertex, vertex + 1)) for vertex in between]
+            if motion is None and None not in steps:
+                motion = reduce(moved, filter(None, steps), (0.0, 0.0, 0.0))
             poses.append(moved(poses[-1], motion or (0.0, 0.0, 0.0)))
-        return poses, gaps
-
-    def _motion(self, start: int, end: int) -> Pose | None:
-        """Find the motion between vertices by an edge or a chain of edges; None without."""
-        if (motion := self.edges.get((start, end))) is not None:
-            return motion
-        if (back := self.edges.get((end, start))) is not None:
-            return displacement_between(back, (0.0, 0.0, 0.0))
-        if not start < end <= start + MOST_BETWEEN:
-            return None
-        motion = (0.0, 0.0, 0.0)
-        for vertex in range(start, end):
-            if (step := self.edges.get((vertex, vertex + 1))) is None:
-                return None
-            motion = moved(motion, step)
-        return motion
+        return poses
 
     def is_corrected(self, farthest: float) -> bool:
         """Check whether a vertex is more than some metres away from its pose by odometry."""
         first = self.vertices[0][1]
         return any(
             math.dist(displacement_between(first, pose)[:2], odometry[:2]) > farthest
-            for (_, pose), odometry in zip(self.vertices, self.chain[0], strict=True)
+            for (_, pose), odometry in zip(self.vertices, self.chain, strict=True)
         )
 
     def index_at(self, pose: Pose, guess: int | None = None) -> int | None:
@@ -393,9 +381,11 @@ def meaning_of(
             "were added up, without the jumps of the correction."
         )
         if survey.unmoved:
+            more = len(survey.unmoved) - 5
             notes.append(
                 "No ODOM line tells how the robot moved before the scans in these lines, so "
-                f"that it seems to have stood still: {_listed(survey.unmoved)}."
+                f"that it seems to have stood still: {', '.join(map(str, survey.unmoved[:5]))}"
+                f"{f' and {more} more' if more > 0 else ''}."
             )
         return "restarts"
     if survey.wandered > (1 - MOST_SCANS) * survey.scans:
@@ -427,19 +417,7 @@ def _meaning_beside_graph(
         f"The robot's poses in {kind} and in VERTEX2 are equal, so they are corrected poses. "
         "Odometry is made by adding up the motions in EDGE2 from each vertex to the next."
     )
-    if gaps := graph.chain[1]:
-        notes.append(
-            "No EDGE2 tells how the robot moved before these vertices, so that it seems to "
-            f"have stood still: {_listed(gaps)}."
-        )
     return "edges"
-
-
-def _listed(numbers: list[int]) -> str:
-    """List the first five numbers for a note, and say how many more there are."""
-    return ", ".join(map(str, numbers[:5])) + (
-        f" and {len(numbers) - 5} more" if len(numbers) > 5 else ""
-    )
 
 
 def mount_in_log(found: Findings, survey: Survey, meaning: Meaning, kind: str) -> Pose:

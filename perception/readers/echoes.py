@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
-from perception.readers.scans import Array, Scan, ScanTable, in_memory, in_turn, shared
+from perception.readers.scans import Array, Scan, ScanTable, shared
 from ssh_abduction.data.checks import a_number, numbers, one_of
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Pose, displacement_between
@@ -137,7 +137,7 @@ def interpret_log(
     several lasers.
     """
     interpret, notes = interpreter_of(scans, options)
-    return ScanTable(map(interpret, in_turn(scans))), notes
+    return ScanTable(map(interpret, scans)), notes
 
 
 def interpreter_of(
@@ -163,7 +163,7 @@ def interpreter_of(
     for key, members in groups.items():
         kept = moving(members)
         some = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_SURVEYED)).astype(int))
-        surveyed = [in_memory(scan) for scan in in_turn(kept[i] for i in some)]
+        surveyed = [replace(kept[i], ranges=kept[i].ranges.copy()) for i in some]
         meanings[key], said = _survey(surveyed, options)
         notes += said
 

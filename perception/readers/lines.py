@@ -12,18 +12,17 @@ import gzip
 import importlib
 import io
 import lzma
-import os
 import shutil
 import tempfile
 import zlib
 from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import IO, Any, cast
 
 from perception.errors import LogError
 from ssh_abduction.data.errors import named
+from ssh_abduction.data.files import opened
 
 # Longer lines are skipped: a scan of 10,000 beams is 100 kB.
 LONGEST_LINE = 2**20
@@ -37,33 +36,18 @@ PACKERS = {
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
+def rereadable(path: str) -> Iterator[IO[bytes]]:
     """Open a file to be read more than once. A pipe is copied to a temporary file.
 
     Raises LogError if the file cannot be read.
     """
-    try:
-        file = Path(path).open("rb")  # noqa: SIM115 - it is closed below
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    except ValueError as error:  # A null character in the path.
-        raise LogError(f"{named(path)}: expected the path of a log: {error}; name a file") from None
-    try:
-        with file:
-            if file.seekable():
-                yield file
-                return
-            with tempfile.TemporaryFile() as copy:
-                copied(file, copy, named(path))
-                yield cast(IO[bytes], copy)
-    except OSError as error:
-        raise _unreadable(path, error) from None
-
-
-def _unreadable(path: str | os.PathLike[str], error: OSError) -> LogError:
-    return LogError(
-        f"{named(path)}: expected a readable log: {error.strerror or error}; check the path"
-    )
+    with opened(path, "a readable log", LogError) as file:
+        if file.seekable():
+            yield file
+            return
+        with tempfile.TemporaryFile() as copy:
+            copied(file, copy, named(path))
+            yield cast(IO[bytes], copy)
 
 
 def copied(file: IO[bytes], copy: IO[bytes], source: str) -> None:

@@ -13,7 +13,7 @@ from typing import IO, cast
 from perception.errors import LogError
 from perception.readers import bag_files, bags, carmen
 from perception.readers.echoes import LaserOptions, interpret_log, interpret_scan, interpreter_of
-from perception.readers.lines import LONGEST_LINE, Piped, lines, opened, piped
+from perception.readers.lines import LONGEST_LINE, Piped, lines, piped, rereadable
 from perception.readers.scans import Damage, RobotLog, Scan, ScanTable, SurveyedLog
 from ssh_abduction.data.checks import a_list, a_path, a_text
 from ssh_abduction.data.errors import brief, named
@@ -195,7 +195,7 @@ def _reading(
             yield bags.read(bag, topics, odom_topic)
         return
     # A file is a log in lines or a bag, by its content.
-    with opened(path) as file:
+    with rereadable(os.fspath(path)) as file:
         found = format or _format(file, named(path))
         if found in LINES:
             if topics or odom_topic is not None:

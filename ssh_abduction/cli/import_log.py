@@ -382,7 +382,7 @@ def digest(logs: Sequence[str]) -> str | None:
 
 def _digest_of(path: str) -> str | None:
     """Compute the digest of one log, as `digest` does. Raises LogError."""
-    from perception.readers.lines import opened
+    from perception.readers.lines import rereadable
 
     whole = hashlib.sha256()
     file = Path(path)
@@ -393,7 +393,7 @@ def _digest_of(path: str) -> str | None:
                 with part.open("rb") as content:
                     whole.update(hashlib.file_digest(content, "sha256").digest())
     elif file.is_file() or not file.exists():
-        with opened(path) as content:
+        with rereadable(path) as content:
             for block in iter(partial(content.read, 2**20), b""):
                 whole.update(block)
     else:

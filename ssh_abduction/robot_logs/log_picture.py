@@ -32,7 +32,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from perception.places.importing import Imported
-from perception.readers.scans import RobotLog, Scan, in_turn
+from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
@@ -335,7 +335,7 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
     # The ends of all beams of a long log would need much memory.
     for begin in range(0, len(log), AT_ONCE):
         some = slice(begin, begin + AT_ONCE)
-        ends = map(_ends, in_turn(log.scans[some]), poses[some])
+        ends = map(_ends, log.scans[some], poses[some])
         cells = np.rint(np.concatenate(list(ends)) / GRAIN).astype(int)
         every, weights = np.concatenate([squares, cells]), np.append(counts, np.ones(len(cells)))
         squares, numbers = np.unique(every, axis=0, return_inverse=True)

@@ -1,26 +1,39 @@
-"""Finds jumps and wrong units in odometry, and describes them in notes."""
+"""Judges the odometry of a log: finds jumps, and compares it with scan matching.
+
+Scan matching corrects an odometer that drifts by some percent. If the trajectories differ by more,
+one of these was read wrongly: the field of view, the position of the laser on the robot, the range
+that means "nothing came back", or the odometer. The kind of difference shows which.
+
+Both trajectories are cut into stretches of about a metre. The motion along a stretch is a complex
+number in the frame of the robot at its beginning. A least-squares fit finds the complex factor that
+maps motions by odometry to motions by scans. Its angle is the difference in direction.
+
+Scan matching starts from the odometry. So in a corridor it hardly notices if the direction of the
+laser is wrong. Pairs of scans show it better: if the second scan is moved by the odometry, its
+points coincide with those of the first only if the direction is right. The field of view is tested
+likewise.
+"""
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from enum import Enum
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from perception.readers.bags import RecordedTrack as Odometry
-from perception.readers.bags import sources_of
-from perception.readers.scans import Array, RobotLog, Scan, in_turn
+from perception.places.track import Array, Track, wrapped
+from perception.readers.bags import TimedPoses, sources_of
+from perception.readers.echoes import moving
+from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.odometry import Pose, displacement_between
 from ssh_abduction.data.words import counted
-
-if TYPE_CHECKING:
-    from perception.places.track import Track
 
 # A step between two scans is impossible if it is longer than both FAR metres and UNUSUAL times the
 # usual step. It is doubtful if it is longer than half of that.
@@ -68,10 +81,7 @@ def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
     """
     if len(log) < LEAST_SCANS:
         return log, []
-    odometry = Odometry()
-    for number, scan in enumerate(log.scans):
-        odometry.add(number, number, scan.odometry)
-    sources = sources_of(odometry)
+    sources = sources_of(log.odometry)
     # Scans that are out of order look like poses of several sources.
     if len(sources) == 1 or times_back(log) > RUNS_BACK * len(log):
         return log, []
@@ -80,7 +90,11 @@ def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
         f"{len(sources[1])} of {len(log)}. The source of more poses is used. If the other one is "
         "better, stop the source that was used, and record again."
     )
-    return replace(log, scans=_of_source(log.scans, sources[0])), [said]
+    poses = log.odometry[sources[0]]
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    kept = TimedPoses(sources[0].astype(float), poses)
+    scans = (replace(scan, odometry=kept.at(k)) for k, scan in enumerate(log.scans))
+    return replace(log, scans=tuple(scans)), [said]
 
 
 def times_back(log: RobotLog) -> int:
@@ -128,19 +142,6 @@ def usual_step(log: RobotLog) -> float:
     """
     far = _far(log, 1)
     return float(np.median(far[far > 0])) if (far > 0).any() else 0.0
-
-
-def _of_source(scans: Sequence[Scan], members: NDArray[np.intp]) -> tuple[Scan, ...]:
-    """Replace the odometry of all scans by that of one source, interpolated or extrapolated."""
-    from scipy.interpolate import interp1d
-
-    poses = np.array([scans[number].odometry for number in members])
-    poses[:, 2] = np.unwrap(poses[:, 2])
-    rows = interp1d(members, poses, axis=0, fill_value="extrapolate")(np.arange(len(scans)))
-    odometry: list[Pose] = [
-        (x, y, math.remainder(heading, math.tau)) for x, y, heading in rows.tolist()
-    ]
-    return tuple(replace(scan, odometry=pose) for scan, pose in zip(scans, odometry, strict=True))
 
 
 def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> list[str]:
@@ -245,7 +246,7 @@ class Doubt(Enum):
 class LiveJumps:
     """Judges each step by those before it, while a robot drives.
 
-    A step is a jump by the same measure as in `unknown_steps`. The usual step is the median of the
+    A step is a jump by the same measure as in `doubts_of`. The usual step is the median of the
     last LATELY steps. Clocks are not read.
     """
 
@@ -264,62 +265,39 @@ class LiveJumps:
         return Doubt.DOUBTFUL if far > least / 2 else Doubt.NONE
 
 
-@dataclass(frozen=True)
-class Unknown:
-    """Scans for which the odometry of the step before them cannot be trusted, by index."""
+def doubts_of(log: RobotLog) -> tuple[dict[int, Doubt], list[tuple[int, int]]]:
+    """Find the scans for which the odometry of the step before them cannot be trusted.
 
-    # Scans after a jump of the odometer, or after a motion that the odometer missed.
-    unknown: frozenset[int] = frozenset()
-    # The scans in `unknown` before which the robot was carried while nothing was logged.
-    carried: frozenset[int] = frozenset()
-    # Scans after other long steps. Such a step is a jump if the scan matches only near the previous
-    # pose.
-    doubtful: frozenset[int] = frozenset()
-    # Scans at which a second drive seems to begin. The step to such a scan is unknown unless the
-    # scan matches where the step ends.
-    seams: frozenset[int] = frozenset()
-    # First and last scan of each stretch in which the odometer stands still, though the scans
-    # change.
-    still: tuple[tuple[int, int], ...] = ()
-
-    def doubt_of(self, scan: int) -> Doubt:
-        """How far the odometry of the step to a scan can be trusted."""
-        if scan in self.carried:
-            return Doubt.CARRIED
-        if scan in self.unknown:
-            return Doubt.UNKNOWN
-        if scan in self.seams:
-            return Doubt.SEAM
-        return Doubt.DOUBTFUL if scan in self.doubtful else Doubt.NONE
-
-    def without(self, standing: frozenset[int]) -> Unknown:
-        """Make a copy in which the scans of a standing robot are not unknown."""
-        return replace(self, unknown=self.unknown - (standing - self.carried), still=())
-
-
-def unknown_steps(log: RobotLog) -> Unknown:
-    """Find scans after a jump of the odometer or after a motion that only the laser shows."""
+    Return the doubt of each by its index, and the first and last scan of each stretch in which the
+    odometer stands still, though the scans change.
+    """
     if len(log) < 3:
-        return Unknown()
+        return {}, []
     seconds = _seconds(log)
     paused = (
         np.zeros(len(log) - 1, bool) if seconds is None else seconds > PAUSE * np.median(seconds)
     )
     jumped, doubtful = _impossible(log, seconds, paused)
-    seams = frozenset(scan for scan, _ in seams_of(log))
+    carried, still = _moved_while_still(log, paused)
     # After a long step in a pause, the odometer may have restarted.
     far, anew = _far(log, 1), np.hypot(*log.odometry[1:, :2].T) < ANEW
-    seams |= _targets(paused & anew & (far > FAR / 2) & ~jumped)
-    carried, still = _moved_while_still(log, paused)
-    moved = frozenset(k for first, last in still for k in range(first, last + 1))
-    return Unknown(
-        _targets(jumped) | moved | carried, carried, _targets(doubtful & ~jumped), seams, still
-    )
+    restarted = _targets(paused & anew & (far > FAR / 2) & ~jumped)
+    moved = {k for first, last in still for k in range(first, last + 1)}
+    doubts: dict[int, Doubt] = {}
+    # The last doubt about a step counts.
+    for scans, doubt in (
+        (_targets(doubtful), Doubt.DOUBTFUL),
+        (restarted.union(scan for scan, _ in seams_of(log)), Doubt.SEAM),
+        (_targets(jumped) | moved, Doubt.UNKNOWN),
+        (carried, Doubt.CARRIED),
+    ):
+        doubts |= dict.fromkeys(scans, doubt)
+    return doubts, still
 
 
-def _targets(steps: NDArray[np.bool_]) -> frozenset[int]:
+def _targets(steps: NDArray[np.bool_]) -> set[int]:
     """The indices of the scans that the marked steps, (n - 1,), lead to."""
-    return frozenset((np.flatnonzero(steps) + 1).tolist())
+    return set((np.flatnonzero(steps) + 1).tolist())
 
 
 def _impossible(
@@ -350,7 +328,7 @@ def _impossible(
 
 def _moved_while_still(
     log: RobotLog, paused: NDArray[np.bool_]
-) -> tuple[frozenset[int], tuple[tuple[int, int], ...]]:
+) -> tuple[set[int], list[tuple[int, int]]]:
     """Find stretches in which the odometer stands still, but the laser shows a motion.
 
     Returns the scans before which there was a pause and somebody moved the robot; and the first and
@@ -359,7 +337,7 @@ def _moved_while_still(
     """
     still = stands_still(log)
     if is_missing(log):
-        return frozenset(), ()
+        return set(), []
     carried, found = set[int](), list[tuple[int, int]]()
     # Each stretch of standing still begins and ends at an edge of the mask.
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still, [0]])))
@@ -371,7 +349,7 @@ def _moved_while_still(
             for k in range(begin + 1, end + 1)
             if paused[k - 1] and _change(log.scans[k - 1], log.scans[k]) > MOVED_UNSEEN
         }
-    return frozenset(carried), tuple(found)
+    return carried, found
 
 
 def stands_still(log: RobotLog) -> NDArray[np.bool_]:
@@ -379,28 +357,15 @@ def stands_still(log: RobotLog) -> NDArray[np.bool_]:
     return np.asarray(np.abs(np.diff(log.odometry, axis=0)).max(axis=1) < STILL)
 
 
-class StandstillCheck:
-    """Notices whether the robot moves while its odometer stands still."""
-
-    def __init__(self) -> None:
-        self.moved = False  # whether the robot moved in this way
-        self._first: Scan | None = None  # of those at one pose
-
-    def add(self, scan: Scan) -> None:
-        """Add the next scan."""
-        first = self._first
-        if first is None or np.abs(np.subtract(scan.odometry, first.odometry)).max() >= STILL:
-            self._first = scan
-        else:
-            self.moved = self.moved or shows_motion(first, scan)
-
-
 def moves_unseen(log: RobotLog) -> bool:
     """Whether the robot moves while its odometer stands still, as the scans of a log show."""
-    standing = StandstillCheck()
-    for scan in in_turn(log.scans):
-        standing.add(scan)
-    return standing.moved
+    first: Scan | None = None  # of those at one pose
+    for scan in log.scans:
+        if first is None or np.abs(np.subtract(scan.odometry, first.odometry)).max() >= STILL:
+            first = scan
+        elif shows_motion(first, scan):
+            return True
+    return False
 
 
 def shows_motion(first: Scan, last: Scan) -> bool:
@@ -439,3 +404,228 @@ def _seconds(log: RobotLog) -> Array | None:
         return None
     seconds = np.diff(np.array([scan.time for scan in log.scans], dtype=float))
     return seconds if (seconds >= 0).all() and seconds.any() else None
+
+
+# A stretch ends after this many metres or radians, by odometry.
+STRETCH, BEND = 1.0, math.radians(30)
+# Turns are compared over stretches that turn by at least this many radians, if there are at least
+# LEAST_TURNS of them.
+TURN, LEAST_TURNS = math.radians(15), 8
+# Trajectories diverge in a stretch if their ends differ by more than this share of it plus this
+# many metres.
+PARTED, ASIDE = 0.25, 0.2
+# In good logs, recorded and simulated, the trajectories differ by at most 4 % in length, 2 degrees
+# in direction and 6 % in turns, and diverge in at most 3 % of the stretches. Matching can correct
+# that. About twice as much is worth a warning.
+LENGTH, ANGLE, TURNING, PARTING = 0.1, math.radians(10), 0.15, 0.05
+# If the robot was pushed or slipped once, the trajectories diverge in fewer stretches than this.
+LEAST_PARTED = 3
+# Distance of the scans of a pair: at least the first number and less than the second, in metres
+# (GAP) or radians (TURN_OF_PAIR).
+GAP, TURN_OF_PAIR = (0.8, 2.4), (0.35, 1.2)
+# Number of pairs to compare, and about how many points of the second scan of each pair.
+PAIRS, POINTS = 60, 90
+# Points coincide within MEET metres; points beyond NEAR metres are ignored.
+MEET, NEAR = 0.3, 8.0
+# Directions of the laser, in degrees, and fields of view to try. In all good logs, points coincide
+# best within 5 degrees of the true direction and 10 of the true field.
+TURNS, FIELDS = np.arange(-180, 180, 5), np.arange(60, 361, 10)
+# Another direction or field is likely if it differs by this many degrees and reduces the distance
+# of points by these factors.
+LEAST_CHANGE, CLOSER_TURNED, CLOSER_WIDENED = 10, 0.75, 0.85
+
+
+def disagreement(log: RobotLog, track: Track) -> str | None:
+    """Describe how scan matching and odometry differ, likely causes, and options that correct it.
+
+    Returns None if scans and odometry agree. Stretches across a cut of the track, where the motion
+    is unknown, are ignored. If the odometer hardly moved, only lengths are compared.
+    """
+    # 1. Compare the motions along stretches: their lengths, directions, ends and turns.
+    odometry = log.odometry
+    stretches = [
+        (i, j) for i, j in _stretches(odometry) if not any(i < cut <= j for cut in track.cuts)
+    ]
+    measured, seen = (
+        np.array([displacement_between(way[i], way[j]) for i, j in stretches]).reshape(-1, 3)
+        for way in (odometry, track.poses)
+    )
+    told, shown = (way[:, 0] + 1j * way[:, 1] for way in (measured, seen))
+    length = np.abs(told)
+    by_odometry, by_scans = float(length.sum()), float(np.abs(shown).sum())
+    if not stretches:
+        by_odometry = float(np.hypot(*np.diff(odometry[:, :2], axis=0).T).sum())
+        by_scans = float(track.way[-1])
+    angle = cmath.phase(complex((np.conj(told) * shown).sum()))
+    # Turning on the spot has no direction of motion.
+    driven = length >= STRETCH / 2
+    parted = int((np.abs(shown - told) > PARTED * length + ASIDE)[driven].sum())
+    turned = np.abs(measured[:, 2]) >= TURN
+    pairs = zip(measured[turned, 2], seen[turned, 2], strict=True)
+    ratios = [wrapped(float(b)) / a for a, b in pairs]
+    turning = float(np.median(ratios)) if len(ratios) >= LEAST_TURNS else 1.0
+
+    # 2. Judge the differences, and look for another field of view or direction.
+    has_other_turns, is_askew = abs(turning - 1) > TURNING, abs(angle) > ANGLE
+    is_good = max(by_scans, by_odometry) < STRETCH or not (
+        abs(by_scans - by_odometry) > max(LENGTH * by_odometry, STRETCH)
+        or is_askew
+        or has_other_turns
+        or parted >= max(LEAST_PARTED, PARTING * driven.sum())
+    )
+    covers = None if is_good else field_of_view(log)
+    looks = laser_direction(log) if covers is None and not has_other_turns else None
+    if is_good and looks is None:
+        return None
+
+    # 3. Say it.
+    found = [f"{by_scans:.0f} m by scans, {by_odometry:.0f} m by odometry"]
+    if has_other_turns:
+        found.append(f"turns by scans are {turning:.2f} times those by odometry")
+    if is_askew:
+        degrees, side = abs(math.degrees(angle)), "left" if angle > 0 else "right"
+        found.append(
+            f"the direction by scans is {degrees:.0f} degrees to the {side} of that by odometry"
+        )
+    if parted:
+        found.append(f"they diverge in {parted} of {driven.sum()} stretches of a metre")
+    causes = _causes(log.scans[0], turning if has_other_turns else None, covers, looks)
+    return (
+        f"Scan matching and odometry disagree: {'; '.join(found)}. The map may be wrong. Likely "
+        f"causes: {'; '.join(causes)}."
+    )
+
+
+def _causes(
+    scan: Scan, turning: float | None, covers: float | None, looks: float | None
+) -> Iterator[str]:
+    """Yield the likely causes of a difference, each with an option that corrects it.
+
+    `turning` is the ratio of turns by scans to turns by odometry, if they differ clearly. `covers`
+    and `looks` are the field of view and the direction of the laser, in degrees, if they
+    are likely to be others than those of the scan.
+    """
+    fov = _fov(scan)
+    # Turns show the field of view; a negative ratio means that left and right are swapped.
+    if turning is not None and turning < 0:
+        covers = None
+        yield f"the laser hangs upside down (--set fov={-math.copysign(fov, scan.laser.step):.0f})"
+    elif turning is not None and covers is None and fov / turning <= 360:
+        covers = fov / turning
+    if covers is not None:
+        yield f"its beams cover about {covers:.0f} degrees, not {fov:.0f} (--set fov)"
+    if looks is not None:
+        x, y, _ = scan.laser.mount
+        side = "left" if looks >= 0 else "right"
+        yield (
+            f"the laser looks {abs(looks):.0f} degrees to the {side} of straight ahead "
+            f"(--set mount={x:g},{y:g},{looks:.0f})"
+        )
+    if covers is None and looks is None and (turning is None or turning >= 0):
+        yield (
+            'a range that means "nothing came back" is read as a wall (--set no_return, --set '
+            "zero_is)"
+        )
+        yield "the laser sits or looks elsewhere on the robot (--set mount)"
+        yield "its field of view is another (--set fov)"
+    yield "the odometer jumps, slips or is out of scale"
+
+
+def laser_direction(log: RobotLog) -> float | None:
+    """Estimate the direction of the laser, in degrees to the left of straight ahead.
+
+    Returns None if the direction given in the log is correct, if the scans do not show the
+    direction, or if there are several lasers.
+    """
+    angles = {scan.laser.mount[2] for scan in log.scans}
+    apart = _apart(log, np.radians(TURNS)) if len(angles) == 1 else None
+    if apart is None:
+        return None
+    best, now = int(np.argmin(apart)), int(np.argmin(np.abs(TURNS)))
+    if abs(TURNS[best]) < LEAST_CHANGE or apart[best] > CLOSER_TURNED * apart[now]:
+        return None
+    return math.degrees(wrapped(angles.pop() + math.radians(TURNS[best])))
+
+
+def field_of_view(log: RobotLog) -> float | None:
+    """Estimate the field of view of the laser in degrees.
+
+    Returns None if the field of view given in the log is correct, or if the scans do not show it.
+    """
+    fov = _fov(log.scans[0])
+    tried = [_apart(log, np.zeros(1), float(degrees) / fov) for degrees in (fov, *FIELDS)]
+    now, *apart = [float(one[0]) for one in tried if one is not None] or [0.0]
+    if len(apart) < len(FIELDS):
+        return None
+    best = int(np.argmin(apart))
+    is_other = abs(FIELDS[best] - fov) >= LEAST_CHANGE and apart[best] < CLOSER_WIDENED * now
+    return float(FIELDS[best]) if is_other else None
+
+
+def _fov(scan: Scan) -> float:
+    """The field of view of a scan according to the log, in degrees."""
+    return math.degrees(abs(scan.laser.step)) * scan.laser.steps
+
+
+def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
+    """How far the points of two scans lie apart, if the odometry moves one scan to the other.
+
+    The laser is rotated by each of `turns` radians, and angles between beams are stretched. The
+    result is the mean distance in metres for each turn, (turns,); None if there are too few pairs.
+    """
+    apart = []
+    for first, second in _pairs(log):
+        here, there = _points(first, stretch), _points(second, stretch)
+        if first.laser != second.laser or not (len(here) and len(there)):
+            continue
+        x, y, angle = first.laser.mount
+        at, looks = complex(x, y), np.exp(1j * (angle + turns))
+        dx, dy, turn = displacement_between(first.odometry, second.odometry)
+        # Transform from the laser of the second scan to the robot then, to the robot at the first
+        # scan, to the laser then.
+        there = there[:: 1 + len(there) // POINTS, None]
+        seen = (complex(dx, dy) + (at + there * looks) * np.exp(1j * turn) - at) / looks
+        tree = cKDTree(np.stack([here.real, here.imag], axis=-1))
+        points = np.stack([seen.real, seen.imag], axis=-1)
+        nearest, _ = tree.query(points, distance_upper_bound=MEET)
+        apart.append(np.minimum(nearest, MEET).mean(axis=0))
+    return np.mean(apart, axis=0) if len(apart) >= PAIRS / 4 else None
+
+
+def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
+    """Choose at most PAIRS pairs of scans so near to each other that they see the same walls.
+
+    The odometry between near scans is accurate.
+    """
+    kept = moving(log.scans)
+    pairs = []
+    for i, scan in enumerate(kept):
+        for later in kept[i + 1 : i + 10]:
+            dx, dy, turn = displacement_between(scan.odometry, later.odometry)
+            if math.hypot(dx, dy) >= GAP[0] or abs(turn) >= TURN_OF_PAIR[0]:
+                if math.hypot(dx, dy) < GAP[1] and abs(turn) < TURN_OF_PAIR[1]:
+                    pairs.append((scan, later))
+                break
+    some = np.unique(np.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).astype(int))
+    return [pairs[i] for i in some]
+
+
+def _points(scan: Scan, stretch: float) -> NDArray[np.complex128]:
+    """Points that the beams of a scan hit, in the frame of the laser, as complex numbers."""
+    met = (scan.ranges > 0) & (scan.ranges < min(scan.laser.reach, NEAR))
+    middle = scan.laser.bearings.mean()
+    return np.asarray(
+        scan.ranges[met] * np.exp(1j * (middle + stretch * (scan.laser.bearings[met] - middle)))
+    )
+
+
+def _stretches(odometry: Array) -> list[tuple[int, int]]:
+    """Indices of the first and last scan of each stretch of a trajectory, (n, 3) poses."""
+    cuts, way, turned = [0], 0.0, 0.0
+    steps = np.hypot(*np.diff(odometry[:, :2], axis=0).T)
+    for i, (step, turn) in enumerate(zip(steps, np.diff(odometry[:, 2]), strict=True), 1):
+        way, turned = way + step, turned + wrapped(turn)
+        if way >= STRETCH or abs(turned) >= BEND:
+            cuts.append(i)
+            way, turned = 0.0, 0.0
+    return list(pairwise(cuts))
