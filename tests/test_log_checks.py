@@ -260,7 +260,7 @@ def test_headings_in_degrees_are_converted(scans: tuple[Scan, ...]) -> None:
 def test_shuffled_log_is_refused_before_matching(
     scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("perception.places.importing.follow", None)
+    monkeypatch.setattr("perception.places.following.follow", None)
     shuffled = random.Random(1).sample(scans, len(scans))
     with pytest.raises(LogError, match="expected scans in the order of the drive"):
         tracked(RobotLog(tuple(shuffled), source="drive"))
@@ -284,7 +284,7 @@ def test_log_with_unmatched_scans_is_refused(
 def test_refusal_advises_more_beams_if_scans_have_few(
     scans: Scans, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(importing, "HOPELESS", -1.0)
+    monkeypatch.setattr(log_checks, "HOPELESS", -1.0)
     few = every_second_beam(every_second_beam(tuple(scans[:60])))
     assert few[0].laser.beams < log_checks.FEW_BEAMS <= scans[0].laser.beams
     for some, advised in ((few, True), (scans[:60], False)):
@@ -295,7 +295,7 @@ def test_refusal_advises_more_beams_if_scans_have_few(
 
 
 def test_error_does_not_repeat_the_notes(scans: Scans, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importing, "HOPELESS", -1.0)
+    monkeypatch.setattr(log_checks, "HOPELESS", -1.0)
     log, told = RobotLog(tuple(backwards(scans[:120])), source="drive"), list[str]()
     with pytest.raises(LogError) as refused:
         import_log(log, tell=told.append)

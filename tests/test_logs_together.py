@@ -19,8 +19,7 @@ from coarse import every_second_beam
 
 from perception.errors import LogError
 from perception.places.closures import DriveScenes, VisitMatch, agreeing_matches, without_clashes
-from perception.places.importing import Imported, import_log
-from perception.places.joining import join_logs
+from perception.places.importing import Imported, import_log, join_logs
 from perception.places.local_map import CELL, LocalScene, Match, Patch
 from perception.readers.scans import RobotLog
 from perception.readers.writers import write_carmen

@@ -122,18 +122,32 @@ def find_closures(
     def scene(visit: int) -> LocalScene:
         return LocalScene.of(patches[visit], visits[visit].middle)
 
-    gates, found = _Gates(track, visits, apart), list[VisitMatch]()
+    scans = [visit.scan for visit in visits]
+    way, middles = track.way[scans], np.array([visit.middle for visit in visits]).reshape(-1, 2)
+    poses = np.array([without_drift(middles, way, drift) for drift in DRIFTS])
     placed: list[Pose] = []  # the visits by the track. Each closure corrects later visits.
-    for last, visit in enumerate(visits):
-        x, y = visit.middle - visits[last - 1].middle if last else visit.middle
+    found: list[VisitMatch] = []
+    for last, (x, y) in enumerate(np.diff(middles, axis=0, prepend=0.0).tolist()):
         placed.append(moved(placed[-1], (x, y, 0.0)) if last else (x, y, 0.0))
-        # Match with the earlier visits that are nearest.
-        earlier = gates.earlier(last)
+        # 1. The earlier visits are far enough before. The motion across a cut is unknown.
+        cuts = bisect(track.cuts, scans[last])
+        begin = bisect_left(scans, track.cuts[cuts - 1]) if cuts else 0
+        earlier = range(begin, int(np.searchsorted(way, way[last] - apart)))
+        # 2. Take the nearest of them, and match those that the track allows to be near.
         far = [math.dist(placed[k][:2], placed[last][:2]) for k in earlier]
-        near = sorted((np.argsort(far, kind="stable")[:MATCHES] + earlier.start).tolist())
-        asked = gates.allowed(last, near)
+        nearest = sorted((np.argsort(far, kind="stable")[:MATCHES] + begin).tolist())
+        gates = [
+            _Gate(
+                k,
+                seen_from(poses[:, k], poses[:, last]),
+                INFLATED * uncertainty(track, scans[k], scans[last], middles[last]),
+            )
+            for k in nearest
+        ]
+        asked = [gate for gate in gates if gate.is_near]
         here = sorted(_closings(scene, asked, last), key=lambda closing: -closing.match.score)
         found += here[:KEPT]
+        # 3. The best closure corrects the position.
         if here:
             best = here[0].match
             placed[last] = moved(placed[here[0].first], (*best.shift.tolist(), best.turn))
@@ -141,19 +155,19 @@ def find_closures(
 
 
 def _closings(
-    scene: Callable[[int], LocalScene], asked: Sequence[tuple[int, _Gate]], last: int
+    scene: Callable[[int], LocalScene], asked: Sequence[_Gate], last: int
 ) -> Iterator[VisitMatch]:
     """Match a visit with earlier ones, and yield the closures."""
     if not asked:
         return
-    turns = [gate.turns for _, gate in asked]
-    begin, end = min(some.start for some in turns), max(some.stop for some in turns)
+    begin, end = min(gate.turns.start for gate in asked), max(gate.turns.stop for gate in asked)
     # The visit is rotated once, for all the earlier visits.
     turned = Turned.of(scene(last), [k * TURN for k in range(begin, end)])
-    for (first, gate), some in zip(asked, turns, strict=True):
-        found = match(scene(first), turned.part(some.start - begin, some.stop - begin))
+    for gate in asked:
+        part = turned.part(gate.turns.start - begin, gate.turns.stop - begin)
+        found = match(scene(gate.first), part)
         if found is not None and is_reliable(found) and gate.allows(found):
-            yield VisitMatch(first, last, found)
+            yield VisitMatch(gate.first, last, found)
 
 
 def is_reliable(found: Match) -> bool:
@@ -165,10 +179,17 @@ def is_reliable(found: Match) -> bool:
 class _Gate:
     """The relative poses that the track allows for two visits."""
 
+    first: int  # index of the earlier visit
     # (d, 3) x, y and rotation of the later visit in the frame of the earlier one, for each of the d
     # drifts of the heading that are tried.
     poses: Array
     covariance: Array  # (3, 3) covariance of these poses by the track, times INFLATED
+
+    @property
+    def is_near(self) -> bool:
+        """Whether the later visit may be near. Any shift that a match can have is allowed then."""
+        far = float(np.hypot(*self.poses[:, :2].T).min()) - MOST
+        return bool(far <= SIGMAS * math.sqrt(np.linalg.eigvalsh(self.covariance[:2, :2])[1]))
 
     @property
     def turns(self) -> range:
@@ -185,46 +206,6 @@ class _Gate:
         off = errors_of(self.poses, np.array([*found.shift, found.turn]))
         inverse = np.linalg.inv(self.covariance + np.diag(NOISE) ** 2)
         return bool(np.einsum("di,ij,dj->d", off, inverse, off).min() < GATE)
-
-
-class _Gates:
-    """Makes the gates (`_Gate`) of pairs of visits that are at least `apart` metres apart.
-
-    That is how far the robot drove between the two visits.
-    """
-
-    def __init__(self, track: Track, visits: Sequence[Visit], apart: float) -> None:
-        self._track, self._apart = track, apart
-        self._scans = [visit.scan for visit in visits]
-        self._way = track.way[self._scans]
-        self._middles = np.array([visit.middle for visit in visits]).reshape(-1, 2)
-        self._poses = np.array([without_drift(self._middles, self._way, drift) for drift in DRIFTS])
-
-    def earlier(self, last: int) -> range:
-        """The earlier visits far enough before a visit, without a cut of the track between.
-
-        The motion across a cut is unknown.
-        """
-        cuts = bisect(self._track.cuts, self._scans[last])
-        begin = bisect_left(self._scans, self._track.cuts[cuts - 1]) if cuts else 0
-        end = int(np.searchsorted(self._way, self._way[last] - self._apart))
-        return range(begin, max(begin, end))
-
-    def allowed(self, last: int, some: Sequence[int]) -> list[tuple[int, _Gate]]:
-        """List the candidates that may be near a visit, each with its gate (allowed poses)."""
-        if not some:
-            return []
-        # By the axes of each earlier visit, for each drift: (drifts, visits, 3).
-        there = seen_from(self._poses[:, some], self._poses[:, last, None])
-        end = self._middles[last]
-        spreads = [
-            INFLATED * uncertainty(self._track, self._scans[k], self._scans[last], end)
-            for k in some
-        ]
-        # Any shift that a match can have is allowed for the visits that are near.
-        far = np.hypot(there[..., 0], there[..., 1]).min(axis=0) - MOST
-        near = far <= SIGMAS * np.sqrt(np.linalg.eigvalsh(np.array(spreads)[:, :2, :2])[:, 1])
-        return [(some[k], _Gate(there[:, k], spreads[k])) for k in np.flatnonzero(near).tolist()]
 
 
 def seen_from(first: Array, last: Array) -> Array:
@@ -492,12 +473,6 @@ def closures_between(
             yield replace(closing, first=closing.first + counts[a], last=closing.last + counts[b])
 
 
-def piece_of_each(track: Track, visits: Sequence[Visit]) -> list[int]:
-    """Return, for each visit, how many cuts of the track are before it."""
-    scans = [visit.scan for visit in visits]
-    return [int(count) for count in np.searchsorted(track.cuts, scans, "right")]
-
-
 def closures_across_cuts(track: Track, visits: Sequence[Visit], poses: Array) -> list[VisitMatch]:
     """Find the closures between visits before and after cuts of the track of one drive.
 
@@ -506,7 +481,8 @@ def closures_across_cuts(track: Track, visits: Sequence[Visit], poses: Array) ->
     if not track.cuts:
         return []
     some = range(0, len(visits), 1 + len(visits) // MATCHED)
-    parts = gathered(zip(piece_of_each(track, visits)[:: some.step], some, strict=True)).values()
+    cuts_before = np.searchsorted(track.cuts, [visits[k].scan for k in some], "right").tolist()
+    parts = gathered(zip(cuts_before, some, strict=True)).values()
     drives = [[visits[k] for k in part] for part in parts]
     return [
         replace(closing, first=some[closing.first], last=some[closing.last])

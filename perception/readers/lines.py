@@ -22,7 +22,7 @@ from typing import IO, Any, cast
 
 from perception.errors import LogError
 from ssh_abduction.data.errors import named
-from ssh_abduction.data.files import opened
+from ssh_abduction.data.files import opened_file
 
 # Longer lines are skipped: a scan of 10,000 beams is 100 kB.
 LONGEST_LINE = 2**20
@@ -41,7 +41,7 @@ def rereadable(path: str) -> Iterator[IO[bytes]]:
 
     Raises LogError if the file cannot be read.
     """
-    with opened(path, "a readable log", LogError) as file:
+    with opened_file(path, "a readable log", LogError) as file:
         if file.seekable():
             yield file
             return

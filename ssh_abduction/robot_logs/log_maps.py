@@ -23,8 +23,7 @@ import numpy as np
 from perception.errors import LogError
 from perception.images import images_of
 from perception.places.distinctive import WIDTH
-from perception.places.importing import Imported, import_log
-from perception.places.joining import join_logs
+from perception.places.importing import Imported, import_log, join_logs
 from perception.readers.scans import RobotLog
 from perception.recognition import recogniser as new_recogniser
 from perception.store import written
