@@ -13,14 +13,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simulator.driver import LONG, Driver, act, climb, sight
+from simulator.driver import LONG, Driver, Tolerance, act, climb, sight
 from simulator.errors import SimulatorError
 from simulator.robot import BEARINGS, Body, Laser, SimulatedRobot, reported
-from simulator.tours import simulate
+from simulator.tours import covariance_of, simulate
 from simulator.world import World
 from ssh_abduction import Trace
 from ssh_abduction.data import Odometry
-from ssh_abduction.data.odometry import displacement_between, moved
+from ssh_abduction.data.odometry import checked_covariance, displacement_between, moved
 
 RECTANGLE = World.named("notched-rectangle")
 HALL = World.named("taylor-hall")
@@ -440,6 +440,17 @@ def test_covariance_of_a_report_equals_that_of_its_errors() -> None:
     found = np.array(errors)
     np.testing.assert_allclose(found.mean(0), 0, atol=0.15)
     np.testing.assert_allclose(np.cov(found.T), np.eye(3), atol=0.2)
+
+
+def test_rounded_covariances_of_steps_are_positive_definite() -> None:
+    """After turns on the spot, the error across the way is nearly that of the heading."""
+    rng, exact = np.random.default_rng(0), Tolerance(1e-3, 1e-3)
+    for _ in range(20):
+        robot = SimulatedRobot(Body(), (0.0, 0.0, 0.0), rng)
+        for motion in [(0.0, 1.57)] * 4 + [(0.15, 0.0)] * 17:
+            robot.move(*motion)
+        report = robot.report()
+        checked_covariance(covariance_of(report, exact))
 
 
 def test_wheel_errors_scale_distances_and_bend_the_track() -> None:
