@@ -235,7 +235,7 @@ def test_drives_without_common_views_are_pieces(
     with pytest.warns(UserWarning, match=r"trace 2 \(far\) has no view in common with another"):
         solution = solve([MONDAY, far, TUESDAY], Theory.causal())
     assert solution[0].pieces == ((0, 1, 2, 3), (4, 5, 6))
-    assert "2 pieces that share no place: far alone; monday, tuesday" in solution.joined
+    assert "2 pieces that share no place: monday, tuesday; far alone" in solution.joined
     assert caplog.messages == [solution.joined]
     solution.save(tmp_path / "maps.json")
     data = json.loads((tmp_path / "maps.json").read_text())

@@ -229,23 +229,18 @@ def checked_view(value: Any, where: str) -> View:
     """Return a view if it is a text or an integer of 32 bits, perhaps of numpy. Else TraceError."""
     if is_whole(value):
         value = int(value)
-    if isinstance(value, bool) or not isinstance(value, str | int):
-        raise TraceError(
-            f"{where}: expected a text or an integer, got {brief(value)}; name the view"
-        )
-    if isinstance(value, int) and not -(2**31) < value < 2**31:  # clingo's integers
-        raise TraceError(
-            f"{where}: expected an integer of 32 bits, got {brief(value)}; write it as a text"
-        )
-    if isinstance(value, str) and "\0" in value:
-        raise TraceError(
-            f"{where}: expected a text without null characters, got {brief(value)}; rename the view"
-        )
-    if isinstance(value, str) and not is_writable(value):
-        raise TraceError(
-            f"{where}: expected a text that UTF-8 can hold, got half a character in "
-            f"{brief(value)}; rename the view"
-        )
+    is_text = isinstance(value, str)
+    is_number = isinstance(value, int) and not isinstance(value, bool)
+    rename = "rename the view"
+    for is_wrong, expected, mend in (
+        (not (is_text or is_number), "a text or an integer", "name the view"),
+        # clingo's integers
+        (is_number and abs(value) >= 2**31, "an integer of 32 bits", "write it as a text"),
+        (is_text and "\0" in value, "a text without null characters", rename),
+        (is_text and not is_writable(value), "a text that UTF-8 can hold", rename),
+    ):
+        if is_wrong:
+            raise TraceError(f"{where}: expected {expected}, got {brief(value)}; {mend}")
     return plain_text(value) if isinstance(value, str) else value
 
 

@@ -443,11 +443,11 @@ class Corrections:
         """Raise MapError if the robot passed a gateway that is said to be closed."""
         if said.is_open:
             return
-        action, before = trace.steps[t].action, trace.steps[t - 1].action if t else None
-        if near_quarter(way) == 0 and action is not None and action.kind == "travel":
-            raise self._contradicted(said, f"the robot left {name} through it; say it is open")
-        if near_quarter(way) == 2 and before is not None and before.kind == "travel":
-            raise self._contradicted(said, f"the robot came to {name} through it; say it is open")
+        after, before = trace.steps[t].action, trace.steps[t - 1].action if t else None
+        for quarter, action, what in ((0, after, "left"), (2, before, "came to")):
+            if near_quarter(way) == quarter and action is not None and action.kind == "travel":
+                why = f"the robot {what} {name} through it; say it is open"
+                raise self._contradicted(said, why)
 
 
 def number_at(ssh_map: SSHMap, kind: str, label: int) -> int | None:

@@ -43,7 +43,7 @@ from typing import overload
 from ssh_abduction.data.checks import a_list, a_text, all_instances
 from ssh_abduction.data.errors import TraceError, brief, checked_index
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.groups import NodeClasses
+from ssh_abduction.data.groups import NodeClasses, gathered
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.schema import SparseData
@@ -205,15 +205,12 @@ def with_named_faults(ssh_map: SSHMap, drives: Sequence[Drive]) -> SSHMap:
 def joined_drives(drives: Sequence[Drive], ssh_map: SSHMap) -> tuple[tuple[str, ...], ...]:
     """Group the names of drives that a map joins: their steps are in one piece of the map."""
     piece_of = ssh_map.piece_of
-    groups: list[tuple[set[int], list[str]]] = []  # the pieces and the drives of each group
-    for drive in drives:
-        pieces = {piece_of[label] for label in ssh_map.dstate_at[drive.first : drive.stop]}
-        names = [drive.name]
-        for group in [group for group in groups if group[0] & pieces]:
-            groups.remove(group)
-            pieces, names = group[0] | pieces, [*group[1], *names]
-        groups.append((pieces, names))
-    return tuple(tuple(names) for _, names in groups)
+    classes = NodeClasses[tuple[str, int]]()
+    for k, drive in enumerate(drives):
+        for label in ssh_map.dstate_at[drive.first : drive.stop]:
+            classes.merge(("piece", piece_of[label]), ("drive", k))
+    groups = gathered((classes.of(("drive", k)), drive.name) for k, drive in enumerate(drives))
+    return tuple(map(tuple, groups.values()))
 
 
 def pieces_in_words(drives: Sequence[Drive], ssh_map: SSHMap) -> str:

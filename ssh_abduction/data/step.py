@@ -288,13 +288,13 @@ class Step:
             self,
             view=checked_view,
             action=_an_action,
-            extra=lambda extra, name: an_object(name, extra, TraceError),
             image=checked_image,
             confidence=checked_probability,
             star=parse_star,
             displacement=lambda displacement, _: checked_displacement(displacement),
             covariance=lambda covariance, _: checked_covariance(covariance),
         )
+        an_object("extra", self.extra, TraceError)
         object.__setattr__(self, "gateways", None if self.star is None else Star.of(self.star))
         if self.covariance is not None and self.displacement is None:
             raise TraceError(

@@ -129,9 +129,8 @@ class Trace:
             mend = "make one with Odometry.of, or leave it out"
             an_instance("odometry", self.odometry, Odometry, TraceError, mend=mend)
         an_object("extra", self.extra, TraceError)
-        set_checked(
-            self, closures=lambda some, _: checked_closures(some, len(self.steps), self.source)
-        )
+        closures = checked_closures(self.closures, len(self.steps), self.source)
+        object.__setattr__(self, "closures", closures)
         self._check_actions()
 
     def _check_actions(self) -> None:
@@ -384,7 +383,7 @@ class Trace:
         Raises:
             TraceError: If a value is wrong, or there is not one for each step.
         """
-        seen = one_each(views, "views", len(self))
+        seen = one_each(as_list(views, "views"), "views", len(self))
         sure = one_each(confidences, "confidences", len(self))
         steps = []
         for i, (step, v, c) in enumerate(zip(self.steps, seen, sure, strict=True)):

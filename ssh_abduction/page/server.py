@@ -25,7 +25,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from ssh_abduction.data.checks import a_list, one_of
-from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole
+from ssh_abduction.data.errors import AbductionError, MapError, brief
+from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page import answers
 from ssh_abduction.page.content import Called, Run, content_of
@@ -160,15 +161,9 @@ class PageServer(ThreadingHTTPServer):
     def _pair(self, pair: Any) -> tuple[int, int]:
         """Check a pair of steps, and return it in order. Raise MapError if it is malformed."""
         last = len(self._trace) - 1
-        if (
-            not isinstance(pair, list)
-            or len(pair) != 2
-            or not all(is_whole(t) and 0 <= t <= last for t in pair)
-        ):
-            raise MapError(
-                f"expected a pair of steps from 0 to {last}, got {brief(pair)}; "
-                "send two such as [0, 8]"
-            )
+        read = FieldReader("question")
+        read.mend, steps = "send two such as [0, 8]", f"a pair of steps from 0 to {last}"
+        pair = read.several(read.within(0, last, steps), steps, 2)(pair, "pair")
         return min(pair), max(pair)
 
 
