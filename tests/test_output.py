@@ -491,7 +491,7 @@ def test_closed_standard_input_is_an_error(
     assert main(words.split()) == 1
     err = capsys.readouterr().err
     assert err.startswith("ssh-abduction: standard input: expected a ")
-    assert err.endswith(" got a closed stream; check the path\n")
+    assert err.endswith(" got a closed stream; name a file\n")
     assert not [*tmp_path.iterdir()]
 
 

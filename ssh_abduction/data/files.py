@@ -162,7 +162,7 @@ def opened_file(path: str, what: str, error: type[AbductionError]) -> Iterator[B
     """
     try:
         if path == "-" and sys.stdin is None:
-            raise ValueError("got a closed stream")
+            raise error(f"{source_of(path)}: expected {what}, got a closed stream; name a file")
         with nullcontext(sys.stdin.buffer) if path == "-" else Path(path).open("rb") as file:
             yield file
     except AbductionError:

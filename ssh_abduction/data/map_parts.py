@@ -412,11 +412,14 @@ def read_json(path: str | os.PathLike[str]) -> Any:
                 f"{source}: expected maps, got a trace; "
                 f"name the two files in the other order, or solve it first"
             ) from None
-        mend = error.mend or FieldReader.mend
-        if "Extra data" in str(error):
-            mend = "solve prints a line for each of several traces: take one of them"
         where = source if error.line is None else f"{source}:{error.line}"
+        if "Extra data" in str(error):
+            raise MapError(
+                f"{where}: expected one JSON value, got more after it; "
+                "solve prints a line for each of several traces: take one of them"
+            ) from None
         where += f": {error.field}" if error.field else ""
+        mend = error.mend or FieldReader.mend
         raise MapError(f"{where}: expected {error.expected}, got {error}; {mend}") from None
 
 
