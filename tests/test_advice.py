@@ -35,7 +35,6 @@ SAID_BY = {
     "ssh_abduction/data/checks.py": WITH_MAPS,
     "ssh_abduction/cli/batch.py": ("solve",),
     "ssh_abduction/cli/jobs.py": ("solve", "map"),
-    "ssh_abduction/explain/question.py": ("explain",),
     "ssh_abduction/cli/import_log.py": ("import", "map"),
     "ssh_abduction/cli/solve.py": ("solve",),
     "ssh_abduction/cli/mapping.py": ("map",),
@@ -43,7 +42,6 @@ SAID_BY = {
     "ssh_abduction/cli/text.py": ("solve",),
     "ssh_abduction/evaluation/paper_report.py": ("reproduce",),
     "ssh_abduction/evaluation": ("evaluate",),
-    "ssh_abduction/explain/no_map.py": WITH_THEORY,
     "ssh_abduction/solver/entry.py": ("solve",),
     "ssh_abduction/robot_logs/log_maps.py": ("map",),
     "ssh_abduction/robot_logs/log_report.py": ("map",),
@@ -54,9 +52,10 @@ SAID_BY = {
     "ssh_abduction/solver/parts.py": ("solve",),
     "ssh_abduction/theory": WITH_THEORY,
 }
-# The verbs of modules of the command line that have several. Each has some of the options that the
+# The verbs of modules whose verbs have different options. Each has some of the options that the
 # module names without a verb.
 SEVERAL = {
+    "ssh_abduction/explain/no_map.py": WITH_THEORY,
     "ssh_abduction/cli/shared.py": SAID_BY["ssh_abduction/cli/shared.py"],
     "ssh_abduction/cli/about.py": ("theory", "facts", "completion"),
     "ssh_abduction/cli/compare.py": ("compare", "next", "evaluate", "ladder"),

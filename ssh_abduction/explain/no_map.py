@@ -1,4 +1,4 @@
-"""Explain why a trace has no map.
+"""Explain why a trace has no map, and answer questions about a trace within limits.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.explain.no_map import explain
@@ -14,34 +14,46 @@ stretch has a map.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, count, groupby
 from operator import itemgetter
-from typing import Any
+from typing import Any, Generic, TypedDict, TypeVar
 
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import AbductionError, TheoryError, TraceError
 from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_maps
 from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace
 from ssh_abduction.data.words import noun_of
-from ssh_abduction.explain.axioms import Axioms, Piece
-from ssh_abduction.explain.question import LimitedQuestion
-from ssh_abduction.solver import Status, Stop, check_rules
+from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
+from ssh_abduction.solver import (
+    LimitError,
+    Progress,
+    Search,
+    Start,
+    Status,
+    Stop,
+    Watch,
+    check_limit,
+    check_rules,
+)
 from ssh_abduction.theory.settle import displacement_of, settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # Stretches of this many steps are tried first. They overlap by a step, so that each action is in
 # one. A stretch takes about 30 ms. Shorter ones take 13 ms, and 16 steps take 120 ms.
 STRETCH = 8
-
-
 NEW_VIEW = "a view never seen"
 # Share of the remaining time that each search of the whole trace may take.
 SHARE = 0.45
+SHORTEST = 0.05  # the least time limit of a search in seconds
+_Answer = TypeVar("_Answer")
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,6 +305,102 @@ class TraceExplanation:
         """Return the answer as plain data, as `explain --json` prints it."""
         own = attributes_of(self, "possible", "sentences", "clash", "mends", "complete")
         return own | ({"stopped": self.stopped} if self.stopped else {})
+
+
+class QuestionLimits(TypedDict, total=False):
+    """The limits of a question, and known maps of its trace, as in `LimitedQuestion`."""
+
+    time_limit: float | None
+    memory_limit: int | None
+    known: Iterable[SSHMap]
+
+
+class LimitedQuestion(ABC, Generic[_Answer]):
+    """A question about a trace under limits of time and memory.
+
+    `answer` may be called once. `known` may be called from any thread while `answer` runs.
+    Parameters as in `explain_pair`.
+    """
+
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory | None,
+        time_limit: float | None = None,
+        memory_limit: int | None = None,
+        known: Iterable[SSHMap] = (),
+    ) -> None:
+        check_limit("time_limit (--time-limit)", "seconds", time_limit)
+        check_limit("memory_limit (--memory-limit)", "MiB", memory_limit)
+        self.problem = settle(trace, theory)
+        self.trace, self.theory = trace, self.problem.theory
+        self.theory.check_steps(trace)
+        check_rules(self.theory)
+        self.limit, self.memory = time_limit, memory_limit
+        self._known_maps = [*checked_maps(known)]
+        check_of_trace(self._known_maps, trace, "known", views=False)
+        self.stopped: Stop | None = None
+        self._watch = Watch(time_limit, memory_limit)
+        self._search: Search | None = None
+
+    def answer(self) -> _Answer:
+        """Find the answer. At a limit or Ctrl-C, return what is known by then."""
+        self._watch.start()
+        with suppress(Interrupted, KeyboardInterrupt, LimitError):
+            try:
+                self._find_out()
+            except KeyboardInterrupt:
+                self.stopped = "interrupted"
+                raise
+        return self.known()
+
+    @abstractmethod
+    def known(self, why: Stop | None = None) -> _Answer:
+        """Return what is known so far. `why` is the limit that is about to end the search."""
+
+    @abstractmethod
+    def _find_out(self) -> None:
+        """Find the answer and store it in attributes. At a limit, raise an exception."""
+
+    def interrupt(self) -> None:
+        """Make `answer` return soon. Call this from another thread or a signal handler."""
+        self._watch.interrupted = True
+        if self._search is not None:
+            self._search.interrupt()
+
+    def _over(self) -> bool:
+        """Tell whether a limit has been reached, and store it in `stopped`."""
+        try:
+            self._watch.check()
+        except LimitError as limit:
+            self.stopped = limit.reason
+        return self.stopped is not None
+
+    def _solved(self, trace: Trace, theory: Theory, maps: int | None, seconds: float) -> Search:
+        """Make a search for maps that ends at the limits of this question."""
+
+        def end_with_this(_: Progress) -> None:
+            if self._over():
+                search.interrupt()
+
+        limit = None if seconds == float("inf") else max(seconds, SHORTEST)
+        search = self._search = Search(
+            trace,
+            theory,
+            time_limit=limit,
+            memory_limit=self.memory,
+            max_maps=maps,
+            on_progress=end_with_this,
+            _start=Start(known=tuple(self._known_maps)),
+        )
+        return search
+
+    def _ended(self, search: Search) -> None:
+        """Store in `stopped` why a search ended early, if a limit of this question was reached."""
+        self._search = None
+        if search.stopped in ("interrupted", "memory limit"):
+            self.stopped = search.stopped
+        self._over()
 
 
 class TraceQuestion(LimitedQuestion[TraceExplanation]):

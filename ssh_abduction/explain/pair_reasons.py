@@ -30,8 +30,15 @@ from ssh_abduction.data.odometry import match_in_words
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.argument import Argument
 from ssh_abduction.explain.axioms import Axioms, Piece
-from ssh_abduction.explain.no_map import Explanation, check_two_steps, explain
-from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits, changes_in_words
+from ssh_abduction.explain.no_map import (
+    SHARE,
+    Explanation,
+    LimitedQuestion,
+    QuestionLimits,
+    check_two_steps,
+    explain,
+)
+from ssh_abduction.explain.place_reasons import changes_in_words
 from ssh_abduction.explain.verdict import Derivation, PairExplanation, Side, Verdict
 from ssh_abduction.solver import EQUAL, Cost, Judging, Status, Stop, facts
 from ssh_abduction.theory.settle import displacement_of
@@ -47,9 +54,6 @@ UNCUT = 24
 # If a few steps decide the verdict, a search only confirms that the trace has a map. It may take
 # this many seconds, or a tenth of the time limit if that is more.
 CONFIRMING = 5.0
-# Share of the remaining time that the search for minimal maps may take, and then the search for the
-# best map of the other side.
-SHARE = 0.45
 # Estimating maps of the other side, which are like the best known map, may take this many seconds.
 ESTIMATING = 0.5
 

@@ -12,7 +12,7 @@ then the place of this step in the other map. Likewise for a path, by the first 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeAlias, Unpack
 
@@ -24,7 +24,7 @@ from ssh_abduction.data.map_parts import course_named, list_in_words, regions_at
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import PlainData
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain.question import LimitedQuestion, QuestionLimits, changes_in_words
+from ssh_abduction.explain.no_map import LimitedQuestion, QuestionLimits
 from ssh_abduction.solver import Judging, Stop, with_regions
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -255,3 +255,9 @@ def _sentence(place: int, path: int, side: _Side, branch: RightBranch | None) ->
     leaves = "" if ahead == onto[1] else f", so {ahead} leaves {name} on the {side} there"
     where = f"place {place} lies {side} of {name}"
     return f"{where}: {reason}{leaves}, and place {place} is ahead on {ahead}"
+
+
+def changes_in_words(ssh_map: SSHMap, places: Collection[int | None]) -> tuple[str, ...]:
+    """Say which gateways at these places changed between drives, and what each change costs."""
+    changes = (f for f in ssh_map.faults if f.kind == "changed" and f.place in places)
+    return tuple(f"{change}; this change costs {change.cost:g} dstates" for change in changes)
