@@ -155,11 +155,17 @@ def test_dstates_at_one_place_are_merged_only_if_that_lowers_the_cost() -> None:
     assert min(saved) >= 0 < max(saved)
 
 
-def test_smoothing_needs_displacements_that_connect_all_steps() -> None:
-    trace, _ = rounds(6, 4, 0)
-    cut = replace(trace.without_displacements_at([40]), closures=())
+@pytest.mark.parametrize("seed", range(3))
+def test_each_part_of_a_trace_is_smoothed(seed: int) -> None:
+    """No displacement or closure leads to the last five steps, but a known link does."""
+    trace, places = rounds(6, 4, seed)
+    first = len(trace) - 5
+    closures = tuple(c for c in trace.closures if c.last < first)
+    cut = replace(trace.without_displacements_at([first]), closures=closures)
     problem = settle(cut, BARE)
-    assert smoothed_map(problem, Log(cut, problem.theory, problem.pairs)) is None
+    ssh_map = smoothed_map(problem, Log(cut, problem.theory, problem.pairs))
+    assert ssh_map is not None
+    assert is_true(ssh_map, places)
 
 
 def test_search_takes_the_smoothed_map() -> None:

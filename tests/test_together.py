@@ -137,7 +137,7 @@ OTHER = Trace.from_steps("ab", [{"name": "travel", "kind": "turn", "turn": "left
     [
         ([], None, "traces: expected at least one trace, got none"),
         ([MONDAY, "tuesday"], None, r"traces\[1\]: expected a Trace, got 'tuesday'"),
-        ([MONDAY, MONDAY[:2]], None, "a different name for each drive, got 'monday' twice"),
+        ([MONDAY, TUESDAY], ["one", "one"], "a different name for each drive, got 'one' twice"),
         ([MONDAY, TUESDAY], ["one"], "names: expected 2, one per drive, got 1"),
         ([MONDAY, TUESDAY], ["one", 2], r"names\[1\]: expected a text, got 2"),
         ([MONDAY, WITH_STARS], None, "star: expected the same .* no stars in trace 1 and four"),
@@ -187,6 +187,9 @@ def test_together_warns_of_equal_traces() -> None:
     with pytest.warns(UserWarning, match=r"the same steps \(monday, monday\); give"):
         joint = together([MONDAY, TUESDAY, MONDAY])
     assert [drive.name for drive in drives_of(joint)] == ["monday", "tuesday", "monday-2"]
+    other = MONDAY.with_views("dcba")
+    joint = together([MONDAY, other, other[:2]])
+    assert [drive.name for drive in drives_of(joint)] == ["monday", "monday-2", "monday-3"]
 
 
 def test_together_warns_of_other_action_names_and_units() -> None:

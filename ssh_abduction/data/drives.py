@@ -35,7 +35,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import accumulate, pairwise
+from itertools import accumulate, chain, count, pairwise
 from pathlib import Path
 from statistics import median
 from typing import overload
@@ -230,15 +230,15 @@ def together(traces: Iterable[Trace], names: Iterable[str] | None = None) -> Tra
     Args:
         traces: The traces. The drives of a joint trace stay drives.
         names: The names of the drives. By default these are the names of the traces, or of their
-            files, or "drive 1", "drive 2" and so on.
+            files, or "drive 1", "drive 2" and so on. A name that comes again gets a number.
 
     Returns:
         The joint trace. Nothing is known of how its drives relate to each other.
 
     Raises:
-        TraceError: There is no trace; two drives have one name; or the traces differ in what they
-            record, such as stars, displacements, the systematic errors of the odometry, or the
-            kind of an action.
+        TraceError: There is no trace; two of the `names` are equal; or the traces differ in what
+            they record, such as stars, displacements, the systematic errors of the odometry, or
+            the kind of an action.
     """
     parts = all_instances(
         "traces", traces, Trace, TraceError, mend="make one with Trace.load or Trace.from_steps"
@@ -297,26 +297,22 @@ def _names(traces: Sequence[Trace], names: Iterable[str] | None) -> list[str]:
     """Return the names of all drives, or raise TraceError if two are the same."""
     if names is None:
         found: list[str] = []
-        copies: Counter[tuple[Step, ...]] = Counter()
         for trace in traces:
-            for name, steps in _recorded(trace):
-                copies[steps] += 1
-                # If a drive is given twice, number its name.
-                again = name in found and copies[steps] > 1
-                own = f"{name}-{copies[steps]}" if again else name
-                found.append(own if _name(trace) else "")
-        found = [name or f"drive {i + 1}" for i, name in enumerate(found)]
+            for name, _ in _recorded(trace):
+                own = name if _name(trace) else f"drive {len(found) + 1}"
+                again = (f"{own}-{number}" for number in count(2))
+                found.append(next(one for one in chain([own], again) if one not in found))
     else:
         found = [
             a_text(f"names[{i}]", name, TraceError, mend="name the drive")
             for i, name in enumerate(a_list("names", names, TraceError))
         ]
-        count = sum(len(drives_of(trace)) for trace in traces)
-        if len(found) != count:
+        drives = sum(len(drives_of(trace)) for trace in traces)
+        if len(found) != drives:
             raise TraceError(
-                f"names: expected {count}, one per drive, got {len(found)}; name each drive"
+                f"names: expected {drives}, one per drive, got {len(found)}; name each drive"
             )
-    twice = next((name for name, count in Counter(found).items() if count > 1 or not name), None)
+    twice = next((name for name, times in Counter(found).items() if times > 1 or not name), None)
     if twice is not None:
         raise TraceError(
             f"names: expected a different name for each drive, got {brief(twice)} twice; "

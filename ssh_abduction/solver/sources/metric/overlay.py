@@ -8,7 +8,7 @@ one action leads to from merged dstates are merged, too. If gateways may change 
 places with different gateways may be merged, at a price for each change. Dstates and places of one
 piece of a map that must be kept are never merged.
 
-*Smoothing* guesses a map of all steps that displacements and closures connect. A beam goes through
+*Smoothing* guesses a map of each part that displacements and closures connect. A beam goes through
 the trace once, so it does not know the closures of later steps. After a long way it may join places
 that only the drift brings together. Smoothing first fits the poses of all visits to the
 displacements and closures, as if no two visits were to one place, and then merges them. It may also
@@ -415,11 +415,23 @@ def smoothed(problem: Problem, log: Log, sights: Sights, begin: SSHMap | None) -
 def smoothed_map(problem: Problem, log: Log, begin: SSHMap | None = None) -> SSHMap | None:
     """Make a map of a trace by smoothing, see `smoothed`.
 
-    None if it breaks an axiom, or if displacements and closures do not connect all visits.
+    Two parts that no displacement or closure connects are joined only where a known link leads from
+    one to the other. None if the map breaks an axiom.
     """
     bare = problem.theory.replace(displacement="none", weigh="count")
-    found = smoothed(problem, log, Sights(problem.trace, bare, misreads=False), begin)
-    return found[0].ssh_map(problem.trace, bare) if len(found) == 1 else None
+    sights = Sights(problem.trace, bare, misreads=False)
+    whole, *parts = smoothed(problem, log, sights, begin)
+    for part in parts:
+        led = (
+            (whole.links.get((whole.labels[t - 1], log.actions[t - 1])), label)
+            for t, label in part.labels.items()
+            if t - 1 in whole.labels
+        )
+        pair = next(((known, label) for known, label in led if known is not None), None)
+        overlay = Overlay(whole, part, problem, sights)
+        joined = pair is not None and overlay.merge(*pair)
+        whole = overlay.part() if joined else whole.beside(part)
+    return whole.ssh_map(problem.trace, bare)
 
 
 class KeptApart:
