@@ -162,6 +162,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*args, **kwargs)
         self.settings: dict[str, argparse.Action] = {}  # of this verb, by name
         self.formatter_class = _Paragraphs
+        self._listed = argparse._ArgumentGroup(self, "settings, each given as --set NAME=VALUE")
 
     def add_rows(self, rows: Rows) -> None:
         """Add an argument, an option, a setting or a group for each row.
@@ -200,7 +201,7 @@ class Parser(argparse.ArgumentParser):
             self.add_argument(
                 "--set", help=shown, action=_Set, dest=argparse.SUPPRESS, metavar="NAME=VALUE"
             )
-            self._listed = self.add_argument_group("settings, each given as --set NAME=VALUE")
+            self._action_groups.append(self._listed)
         many, choices = details.pop("nargs", None), details.get("choices")
         value = f"{{{','.join(choices)}}}" if choices else details["metavar"]
         kind = argparse._AppendAction if many else argparse._StoreAction
