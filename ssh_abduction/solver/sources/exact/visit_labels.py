@@ -46,7 +46,6 @@ from clingo import Function, Symbol
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import number_symbols, sides
-from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.fitting import Member
 from ssh_abduction.solver.steps.apart import clique
@@ -156,8 +155,13 @@ class VisitLabels:
         self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False
     ) -> None:
         """Give clingo (if `anew`, a new control) all that it lacks about these visits."""
+        # Check that time is left to ground the pairs of visits that clingo lacks. If all visits are
+        # given, the number of pairs is known before they are listed.
         known = 0 if anew else len(self.program.fits)
-        fits = fits_in_time(self._asker.watch, chart, visits, known)
+        is_all = len(visits) == len(chart.stars)
+        self._asker.watch.check(SECONDS_A_PAIR * (int(chart.fitting[-1]) - known) if is_all else 0)
+        fits = frozenset(chart.fits(sorted(visits)))
+        self._asker.watch.check(SECONDS_A_PAIR * (len(fits) - known))
         size, self.size = self.size, 0  # an error may leave this prefix incomplete
         if anew:
             self._program = VisitProgram(self.task, self._asker, chart)
@@ -534,22 +538,6 @@ class VisitProgram:
             else:
                 control.ground([(part, number_symbols(*arguments))])
         return True
-
-
-def fits_in_time(watch: Watch, chart: FramedChart, visits: set[int], known: int) -> frozenset[Pair]:
-    """Return the pairs of some visits that may be at one place, as `FramedChart.fits` does.
-
-    `known` pairs have been grounded already, and their time is not counted. Raises LimitError if
-    grounding the others would take longer than the time that is left.
-    """
-    numbers = sorted(visits)
-    if len(numbers) == len(chart.stars):  # the number of pairs is known before they are listed
-        watch.check(SECONDS_A_PAIR * (int(chart.fitting[-1]) - known))
-    else:
-        watch.check()
-    fits = frozenset(chart.fits(numbers))
-    watch.check(SECONDS_A_PAIR * (len(fits) - known))
-    return fits
 
 
 def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> list[Three]:
