@@ -581,7 +581,7 @@ def test_assertions_enlarge_the_pinned_clique() -> None:
 
     def noted(self: LabelsFirst, size: int) -> None:
         grow(self, size)
-        cliques.append(len(self._labels.clique))
+        cliques.append(len(self._labels.program.clique))
 
     theory = Theory.causal().replace(different=[(0, 2), (0, 4), (2, 4)])
     with patch.object(LabelsFirst, "grow", noted):
