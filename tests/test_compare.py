@@ -535,7 +535,7 @@ def edited(path: Path, change: Callable[[dict[str, object]], object]) -> Path:
         ),
         (
             lambda d: d["backbone"]["places"].update(sometimes=[[0, 99]]),
-            "backbone: places.sometimes[0]: expected a step from 0 to 22",
+            "backbone: places.sometimes[0][1]: expected a step from 0 to 22",
         ),
         (
             lambda d: (d.update(complete=False), d["backbone"]["places"].update(sometimes=[])),
