@@ -50,11 +50,9 @@ from ssh_abduction.data.words import counted, meant
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import (
-    Limits,
     Solution,
     Status,
     obeyed,
-    solve,
     with_correction_warnings,
     with_names,
 )
@@ -137,18 +135,9 @@ class Obeying:
         """Return a solution whose maps have the names that a person gave."""
         return with_names(self.corrections, solution, self.trace)
 
-    def finished(self, solution: Solution, limits: Limits) -> Solution:
-        """Add names, and warn of drives that share no place because of a corrected gateway."""
-        counts = limits.work_limit is not None
-        limit = limits.work_limit if counts else limits.time_limit
-        spent = solution.effort.work if counts else solution.seconds.total
-        left = math.inf if limit is None else limit - (spent or 0.0)
-
-        def find(trace: Trace, theory: Theory, most: float) -> Solution:
-            within: dict[str, Any] = limits.of_part(most)
-            return solve(trace, theory, max_maps=1, **within)
-
-        return with_correction_warnings(self.corrections, self.with_names(solution), left, find)
+    def finished(self, solution: Solution) -> Solution:
+        """Add names, and warn of drives that contradict a corrected gateway."""
+        return with_correction_warnings(self.corrections, self.with_names(solution))
 
     def blamed(self, solution: Solution, explanation: Explanation | None) -> list[str]:
         """List the corrections that may be the reason why the trace has no map.

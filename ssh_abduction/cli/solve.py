@@ -191,7 +191,7 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
             )
             until_printed.enter_context(guard)
             explanation = printed.searched(guard.say)
-        solution = obeying.finished(search.solution(tuple(printed.kept)), search.limits)
+        solution = obeying.finished(search.solution(tuple(printed.kept)))
 
         def save() -> None:
             options.json = False  # the JSON is complete: a later error must not follow it

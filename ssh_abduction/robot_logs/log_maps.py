@@ -351,13 +351,7 @@ def map_log(
         solution = mapping.solve(trace, chosen, work_limit=allowed, **limits)
     mapping.latest = lambda: outcome(solution)
     if corrections is not None:
-
-        def best(trace: Trace, theory: Theory, seconds: float) -> Solution:
-            return mapping.solve(trace, theory, time_limit=None, work_limit=seconds, max_maps=1)
-
-        solution = with_correction_warnings(
-            corrections, solution, allowed - (solution.effort.work or 0.0), best
-        )
+        solution = with_correction_warnings(corrections, solution)
     seconds["maps"] = round(time.process_time() - begin, 3)
 
     # 4. Ladder: what each kind of evidence is worth.

@@ -1,15 +1,13 @@
 """The board of a search: what is known about the maps of a trace, and the judge of its maps.
 
 Only here does a map become an answer. A map is reduced to what the theory speaks of, and judged by
-the checker, which shares no code with the encodings. Checking every step of a long trace, or every
-map of a long list, would take longer than finding the maps. So checks get only a share of the
-search time. The first maps are always checked, at least for the steps that clingo was given. Later
-maps are checked if the share is not used up.
+the checker, which shares no code with the encodings. Checking every map of a long list would take
+longer than finding the maps. So checks get only a share of the search time. The first maps are
+always checked. Later maps are checked if the share is not used up.
 """
 
 from __future__ import annotations
 
-import random
 from dataclasses import replace
 from functools import cached_property
 
@@ -28,8 +26,7 @@ from ssh_abduction.theory.theory import Theory
 # Optional checks take at most SHARE of the search time plus BEYOND seconds.
 SHARE = 0.1
 BEYOND = 0.01
-ALWAYS = 3  # this many maps are always checked, for the steps that clingo was given
-SAMPLE = 1000  # if there is no time for all later steps, check this many of them at random
+ALWAYS = 3  # this many maps are always checked
 A_STEP = 5e-6  # seconds that the checker takes for a step, until the first check measures it
 # Without these axioms a dstate may have several places, courses or headings, but a map shows only
 # one. So the checker cannot judge it.
@@ -170,22 +167,15 @@ class Judging:
         self._accepted = ssh_map if accepted else self._accepted
         return accepted
 
-    def pass_map(self, ssh_map: SSHMap, prefix: int, elapsed: float) -> None:
+    def pass_map(self, ssh_map: SSHMap, elapsed: float) -> None:
         """Check a map of the whole trace before it is given, as far as there is time.
 
-        Clingo was given the first `prefix` steps, and the search took `elapsed` seconds so far.
-        Raises InternalError if the map breaks an axiom.
+        The search took `elapsed` seconds so far. Raises InternalError if the map breaks an axiom.
         """
         if not self._shown or ssh_map == self._accepted:
             return
-        steps = len(self._trace)
-        shows_all = prefix < steps and len(set(ssh_map.dstate_at[:prefix])) == len(ssh_map.dstates)
-        if self.has_time_for(steps, elapsed) or (self._judged < ALWAYS and not shows_all):
-            self._check(ssh_map, steps)
-        elif self._judged < ALWAYS:
-            first = replace(ssh_map, dstate_at=ssh_map.dstate_at[:prefix], starts=(), faults=())
-            self._check(first, prefix)
-            self._look_at_sample(ssh_map, prefix)
+        if self._judged < ALWAYS or self.has_time_for(len(self._trace), elapsed):
+            self.pass_grown_map(self._trace, ssh_map)
         self._judged += 1
 
     def has_time_for(self, steps: int, elapsed: float) -> bool:
@@ -193,47 +183,24 @@ class Judging:
         return self._shown and self._a_step * steps <= BEYOND + SHARE * elapsed - self._seconds
 
     def pass_grown_map(self, trace: Trace, ssh_map: SSHMap) -> None:
-        """Check a map of a longer trace. Later checks use this trace. Raises InternalError."""
-        self._trace = trace
-        self._check(ssh_map, len(trace))
+        """Check a map of a longer trace, and measure the time. Later checks use this trace.
 
-    def _check(self, ssh_map: SSHMap, steps: int) -> None:
-        """Check a map of the first `steps` steps, and measure the time. Raises InternalError."""
+        Raises InternalError if the map breaks an axiom.
+        """
+        self._trace = trace
         began = now()
-        violations = check(self._trace.prefix(steps), ssh_map, self._theory.of_steps(0, steps))
+        broken = check(trace, ssh_map, self._theory.of_steps(0, len(trace)))
         spent = now() - began
         self._seconds += spent
-        self._a_step = spent / steps
-        if violations:
-            self._fail(violations[0])
-
-    def _look_at_sample(self, ssh_map: SSHMap, prefix: int) -> None:
-        """Check links and views at random steps after the first ones. Raises InternalError."""
-        links = set(ssh_map.links)
-        beyond = range(prefix, len(self._trace))
-        for t in random.Random(0).sample(beyond, min(SAMPLE, len(beyond))):
-            here, there = ssh_map.dstate_at[t - 1], ssh_map.dstate_at[t]
-            action = self._trace.steps[t - 1].action
-            if (
-                action is None
-                or (not action.starts and (here, action.name, there) not in links)
-                or self._trace.steps[t].view not in (None, ssh_map.dstates[there].view)
-            ):
-                self._fail(
-                    Violation(
-                        "map_explains_trace", (t - 1, t), f"Step {t} is not where the map says."
-                    )
-                )
-
-    def _fail(self, violation: Violation) -> None:
-        """Raise InternalError for a violation of an axiom."""
-        where = f" at step {violation.steps[-1]}" if violation.steps else ""
-        raise InternalError(
-            f"internal error: a map that was found breaks {violation.axiom}{where} (trace "
-            f"{self._trace.digest}): {violation.message} "
-            "This is a defect of ssh-abduction, not of the trace; please report it with the "
-            "trace, and try solve --set without_speedups=prefixes,names,ways"
-        )
+        self._a_step = spent / len(trace)
+        for violation in broken:
+            where = f" at step {violation.steps[-1]}" if violation.steps else ""
+            raise InternalError(
+                f"internal error: a map that was found breaks {violation.axiom}{where} (trace "
+                f"{trace.digest}): {violation.message} "
+                "This is a defect of ssh-abduction, not of the trace; please report it with the "
+                "trace, and try solve --set without_speedups=prefixes,names,ways"
+            )
 
 
 def projected(ssh_map: SSHMap, theory: Theory) -> SSHMap:

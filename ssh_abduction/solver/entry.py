@@ -9,17 +9,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from statistics import median
-from typing import Any
 
 from ssh_abduction.data.checks import an_instance
 from ssh_abduction.data.corrections import (
     Corrections,
-    Passage,
     checked_corrections,
     direction_in_words,
     number_at,
@@ -32,13 +28,13 @@ from ssh_abduction.data.drives import (
     step_name,
     step_of,
     together,
-    travels_of,
 )
 from ssh_abduction.data.errors import SolverError, TheoryError, brief, is_whole, named
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.star import with_gateway
 from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.data.words import noun_of
 from ssh_abduction.runtime.clock import counting, each_heeding, heeding
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
@@ -51,7 +47,8 @@ from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine, may_name
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import prove_backbone
-from ssh_abduction.solver.values import Found, Progress, Status
+from ssh_abduction.solver.values import Found, Progress
+from ssh_abduction.theory.evidence.of_steps import are_alike
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import ALL, Speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -59,8 +56,6 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 _log = log_of(__name__)
 # If the time limit is over, a search gets this many seconds to find any map.
 LEAST_SECONDS = 1e-9
-# A search for a map without corrections of gateways may take this many seconds.
-SHORTEST, DOUBTING = 0.05, 10.0
 # If the theory allows no faults, allow both kinds. Their costs do not matter for a front.
 KINDS = {"misread": 1.5, "slipped": 1.5}
 
@@ -122,7 +117,7 @@ def solve(
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
     """
     joint = together(trace) if isinstance(trace, list | tuple | Iterator) else checked_trace(trace)
-    limits = Limits(time_limit, memory_limit, work_limit=work_limit)
+    Limits(time_limit, memory_limit, work_limit=work_limit)  # checks them
     watch = Watch(time_limit, memory_limit, work=work_limit)
     watch.start()
 
@@ -158,22 +153,14 @@ def solve(
             names = Corrections.of_names(standing, solution.drives)
     if names is not None:
         solution = with_names(names, solution, joint)
-    return _with_warnings(solution, corrections, watch, limits)
+    return _with_warnings(solution, corrections)
 
 
-def _with_warnings(
-    solution: Solution, corrections: Corrections | None, watch: Watch, limits: Limits
-) -> Solution:
-    """Add warnings about drives that share no place, and log them."""
-
-    def find(trace: Trace, theory: Theory, left: float) -> Solution:
-        within: dict[str, Any] = limits.of_part(left)
-        search = Search(trace, theory, max_maps=1, **within)
-        return search.solution(tuple(search))
-
+def _with_warnings(solution: Solution, corrections: Corrections | None) -> Solution:
+    """Add warnings about corrections, and log them, and which drives share no place."""
     said = len(solution.support.warnings)
     if corrections is not None:
-        solution = with_correction_warnings(corrections, solution, watch.left(), find)
+        solution = with_correction_warnings(corrections, solution)
     if solution.maps and len(joined_drives(solution.drives, solution.maps[0])) > 1:
         _log.warning("%s", solution.joined)
     for warning in solution.support.warnings[said:]:
@@ -429,12 +416,7 @@ def with_names(corrections: Corrections, solution: Solution, trace: Trace) -> So
     return replace(solution, maps=maps)
 
 
-def with_correction_warnings(
-    corrections: Corrections,
-    solution: Solution,
-    left: float,
-    find: Callable[[Trace, Theory, float], Solution],
-) -> Solution:
+def with_correction_warnings(corrections: Corrections, solution: Solution) -> Solution:
     """Add warnings about drives that contradict a corrected gateway, and about unused names.
 
     A correction changes only the stars of the steps that it names. If another drive saw the gateway
@@ -443,26 +425,22 @@ def with_correction_warnings(
     Args:
         corrections: The corrections that the solution obeys.
         solution: The solution, with its trace.
-        left: The seconds, or units of work, that are left; infinity without a limit.
-        find: Finds a map of a trace and a theory in that much time. It is called once, without
-            corrections of gateways, if the correction may keep a drive from the place.
     """
-    said = [*_unused_names(corrections, solution)]
-    if corrections.gateways and solution.stopped != "interrupted":
-        most = max(min(left, DOUBTING), SHORTEST)
-        said += _contradictions(
-            corrections, solution, lambda trace, theory: find(trace, theory, most)
-        )
+    if not solution.maps or solution.trace is None:
+        return solution
+    drives = drives_of(solution.trace)
+    known = corrections.known_in(drives)
+    named_maps = corrections.named(solution.maps[0], drives)
+    said = (
+        *_unused_names(known, named_maps, drives),
+        *_contradictions(known, solution.trace, drives),
+    )
     return replace(solution, support=solution.support.warning_of(*said))
 
 
-def _unused_names(corrections: Corrections, solution: Solution) -> Iterator[str]:
-    """Yield a warning for each name that the first map does not have."""
-    if not solution.maps or solution.trace is None:
-        return
-    drives = drives_of(solution.trace)
-    ssh_map = corrections.named(solution.maps[0], drives)
-    for naming in corrections.known_in(drives).names:
+def _unused_names(said: Corrections, ssh_map: SSHMap, drives: Sequence[Drive]) -> Iterator[str]:
+    """Yield a warning for each name that a map does not have."""
+    for naming in said.names:
         label = ssh_map.dstate_at[step_of(drives, naming.step)]
         used = ssh_map.name_of(naming.kind, number_at(ssh_map, naming.kind, label))
         if used != naming.name:
@@ -472,118 +450,37 @@ def _unused_names(corrections: Corrections, solution: Solution) -> Iterator[str]
                 else f"this {naming.kind} is also {brief(used)}; rename or remove one of them"
             )
             yield (
-                f"{named(corrections.source or 'corrections')}: {naming}: it is not shown: in the "
+                f"{named(said.source or 'corrections')}: {naming}: it is not shown: in the "
                 f"first map, {why}"
             )
 
 
-def _contradictions(
-    corrections: Corrections, solution: Solution, find: Callable[[Trace, Theory], Solution]
-) -> Iterator[str]:
-    """Yield the warnings that `with_correction_warnings` adds."""
-    trace = solution.trace
-    if trace is None or not solution.maps:
-        return
-    drives, ssh_map = drives_of(trace), solution.maps[0]
-    said, found = corrections.known_in(drives), solution
-    unit = 90 if solution.theory.star == "frame" else 1
-    doubted = [(p, d) for p in said.gateways for d in drives]
-    # With stars, solve again without the corrections of gateways, to see what they prevent.
-    if solution.theory.star != "none":
-        seen = replace(trace, steps=tuple(step.as_seen() for step in trace.steps))
-        doubted = [(p, d) for p, d in doubted if _may_keep_out(p, d, seen, ssh_map)]
-        if not doubted:
-            return
-        found = find(*obeyed(replace(said, gateways=()), seen, solution.theory))
-    for passage, drive in doubted:
-        apart = drive in _apart(passage, drives, ssh_map)
-        sentence, without = f"{named(said.source or 'corrections')}: {passage}: ", ""
-        steps = _seen_otherwise(passage, drive, trace, found, unit)
-        if steps:
-            step, way = next(iter(steps.items()))
-            option = "--open" if passage.is_open else "--closed"
-            if found is not solution:
-                shared = "places" if apart else "this place"
-                without = f": without it, {drive.name} would share {shared} with the other drives"
-            agree = f"(correct {option} '{step} {direction_in_words(way)}')"
-            yield (
-                f"{sentence}it contradicts what {drive.name} saw at "
-                f"{'step' if len(steps) == 1 else 'steps'} {', '.join(steps)}{without}; say the "
-                f"same of {step} {agree}, or remove it"
-            )
-        # In doubt, an unproven map without the correction leaves the drive apart, too.
-        elif (
-            apart
-            and found is not solution
-            and found.status is not Status.OPTIMAL
-            and (not found.maps or drive in _apart(passage, found.drives, found.maps[0]))
-        ):
-            yield (
-                f"{sentence}{drive.name} shares no place with the drives that it is about; if "
-                f"{drive.name} saw this gateway otherwise, say the same of its steps (correct)"
-            )
+def _contradictions(said: Corrections, trace: Trace, drives: Sequence[Drive]) -> Iterator[str]:
+    """Yield a warning for each other drive that saw what a corrected step saw before."""
+    for passage in said.gateways:
+        about = {step.rpartition(":")[0] for step, _ in passage.seen}
+        before = [(trace.steps[step_of(drives, step)].as_seen(), way) for step, way in passage.seen]
+        for drive in drives:
+            ways = {
+                step_name(drives, t): way
+                for t in range(drive.first, drive.stop if drive.name not in about else 0)
+                for seen, way in before
+                if _looks_like(trace.steps[t], seen)
+                and seen.star
+                and with_gateway(seen.star, way, is_open=passage.is_open) != seen.star
+            }
+            if ways:
+                step, way = next(iter(ways.items()))
+                option = "--open" if passage.is_open else "--closed"
+                yield (
+                    f"{named(said.source or 'corrections')}: {passage}: it contradicts what "
+                    f"{drive.name} saw at {noun_of('step', ways)} {', '.join(ways)}; say the same "
+                    f"of {step} (correct {option} '{step} {direction_in_words(way)}'), or remove it"
+                )
 
 
-def _apart(passage: Passage, drives: Sequence[Drive], ssh_map: SSHMap) -> list[Drive]:
-    """List the drives that a map does not join with the drives of a corrected gateway."""
-    about = {step.rpartition(":")[0] for step, _ in passage.seen}
-    joined = {
-        name for names in joined_drives(drives, ssh_map) if about & {*names} for name in names
-    }
-    return [drive for drive in drives if drive.name not in joined]
-
-
-def _may_keep_out(passage: Passage, drive: Drive, seen: Trace, ssh_map: SSHMap) -> bool:
-    """Whether a corrected gateway may keep a drive out of its place.
-
-    The drive shares no place with the drives of the correction; or it was not at the place, but saw
-    nearby as many gateways as the robot saw there before the correction. `seen` is the trace as it
-    was before.
-    """
-    drives = drives_of(seen)
-    if drive in _apart(passage, drives, ssh_map):
-        return True
-    there = [step_of(drives, step) for step, _ in passage.seen]
-    places = {ssh_map.place_of(t) for t in there}
-    steps = range(drive.first, drive.stop)
-    if any(ssh_map.place_of(t) in places for t in steps):
+def _looks_like(step: Step, seen: Step) -> bool:
+    """Whether two steps have one view, and stars that may show the same gateways."""
+    if step.view is None or step.view != seen.view or not (step.gateways and seen.gateways):
         return False
-    poses = ssh_map.fit.poses if ssh_map.fit else ()
-    near = median(travels_of(seen) or [0.0]) / 2
-    counts = [step.gateways and len(step.gateways.gateways) for step in seen.steps]
-
-    def is_near(t: int, u: int) -> bool:
-        here, other = (poses[ssh_map.dstate_at[step]] for step in (t, u))
-        return math.hypot(here.x - other.x, here.y - other.y) < near
-
-    return any(
-        counts[t] == counts[u] and (not poses or is_near(t, u)) for t in steps for u in there
-    )
-
-
-def _seen_otherwise(
-    passage: Passage, drive: Drive, trace: Trace, found: Solution, unit: int
-) -> dict[str, float]:
-    """Find the steps of a drive that saw a corrected gateway otherwise, by the best map found.
-
-    Each has the direction of the gateway. `unit` is the unit of the map's headings, in degrees.
-    """
-    if not found.maps:
-        return {}
-
-    def is_otherwise(step: Step, way: float) -> bool:
-        star = step.star
-        return star is not None and with_gateway(star, way, is_open=passage.is_open) != star
-
-    drives, ssh_map = drives_of(trace), found.maps[0]
-    ways = {ssh_map.dstate_at[step_of(drives, step)]: way for step, way in passage.seen}
-    for label, way in [*ways.items()]:
-        here = ssh_map.dstates[label]
-        for s in ssh_map.dstates:
-            if s.place == here.place and s.heading is not None and here.heading is not None:
-                ways.setdefault(s.id, (way + unit * (here.heading - s.heading)) % 360)
-    return {
-        step_name(drives, t): ways[label]
-        for t, label in enumerate(ssh_map.dstate_at[: drive.stop])
-        if t >= drive.first and label in ways and is_otherwise(trace.steps[t], ways[label])
-    }
+    return are_alike(step.gateways, seen.gateways)

@@ -516,7 +516,7 @@ def listed(parts: Parts, found: Iterator[Priced], *, keeps_time: bool) -> Iterat
             if most and known.count == most:
                 known.stopped = "maps limit"
                 return
-            parts.judging.pass_map(ssh_map, parts.engine.size, watch.elapsed())
+            parts.judging.pass_map(ssh_map, watch.elapsed())
             # Take the first map as the best one. The answer gives its counts as the cost.
             known.best = known.best if known.count else ssh_map
             known.count += 1
@@ -659,7 +659,7 @@ def best_map(parts: Parts) -> Iterator[Priced]:
     watch.start()
     if known.status in (Status.FEASIBLE, Status.OPTIMAL) and not known.count and known.best:
         with suppress(LimitError), heeding(Watch().part(overtime(parts)).check):
-            parts.judging.pass_map(known.best, parts.engine.size, watch.elapsed())
+            parts.judging.pass_map(known.best, watch.elapsed())
         watch.stop()
         known.count = 1
         note(parts, known.best, known.cost)
