@@ -19,7 +19,7 @@ from worlds import ACTIONS, HEADINGS, QUARTERS, drive, streets
 
 from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker import check
-from ssh_abduction.checker.crossings import Edges
+from ssh_abduction.checker.evidence import Edges
 from ssh_abduction.data.maps import DState
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.sources.exact import choosing, prefixes

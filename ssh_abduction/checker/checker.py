@@ -14,8 +14,8 @@
 
 The checker shares nothing with the encodings or the solver, so it catches their mistakes. The
 axioms are those of docs/explanation/theory.md, after Kuipers & Beeson (AAAI 2002) and Remolina &
-Kuipers (AIJ 2004). The check of an axiom is a function with its name, in `topological`, `sides`,
-`stars` or `evidence`. This module checks that a map fits its trace, and `sides` the regions that it
+Kuipers (AIJ 2004). The check of an axiom is a function with its name, in `topological`, `sides`
+or `evidence`. This module checks that a map fits its trace, and `sides` the regions that it
 lists.
 
 A map lists one place, one course (path and direction) and one heading for each dstate, even if the
@@ -30,16 +30,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from ssh_abduction.checker import (
-    evidence,
-    sides,
-    stars,
-    topological,
-)
+from ssh_abduction.checker import evidence, sides, topological
 from ssh_abduction.checker.evidence import floors_are_listed
 from ssh_abduction.checker.reading import Check, Found, Reading, course_of, heading_of
 from ssh_abduction.checker.sides import is_pair
-from ssh_abduction.checker.stars import bearing_changes, slot_changes
+from ssh_abduction.checker.topological import bearing_changes, slot_changes
 from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import Fault, SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
@@ -51,7 +46,7 @@ from ssh_abduction.theory.theory import Theory
 COHERENCE = "map_explains_trace"
 
 # The check of an axiom is the function with the name of the axiom in one of these modules.
-_MODULES = (topological, sides, stars, evidence)
+_MODULES = (topological, sides, evidence)
 AXIOMS: dict[str, Check] = {
     axiom.name: getattr(module, axiom.name)
     for axiom in encodings.axioms()

@@ -82,21 +82,21 @@ class _Claims:
         self.theory, self.proven = theory, proven
         self.counts = [_counts(ssh_map) for ssh_map in maps]
         self.first = next(iter(theory.priorities), None)
-        self.is_optimal = answer.get("status") == "optimal"
+        # If axioms are left out, clingo may count more than the maps show.
+        self.is_exact = not theory.without
+        # Whether the bound has to be the cost of map 1.
+        is_optimal = answer.get("status") == "optimal" and "bound" in answer and bool(maps)
+        self.is_tight = is_optimal and self.is_exact and theory.weigh != "cost"
 
     def sizes(self) -> Iterator[str]:
         """Check the claimed numbers of steps and maps, and the range of `prefix`."""
-        listed = len(self.maps)
-        if "count" in self.answer and not _is(self.answer["count"], listed):
-            yield (
-                f"count: expected {listed}, the number of maps listed, got "
-                f"{brief(self.answer['count'])}"
-            )
-        if "steps" in self.answer and not _is(self.answer["steps"], self.steps):
-            yield (
-                f"steps: expected {self.steps}, the number of steps of the trace, got "
-                f"{brief(self.answer['steps'])}"
-            )
+        for name, number, what in (
+            ("count", len(self.maps), "maps listed"),
+            ("steps", self.steps, "steps of the trace"),
+        ):
+            got = self.answer.get(name, number)
+            if not is_whole(got) or got != number:
+                yield f"{name}: expected {number}, the number of {what}, got {brief(got)}"
         prefix = self.answer.get("prefix", 0)
         if not is_whole(prefix) or not 0 <= prefix <= self.steps:
             yield (
@@ -161,18 +161,15 @@ class _Claims:
             if cost != expected or (expected is not None and not whole):
                 because = "as map 1 has these" if self.maps else "as there is no map"
                 yield f"cost: expected {_text(expected)}, {because}, got {_text(cost)}"
-        if self.theory.without:
-            return  # if axioms are left out, clingo may count more than the maps show
-        if self.theory.weigh == "cost":
-            # Maps of one cost in nats may have different counts (checker/cost_claims.py).
-            if "within" in self.answer:
-                yield from self._costs_of_each()
+        if not self.is_exact:
             return
+        is_counted = self.theory.weigh != "cost"
         if "within" in self.answer:
-            yield from self._costs_within(self.answer["within"])
+            yield from self._costs_within() if is_counted else self._costs_of_each()
             return
         best = self._preferred(0)
-        for i in range(len(self.counts)):
+        # Maps of one cost in nats may have different counts (checker/cost_claims.py).
+        for i in range(len(self.counts) if is_counted else 0):
             if (here := self._preferred(i)) != best:
                 preferred = ", ".join(self.theory.priorities)
                 yield (
@@ -189,7 +186,7 @@ class _Claims:
             counts[name] for counts in self.counts[i : i + 1] for name in self.theory.priorities
         ]
 
-    def _costs_within(self, within: Any) -> Iterator[str]:
+    def _costs_within(self) -> Iterator[str]:
         """Check the maps of an answer that also lists maps above the minimum.
 
         The level of a map is its number of dstates, or of the first other count that the theory
@@ -197,6 +194,7 @@ class _Claims:
         by more than `within`. Maps of one level must be equally good. Each map and each level must
         have the claimed cost.
         """
+        within = self.answer["within"]
         sort = next((name for name in self.theory.priorities if name != "excuses"), None)
         if not is_whole(within) or within < 0:
             yield f"within: expected a whole number, 0 or more, got {brief(within)}"
@@ -204,16 +202,14 @@ class _Claims:
         for i, counts in enumerate(self.counts):
             last = self.counts[max(i - 1, 0)]
             most = self.counts[0][sort] + within if sort else 0
+            best, here = self._preferred(max(i - 1, 0)), self._preferred(i)
             # maps are sorted by level, and maps of one level are equally good
             if sort and not last[sort] <= counts[sort] <= most:
                 yield (
                     f"maps: expected {last[sort]} to {most} {sort} in map {i + 1}, as within "
                     f"is {within}, got {counts[sort]}"
                 )
-            elif (not sort or last[sort] == counts[sort]) and self._preferred(i) != self._preferred(
-                max(i - 1, 0)
-            ):
-                best, here = self._preferred(i - 1), self._preferred(i)
+            elif (not sort or last[sort] == counts[sort]) and best != here:
                 preferred = ", ".join(self.theory.priorities)
                 yield (
                     f"maps: expected equal numbers of {preferred} in maps {i} and {i + 1}, which "
@@ -255,7 +251,7 @@ class _Claims:
         the map lists. Then a larger number in `cost` is right, too.
         """
         shown = self.counts[0]
-        if not self.theory.without or not isinstance(cost, Mapping):
+        if self.is_exact or not isinstance(cost, Mapping):
             return shown
         more = {
             k: cost[k]
@@ -287,9 +283,8 @@ class _Claims:
                     else "the theory prefers nothing"
                 )
                 yield f"bound: expected none of {name}, as {preferred}, got {value}"
-            # if axioms are left out, clingo may count more than the map shows
             below = [i for i, counts in enumerate(self.counts) if counts[name] < value]
-            if below and not self.theory.without:
+            if below and self.is_exact:
                 yield (
                     f"bound: expected at most {self.counts[below[0]][name]} {name}, as map "
                     f"{below[0] + 1} has no more, got {value}"
@@ -299,21 +294,12 @@ class _Claims:
                 f"bound: expected at most {self.proven} dstates, as the certificate proves no "
                 f"more, got {bound['dstates']}"
             )
-        if (
-            self.is_optimal
-            and self.theory.weigh != "cost"
-            and self.maps
-            and self.first
-            and not self.theory.without
-            and "bound" in self.answer
-        ):
-            least = self.counts[0][self.first]
-            if bound.get(self.first, 0) < least:
-                got = bound.get(self.first, "none")
-                yield (
-                    f"bound: expected {least} {self.first}, the cost of map 1, as the status is "
-                    f"optimal, got {got}"
-                )
+        least = self.counts[0][self.first] if self.is_tight and self.first else 0
+        if self.first and bound.get(self.first, 0) < least:
+            yield (
+                f"bound: expected {least} {self.first}, the cost of map 1, as the status is "
+                f"optimal, got {bound.get(self.first, 'none')}"
+            )
 
     def _bound_with_faults(self) -> Iterator[str]:
         """Check the claimed lower bound on the cost of dstates and faults together, in dstates."""
@@ -324,19 +310,13 @@ class _Claims:
             return
         costs = [counts["tenths"] / 10 for counts in self.counts]
         below = [i for i, least in enumerate(costs) if least < cost]
-        if below and not self.theory.without:
+        if below and self.is_exact:
             i = below[0]
             yield (
                 f"bound.cost: expected at most {costs[i]:g} dstates, as map {i + 1} costs no more, "
                 f"got {cost:g}"
             )
-        elif (
-            self.is_optimal
-            and self.theory.weigh != "cost"
-            and not self.theory.without
-            and "bound" in self.answer
-            and cost < costs[0]
-        ):
+        elif self.is_tight and cost < costs[0]:
             yield (
                 f"bound.cost: expected {costs[0]:g} dstates, the cost of map 1, as the status is "
                 f"optimal, got {cost:g}"
@@ -366,11 +346,6 @@ def _shown(counts: Mapping[str, float]) -> dict[str, float]:
         for k, v in counts.items()
         if k in ("dstates", "places", "paths") or (v and k != "tenths")
     }
-
-
-def _is(value: Any, number: int) -> bool:
-    """Tell whether a value is this whole number."""
-    return is_whole(value) and value == number
 
 
 def _text(counts: Any) -> str:

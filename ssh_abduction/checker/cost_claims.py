@@ -20,7 +20,7 @@ import cmath
 import math
 from collections import Counter, defaultdict
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
-from itertools import accumulate, combinations, pairwise
+from itertools import accumulate, combinations, pairwise, product
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ssh_abduction.data.errors import brief
+from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Closure, Odometry
 from ssh_abduction.data.trace import Trace
@@ -61,7 +62,11 @@ CROWDED, TRAVEL = 0.4, 0.1
 # metres.
 NEAR = 1.0
 
-_Frame = tuple[complex, float]  # the position and the heading of the origin of a stretch
+# The tiny imaginary part of an unknown, and how many unknowns get one at once.
+TINY, AT_ONCE = 1e-30, 200
+
+_Numbers: TypeAlias = NDArray[Any]  # real, or complex while derivatives are computed
+_Frame: TypeAlias = tuple[complex, float]  # a position, and a heading in radians
 
 
 def misfit(trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> float:
@@ -244,162 +249,117 @@ class _Errors:
 
     def __init__(self, trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> None:
         odometry = trace.odometry or Odometry()
-        size = len(trace)
-        self._moved = np.zeros((size, 3))
-        self._root = np.zeros((size, 3, 3))
-        for t in range(1, size):
-            displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
-            if displacement is None or covariance is None:
-                self._root[t] = MISSING * np.identity(3)
-                continue
-            self._moved[t] = displacement
-            self._root[t] = np.linalg.cholesky(np.array(covariance))
+        self._moved = np.zeros((len(trace), 3))
+        self._root = np.tile(MISSING * np.identity(3), (len(trace), 1, 1))
+        self._root[0] = 0.0
+        missing = []
+        for t, step in enumerate(trace.steps[1:], 1):
+            if step.displacement is None:
+                missing.append(t)
+            else:
+                self._moved[t] = step.displacement
+                self._root[t] = np.linalg.cholesky(np.array(trace.covariance(t)))
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
         # If a heading after a gap is too far off, Gauss-Newton fails. So begin near the solution.
-        self._is_missing = np.array([step.displacement is None for step in trace.steps])
-        missing = [t for t in range(1, size) if self._is_missing[t]]
-        for t, likely in likely_moves(self._moved, missing, dstates, places, trace.closures):
+        for t, likely in _likely_moves(self._moved, missing, dstates, places, trace.closures):
             self._moved[t] = likely
         self._sigma = np.array([odometry.scale, odometry.bend])
-        # The closures, each with the root of its covariance.
-        self._closures = [
-            (closure, np.linalg.cholesky(np.array(closure.covariance)))
-            for closure in trace.closures
-        ]
         self._off = _off_dstates(trace)
-        # The number of unknowns: errors of displacements and closures, then how far the robot is
-        # off its dstate at each step, scale and drift.
-        self._begin = 3 * (size + len(self._closures))
-        self._size = self._begin + self._off.size + 2
-        self.position: Array = np.zeros((size, 2))
-        # A loop: the last earlier step at the dstate or place of a step, the step, and whether both
-        # are at one dstate.
-        self._loops: list[tuple[int, int, bool]] = []
-        at_place: dict[int, int] = {}
-        at_dstate: dict[int, int] = {}
+        covariances = np.array([c.covariance for c in trace.closures]).reshape(-1, 3, 3)
+        self._doubt = np.linalg.cholesky(covariances)
+        self._told = np.array([c.displacement for c in trace.closures]).reshape(-1, 3)
+        # A loop leads from the last earlier step at the dstate or place of a step to this step.
+        # At one place, only the position has to be the same.
+        ends: list[tuple[int, int]] = []
+        counts: list[tuple[bool, bool, bool]] = []
+        last: dict[tuple[str, int], int] = {}
         for t, (dstate, place) in enumerate(zip(dstates, places, strict=True)):
-            if at_dstate.get(dstate, -1) >= 0:
-                self._loops.append((at_dstate[dstate], t, True))
-            elif place in at_place:
-                self._loops.append((at_place[place], t, False))
-            at_dstate[dstate], at_place[place] = t, t
+            here = ("dstate", dstate), ("place", place)
+            if key := next((key for key in here if key in last), None):
+                ends.append((last[key], t))
+                counts.append((True, True, key[0] == "dstate"))
+            last |= dict.fromkeys(here, t)
+        self._loops = np.array(ends, dtype=int).reshape(-1, 2).T
+        self._counts = np.array(counts, dtype=bool).reshape(-1, 3)
+        self._closures = np.array([(c.first, c.last) for c in trace.closures], int).reshape(-1, 2).T
+        self.position: Array = np.zeros((len(trace), 2))
 
     def least(self) -> float:
         """Compute the least sum of squares of the errors, in standard deviations."""
-        z: Array = np.zeros(self._size)
-        for _ in range(ROUNDS):
+        z: Array = np.zeros(3 * (len(self._moved) + len(self._doubt) + len(self._off)) + 2)
+        for _ in range(ROUNDS if self._loops.size + self._closures.size else 0):
             look_at_clock()
-            closing, jacobian = self._closings(z)
-            if not len(closing):
-                return 0.0
-            new = np.asarray(
-                np.linalg.lstsq(jacobian, jacobian @ z - closing, rcond=1e-14)[0], dtype=float
-            )
+            jacobian = self._derivatives(z)
+            wanted = jacobian @ z - self._closing(z)
+            new = np.asarray(np.linalg.lstsq(jacobian, wanted, rcond=1e-14)[0], dtype=float)
             moved, z = float(abs(new - z).max()), new
             if moved < STILL:
                 break
+        self.position = self._poses(z)[1][:, :2]
         return float(z @ z)
 
-    def _closings(self, z: Array) -> tuple[Array, Array]:
-        """Compute c(z), by how much loops and closures are off, and its derivatives J."""
-        pose, own = self._reckoned(z)
-        found = [self._loop_gap(z, pose, own, *loop) for loop in self._loops]
-        found += [self._closure_gap(z, pose, own, k) for k in range(len(self._closures))]
-        if not found:
-            return np.zeros(0), np.zeros((0, self._size))
-        gaps, rows = zip(*found, strict=True)
-        return np.concatenate(gaps), np.concatenate(rows)
+    def _derivatives(self, z: Array) -> Array:
+        """Compute the derivatives J of c(z), of shape (numbers in c, unknowns).
 
-    def _reckoned(self, z: Array) -> tuple[Array, Array]:
-        """Compute the pose at each step by dead reckoning, and the `_own_errors` of movements."""
-        size = len(self._moved)
-        scale, bend = self._sigma * z[-2:]
-        noise = np.einsum("tij,tj->ti", self._root, z[: 3 * size].reshape(size, 3))
-        turned = self._moved[:, 2] + noise[:, 2] - bend * self._way
-        turned[0] = 0.0
-        heading = np.cumsum(turned)
-        before = np.concatenate([[0.0], heading[:-1]])
-        angle = before - bend * self._way / 2
-        cos, sin = np.cos(angle), np.sin(angle)
-        gone = (self._moved[:, :2] + noise[:, :2]) / (1 + scale)
-        gone[0] = 0.0
-        onward = np.stack(
-            [cos * gone[:, 0] - sin * gone[:, 1], sin * gone[:, 0] + cos * gone[:, 1]], axis=1
-        )
-        pose = np.column_stack([np.cumsum(onward, axis=0), heading])
-        off_dstate = z[self._begin : self._begin + self._off.size].reshape(-1, 3) * self._off
-        self.position = pose[:, :2] - (off_dstate[:, :2] if len(self._off) else 0.0)
-        return pose, self._own_errors(cos, sin, onward, 1 + scale)
-
-    def _loop_gap(
-        self, z: Array, pose: Array, own: Array, first: int, last: int, is_dstate: bool
-    ) -> tuple[Array, Array]:
-        """Compute by how much a loop is off, and the derivatives."""
-        gap = pose[last] - pose[first]
-        row = self._row(pose, own, first, last)
-        if len(self._off):
-            away = np.zeros(3)  # how much farther the robot is off its dstate at the last step
-            for t, sign in ((last, 1.0), (first, -1.0)):
-                mine = slice(self._begin + 3 * t, self._begin + 3 * t + 3)
-                away += sign * self._off[t] * z[mine]
-                row[range(3), range(mine.start, mine.stop)] -= sign * self._off[t]
-            gap -= away
-            # Once the loop closes, the two poses are `away` from each other. Earlier turns turn
-            # that. Turns at gaps are left out: they are too uncertain for Gauss-Newton.
-            turns = np.where(self._is_missing[: first + 1, None], 0.0, own[: first + 1, 2])
-            turned = np.outer([-away[1], away[0]], turns).reshape(2, first + 1, 5)
-            row[:2, : 3 * first + 3] += turned[:, :, :3].reshape(2, -1)
-            row[:2, -2:] += turned[:, :, 3:].sum(axis=1)
-        gap[2] = math.remainder(gap[2], math.tau)
-        kept = 3 if is_dstate else 2
-        return gap[:kept], row[:kept]
-
-    def _closure_gap(self, z: Array, pose: Array, own: Array, k: int) -> tuple[Array, Array]:
-        """Compute by how much closure k is off, and the derivatives.
-
-        It gives the pose at the later step in the frame of the earlier one. Errors up to the
-        earlier step move both poses alike.
+        If an unknown has a tiny imaginary part, the imaginary part of c is the derivative (Squire &
+        Trapp 1998, "Using complex variables to estimate derivatives of real functions").
         """
-        (closure, root), size = self._closures[k], len(self._moved)
-        first, last = closure.first, closure.last
-        cos, sin = math.cos(pose[first, 2]), math.sin(pose[first, 2])
-        back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        mine = slice(3 * (size + k), 3 * (size + k) + 3)
-        row = back @ self._row(pose, own, first, last)
-        row[:, mine] = -root
-        gap = back @ (pose[last] - pose[first]) - closure.displacement - root @ z[mine]
-        gap[2] = math.remainder(gap[2], math.tau)
-        return gap, row
+        changes = np.array_split(TINY * 1j * np.identity(len(z)), 1 + len(z) // AT_ONCE)
+        return np.concatenate([self._closing(z + some).imag / TINY for some in changes]).T
 
-    def _own_errors(self, cos: Array, sin: Array, onward: Array, scale: float) -> Array:
-        """Compute derivatives, (n, 3, 5), of movements by their three errors, scale and drift."""
-        own = np.zeros((len(onward), 3, 5))
-        own[:, 0, 0], own[:, 0, 1] = cos / scale, -sin / scale
-        own[:, 1, 0], own[:, 1, 1] = sin / scale, cos / scale
-        own[:, 2, 2] = 1.0
-        own[:, :2, 3] = -onward / scale * self._sigma[0]
-        own[:, 0, 4] = onward[:, 1] * self._way / 2 * self._sigma[1]
-        own[:, 1, 4] = -onward[:, 0] * self._way / 2 * self._sigma[1]
-        own[:, 2, 4] = -self._way * self._sigma[1]
-        own[:, :, :3] = own[:, :, :3] @ self._root
-        own[0] = 0.0
-        return own
+    def _closing(self, z: _Numbers) -> _Numbers:
+        """Compute c(z), by how much loops and closures are off, for each row of unknowns."""
+        pose, at = self._poses(z)
+        doubt = self._parts(z)[1]
+        off = _seen_from(at, *self._loops)[..., self._counts]
+        closed = _seen_from(pose, *self._closures) - self._told
+        closed = closed - np.einsum("cij,...cj->...ci", self._doubt, doubt)
+        closed[..., 2] = _remainder(closed[..., 2])
+        return np.concatenate([off, closed.reshape(*z.shape[:-1], -1)], axis=-1)
 
-    def _row(self, pose: Array, own: Array, first: int, last: int) -> Array:
-        """Compute the derivatives of the pose at `last` minus that at `first`.
+    def _poses(self, z: _Numbers) -> tuple[_Numbers, _Numbers]:
+        """Compute the poses of the robot, by dead reckoning, and of the dstates: (…, steps, 3)."""
+        noise, _, off = self._parts(z)
+        scale, bend = (self._sigma[k] * z[..., k - 2, None] for k in (0, 1))
+        moved = self._moved + np.einsum("tij,...tj->...ti", self._root, noise)
+        turned = moved[..., 2] - bend * self._way
+        heading = np.cumsum(turned, axis=-1)
+        middle = heading - turned - bend * self._way / 2
+        way = np.cumsum(_turned(moved, middle) / (1 + scale[..., None]), axis=-2)
+        pose = np.concatenate([way, heading[..., None]], axis=-1)
+        if not len(self._off):
+            return pose, pose
+        off = off * self._off
+        aside = np.concatenate([_turned(off, heading), off[..., 2:]], axis=-1)
+        return pose, pose - aside
 
-        They are by all unknowns. Errors up to `first`, which turn the difference, do not count.
+    def _parts(self, z: _Numbers) -> list[_Numbers]:
+        """Split unknowns, (…, unknowns), into errors, (…, n, 3).
+
+        They are those of the displacements, and of the closures, and how far the robot is off its
+        dstate at each step: metres ahead and left, and radians.
         """
-        along = slice(first + 1, last + 1)
-        rest = pose[last, :2] - pose[along, :2]
-        # An error of the heading turns the rest of the way.
-        carried = own[along].copy()
-        carried[:, 0] -= rest[:, 1, None] * own[along, 2]
-        carried[:, 1] += rest[:, 0, None] * own[along, 2]
-        row = np.zeros((3, self._size))
-        row[:, 3 * first + 3 : 3 * last + 3] = carried[:, :, :3].transpose(1, 0, 2).reshape(3, -1)
-        row[:, -2:] = carried[:, :, 3:].sum(axis=0)
-        return row
+        ends = 3 * np.cumsum([len(self._moved), len(self._doubt), len(self._off)])
+        parts = np.split(z, ends, axis=-1)[:3]
+        return [part.reshape(*z.shape[:-1], -1, 3) for part in parts]
+
+
+def _turned(vectors: _Numbers, angle: _Numbers) -> _Numbers:
+    """Turn vectors, whose last axis begins with x and y, counterclockwise by angles in radians."""
+    x, y, cos, sin = vectors[..., 0], vectors[..., 1], np.cos(angle), np.sin(angle)
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def _seen_from(pose: _Numbers, first: NDArray[np.int_], last: NDArray[np.int_]) -> _Numbers:
+    """Compute the poses of the last steps in the frames of the first ones."""
+    gap = pose[..., last, :] - pose[..., first, :]
+    there = _turned(gap, -pose[..., first, 2])
+    return np.concatenate([there, _remainder(gap[..., 2:])], axis=-1)
+
+
+def _remainder(angle: _Numbers) -> _Numbers:
+    """Return angles in radians between -pi and pi."""
+    return angle - math.tau * np.round(angle.real / math.tau)
 
 
 def _off_dstates(trace: Trace) -> Array:
@@ -423,96 +383,79 @@ def _off_dstates(trace: Trace) -> Array:
     return np.array(found)
 
 
-def likely_moves(
-    moved: NDArray[np.float64],
-    missing: Collection[int],
+def _likely_moves(
+    moved: Array,
+    missing: Sequence[int],
     dstates: Sequence[int],
     places: Sequence[int],
-    closures: Sequence[Closure] = (),
+    closures: Sequence[Closure],
 ) -> Iterator[tuple[int, tuple[float, float, float]]]:
     """Guess the displacements that lead to the `missing` steps.
 
     `moved`, of shape (n, 3), has the displacement that leads to each step, in metres and radians.
-    `dstates` and `places` have the dstate and the place of each step. `closures` are used where
-    these say nothing.
+    `dstates` and `places` have the dstate and the place of each step.
     """
-    begins = [0, *sorted(missing)]
-    stretch = [range(a, b) for a, b in pairwise([*begins, len(moved)])]
+    begins = [0, *missing]
+    stretches = [range(a, b) for a, b in pairwise([*begins, len(moved)])]
     pose: list[_Frame] = []
     for t, (dx, dy, turned) in enumerate(moved.tolist()):
-        if t in begins:
-            pose.append((0j, 0.0))
-            continue
-        at, heading = pose[-1]
-        pose.append((at + cmath.rect(1, heading) * complex(dx, dy), heading + turned))
-    known: dict[int, int] = {}  # for each dstate, a step whose stretch has a frame
-    position: dict[int, complex] = {}  # for each place, where it is
-    framed: set[int] = set()  # the steps of stretches that have a frame
-    waiting = list(range(len(stretch)))
-    while waiting:
-        number, frame = next(
-            (
-                (number, frame)
-                for number in waiting
-                if (frame := _frame(stretch[number], pose, dstates, places, known, position))
-                or (frame := _frame_by_closure(stretch[number], pose, closures, framed))
-            ),
-            (waiting[0], (0j, 0.0)),
+        pose.append((0j, 0.0) if t in begins else _beyond(pose[-1], (complex(dx, dy), turned)))
+    framed: dict[int, None] = {}  # the steps of stretches that have a frame
+    while stretches:
+        found = (
+            (stretch, frame)
+            for stretch in stretches
+            for frame in _frames(stretch, pose, dstates, places, closures, framed)
         )
-        waiting.remove(number)
-        framed.update(stretch[number])
-        for t in stretch[number]:
-            at, heading = pose[t]
-            pose[t] = frame[0] + cmath.rect(1, frame[1]) * at, frame[1] + heading
-            known.setdefault(dstates[t], t)
-            position.setdefault(places[t], pose[t][0])
-    for t in sorted(missing):
+        stretch, frame = next(found, (stretches[0], (0j, 0.0)))
+        stretches.remove(stretch)
+        framed |= dict.fromkeys(stretch)
+        for t in stretch:
+            pose[t] = _beyond(frame, pose[t])
+    for t in missing:
         (at, heading), (after, facing) = pose[t - 1], pose[t]
         gone = (after - at) * cmath.rect(1, -heading)
         yield t, (gone.real, gone.imag, math.remainder(facing - heading, math.tau))
 
 
-def _frame(
-    steps: range,
+def _frames(
+    stretch: range,
     pose: Sequence[_Frame],
     dstates: Sequence[int],
     places: Sequence[int],
-    known: dict[int, int],
-    position: dict[int, complex],
-) -> _Frame | None:
-    """Find the origin of a stretch of steps, from a dstate or two places with known poses.
+    closures: Sequence[Closure],
+    framed: Collection[int],
+) -> Iterator[_Frame]:
+    """Yield likely origins of a stretch, the best first.
 
-    None if the stretch has neither.
+    They follow from a dstate, from two places, or from a closure, with a step that has a frame.
     """
-    for t in steps:
+    known = firsts((dstates[t], pose[t]) for t in framed)
+    position = firsts((places[t], pose[t][0]) for t in framed)
+    for t in stretch:
         if dstates[t] in known:
-            at, heading = pose[known[dstates[t]]]
-            turn = heading - pose[t][1]
-            return at - cmath.rect(1, turn) * pose[t][0], turn
-    there = [t for t in steps if places[t] in position]
-    for t in there:
-        for u in there:
-            way = position[places[u]] - position[places[t]]
-            mine = pose[u][0] - pose[t][0]
-            if min(abs(way), abs(mine)) > NEAR:
-                turn = cmath.phase(way) - cmath.phase(mine)
-                return position[places[t]] - cmath.rect(1, turn) * pose[t][0], turn
-    return None
-
-
-def _frame_by_closure(
-    steps: range, pose: Sequence[_Frame], closures: Sequence[Closure], framed: Collection[int]
-) -> _Frame | None:
-    """Find the origin of a stretch of steps, from a closure with a step that has a frame."""
+            yield _origin(known[dstates[t]], pose[t])
+    there = [t for t in stretch if places[t] in position]
+    for t, u in product(there, there):
+        way, mine = position[places[u]] - position[places[t]], pose[u][0] - pose[t][0]
+        if min(abs(way), abs(mine)) > NEAR:
+            here = position[places[t]], cmath.phase(way)
+            yield _origin(here, (pose[t][0], cmath.phase(mine)))
     for closure in closures:
         x, y, turned = closure.displacement
-        here, there, onward = closure.last, closure.first, complex(x, y)
-        if closure.first in steps:
-            here, there, onward = there, here, -cmath.rect(1, -turned) * onward
-            turned = -turned
-        if here in steps and there in framed:
-            at, heading = pose[there]
-            turn = heading + turned - pose[here][1]
-            at += cmath.rect(1, heading) * onward
-            return at - cmath.rect(1, turn) * pose[here][0], turn
-    return None
+        beyond = _beyond(pose[closure.first], (complex(x, y), turned))
+        if closure.last in stretch and closure.first in framed:
+            yield _origin(beyond, pose[closure.last])
+        if closure.first in stretch and closure.last in framed:
+            yield _origin(pose[closure.last], beyond)
+
+
+def _beyond(frame: _Frame, pose: _Frame) -> _Frame:
+    """Return a pose that is given relative to a frame."""
+    return frame[0] + cmath.rect(1, frame[1]) * pose[0], frame[1] + pose[1]
+
+
+def _origin(known: _Frame, pose: _Frame) -> _Frame:
+    """Return the frame in which a known pose is `pose`."""
+    turn = known[1] - pose[1]
+    return known[0] - cmath.rect(1, turn) * pose[0], turn

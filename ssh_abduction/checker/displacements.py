@@ -45,8 +45,6 @@ from ssh_abduction.theory.theory import Theory
 Steps: TypeAlias = NDArray[np.int_]
 # Two steps, and the degrees of freedom: 2 at one place, 3 at one dstate.
 Return: TypeAlias = tuple[int, int, int]
-# Returns that are rejected, their chi-square, and the threshold.
-_Found: TypeAlias = tuple[tuple[Return, ...], float, float]
 
 # The number of pairs of returns that numpy works on at once.
 AT_A_TIME = 50_000
@@ -66,54 +64,21 @@ FEW = 64
 
 
 @dataclass(frozen=True)
-class LoopGap:
-    """The error with which a loop closes by dead reckoning.
-
-    Attributes:
-        way: The length of the loop in metres.
-        size: The distance between its two ends in metres.
-        size_sigma: The standard deviation of that distance in metres.
-        turned: The angle between the headings at its two ends in degrees, 0 or more.
-        turned_sigma: The standard deviation of that angle in degrees.
-    """
-
-    way: float
-    size: float
-    size_sigma: float
-    turned: float
-    turned_sigma: float
-
-
-@dataclass(frozen=True)
 class Refused:
     """One return, or a pair of returns, that the displacements reject.
 
     Attributes:
         returns: For each return, its two steps and its degrees of freedom (2 for a place, 3 for a
             dstate).
-        closings: For each return, the error with which its loop closes.
+        why: How far apart the steps of a single return are, or how far off two loops close.
         square: The chi-square of all returns together.
         most: The threshold that the chi-square exceeds.
     """
 
     returns: tuple[Return, ...]
-    closings: tuple[LoopGap, ...]
+    why: str
     square: float
     most: float
-
-    def __str__(self) -> str:
-        """Say how far apart the steps of a single return are, or how far off two loops close."""
-        if len(self.closings) == 2:
-            ways = " and ".join(f"{closing.way:.0f} m" for closing in self.closings)
-            sizes = " and ".join(f"{closing.size:.1f} m" for closing in self.closings)
-            return f"the loops of {ways} close {sizes} off"
-        closing, (_, _, freedom) = self.closings[0], self.returns[0]
-        turned = (
-            f" and {closing.turned:.0f} ± {closing.turned_sigma:.0f} degrees"
-            if freedom == 3
-            else ""
-        )
-        return f"they are {closing.size:.1f} ± {closing.size_sigma:.1f} m{turned} apart"
 
 
 def refused_returns(
@@ -127,23 +92,18 @@ def refused_returns(
     """
     if not trace.has_displacements:
         return
-    for returns, square, most in _refused(trace, ssh_map, theory, Drifts(trace), since):
-        yield Refused(returns, tuple(_closing(trace, i, j) for i, j, _ in returns), square, most)
-
-
-def _refused(
-    trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts, since: int
-) -> Iterator[_Found]:
-    """Find rejected returns for `refused_returns`, the single ones first: they are found fast."""
-    returns = _returns(trace, ssh_map, theory, drifts, since)
-    yield from _refused_alone([*returns], drifts, theory)
+    drifts = Drifts(trace)
+    returns = [*_returns(trace, ssh_map, theory, drifts, since)]
+    for one, square, most in _refused_alone(returns, drifts, theory):
+        yield Refused((one,), _apart(trace, *one), square, most)
     if theory.joint > 1:
-        of_arrivals = _returns(trace, ssh_map, theory, drifts, since, of_arrivals=True)
-        yield from _refused_together([*of_arrivals], drifts, theory)
+        arrivals = [*_returns(trace, ssh_map, theory, drifts, since, of_arrivals=True)]
+        for pair, square, most in _refused_together(arrivals, drifts, theory):
+            yield Refused(pair, _off_together(trace, pair), square, most)
 
 
-def _closing(trace: Trace, first: int, last: int) -> LoopGap:
-    """Compute the closing error of the loop from step `first` to step `last`.
+def _apart(trace: Trace, first: int, last: int, freedom: int) -> str:
+    """Say how far apart two steps are by dead reckoning.
 
     The poses assume no drift of the heading. A possible drift adds to the standard deviations.
     """
@@ -152,17 +112,19 @@ def _closing(trace: Trace, first: int, last: int) -> LoopGap:
     off, covariance = filtered.closing(first, last), filtered.covariance(first, last)
     size = float(np.hypot(*off[:2]))
     ahead = off[:2] / size if size else np.array([1.0, 0.0])
-    return LoopGap(
-        way=math.fsum(
-            math.hypot(*step.displacement[:2])
-            for step in trace.steps[first + 1 : last + 1]
-            if step.displacement
-        ),
-        size=size,
-        size_sigma=math.sqrt(ahead @ covariance[:2, :2] @ ahead),
-        turned=math.degrees(abs(off[2])),
-        turned_sigma=math.degrees(math.sqrt(covariance[2, 2])),
-    )
+    sigma = math.sqrt(ahead @ covariance[:2, :2] @ ahead)
+    turned, doubt = (math.degrees(x) for x in (abs(off[2]), math.sqrt(covariance[2, 2])))
+    headings = f" and {turned:.0f} ± {doubt:.0f} degrees" if freedom == 3 else ""
+    return f"they are {size:.1f} ± {sigma:.1f} m{headings} apart"
+
+
+def _off_together(trace: Trace, pair: Sequence[Return]) -> str:
+    """Say how far off the loops of two returns close by dead reckoning."""
+    poses = ErrorFilter(trace, trace.odometry or Odometry(), 0.0, 0.0)
+    moves = [np.hypot(*step.displacement[:2]) if step.displacement else 0.0 for step in trace.steps]
+    ways = " and ".join(f"{math.fsum(moves[i + 1 : j + 1]):.0f} m" for i, j, _ in pair)
+    sizes = " and ".join(f"{np.hypot(*poses.closing(i, j)[:2]):.1f} m" for i, j, _ in pair)
+    return f"the loops of {ways} close {sizes} off"
 
 
 def _returns(
@@ -210,8 +172,13 @@ def _most(theory: Theory, freedom: int, together: bool) -> float:
     return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
 
-def _refused_alone(returns: Sequence[Return], drifts: Drifts, theory: Theory) -> Iterator[_Found]:
-    """Find the return to a place and the return to a dstate that are rejected most clearly."""
+def _refused_alone(
+    returns: Sequence[Return], drifts: Drifts, theory: Theory
+) -> Iterator[tuple[Return, float, float]]:
+    """Find the return to a place and the return to a dstate that are rejected most clearly.
+
+    Each comes with its chi-square, and the threshold that it exceeds.
+    """
     for freedom in (2, 3) if returns else ():
         rows = np.array([r for r in returns if r[2] == freedom], dtype=int).reshape(-1, 3)
         most, least = _most(theory, freedom, together=False), np.full(len(rows), np.inf)
@@ -229,13 +196,13 @@ def _refused_alone(returns: Sequence[Return], drifts: Drifts, theory: Theory) ->
             )
         if len(rows) and least.max() > most:
             worst = int(least.argmax())
-            yield (returns_row(rows[worst]),), float(least[worst]), most
+            yield _return_of(rows[worst]), float(least[worst]), most
 
 
 def _refused_together(
     returns: Sequence[Return], drifts: Drifts, theory: Theory
-) -> Iterator[_Found]:
-    """Find the pair of returns that is rejected most clearly.
+) -> Iterator[tuple[tuple[Return, Return], float, float]]:
+    """Find the pair of returns that is rejected most clearly, with chi-square and threshold.
 
     If the bound leaves more than MOST_SETS pairs to test, about MOST_SETS of them, evenly spread,
     are tested.
@@ -244,7 +211,8 @@ def _refused_together(
         return
     rows = np.array(sorted(returns, key=lambda r: r[1]), dtype=int).reshape(-1, 3)
     thresholds = {freedom: _most(theory, freedom, together=True) for freedom in (4, 5, 6)}
-    worst: _Found | None = None
+    worst: list[tuple[tuple[Return, Return], float, float]] = []
+    clearest = 0.0
     for first, second in _sets(rows, drifts.none, min(thresholds.values())):
         least = np.full(len(first), np.inf)
         most = np.array([thresholds[f] for f in (rows[first, 2] + rows[second, 2]).tolist()])
@@ -257,15 +225,11 @@ def _refused_together(
             )
         # the clearest pair exceeds its threshold most
         excess = least - most
-        if len(excess) and excess.max() > (worst[1] - worst[2] if worst else 0.0):
+        if len(excess) and excess.max() > clearest:
             k = int(excess.argmax())
-            worst = (
-                (returns_row(rows[first[k]]), returns_row(rows[second[k]])),
-                float(least[k]),
-                float(most[k]),
-            )
-    if worst:
-        yield worst
+            pair = _return_of(rows[first[k]]), _return_of(rows[second[k]])
+            clearest, worst = float(excess[k]), [(pair, float(least[k]), float(most[k]))]
+    yield from worst
 
 
 def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Steps, Steps]]:
@@ -401,7 +365,7 @@ def _square(off: Array, covariance: Array) -> Array:
     return square
 
 
-def returns_row(row: Steps) -> Return:
+def _return_of(row: Steps) -> Return:
     """Convert a row of an array (first step, last step, degrees of freedom) to a tuple."""
     first, last, freedom = map(int, row)
     return first, last, freedom
