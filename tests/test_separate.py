@@ -83,7 +83,7 @@ def test_clash_of_two_drives_is_not_blamed_on_the_evidence(
     drives = [str(tmp_path / f"{name}.jsonl") for name in ("monday", "tuesday")]
     monkeypatch.setattr(outcome, "explain", Mock(side_effect=Interrupted))
     assert main(["solve", *drives, "--together", "--same", "monday:0,tuesday:2"]) == 20
-    why = "no map satisfies the axioms; to find out why: ssh-abduction explain"
+    why = "no map of 6 steps satisfies the axioms; to find out why: ssh-abduction explain"
     assert capsys.readouterr().out.startswith(f"unsatisfiable: {why}\n")
 
 

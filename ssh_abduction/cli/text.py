@@ -21,8 +21,7 @@ from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.output.cards import table_of_dstates
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.runtime import program
-from ssh_abduction.solver import Backbone, Cost, Front, Solution, Status, stretches, summary_of
-from ssh_abduction.theory import Theory
+from ssh_abduction.solver import Backbone, Front, Solution, Status, stretches, summary_of
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Choice, Comparison
@@ -119,62 +118,10 @@ def headline(solution: Solution, explanation: Explanation | None) -> str:
     if explanation:
         return f"{solution.status.value}: {explanation}"
     if solution.status is Status.UNSATISFIABLE:
-        return "unsatisfiable: no map satisfies the axioms; to find out why: ssh-abduction explain"
-    why = f" ({solution.stopped})" if solution.stopped else ""
+        return f"{solution.headline}; to find out why: ssh-abduction explain"
     given = f"{solution.effort.prefix} of {counted(solution.steps, 'steps')} given to clingo"
-    seconds = f"{solution.seconds.total:.2f} s, {given}"
-    bound = ", ".join(
-        f"at least {counted(v, k)}" if k != "cost" else f"a cost of at least {v:g} dstates"
-        for k, v in solution.bound.to_dict().items()
-    )
-    if solution.cost is None:
-        none = f"no map of all {counted(solution.steps, 'steps')} yet"
-        return f"{solution.status.value}{why}: {none}; {_proven(bound)}; {seconds}"
-    counts = ", ".join(
-        counted(v, k) if k != "faults" else f"faults that cost {v:g} dstates"
-        for k, v in _counts_of(solution.cost, solution.theory).items()
-    )
-    weighed = solution.weighed
-    if weighed is not None:
-        counts += f", {weighed.nats:.1f} nats"
-        seconds = f"{weighed.sentence}; {seconds}"
-    if solution.status is Status.FEASIBLE:
-        claim = "not proven minimal" if weighed is None else "not proven to cost least"
-        if weighed is not None:
-            bound = f"{weighed.bound:.1f} nats or more"
-        return f"feasible{why}: {counts}, {claim}; {_proven(bound)}; {seconds}"
-    return f"optimal: {counts}; {_number_of_maps(solution)}; {seconds}"
-
-
-def _proven(bound: str) -> str:
-    """Say what is proven about all maps; `bound` is empty if nothing is."""
-    return f"any map has {bound}" if bound else "no bound is proven"
-
-
-def _number_of_maps(solution: Solution) -> str:
-    """Say how many minimal maps there are, how many of each further level, and if all are found."""
-    least = solution.levels[0].count if solution.levels else len(solution.maps)
-    found = counted(least, "minimal maps")
-    if solution.weighed is not None:
-        found = f"{counted(least, 'maps')} of least cost"
-    for level in solution.levels[1:]:
-        parts = (counted(v, k) for k, v in _counts_of(level.cost, solution.theory).items())
-        found += f"; {level.count} with {', '.join(parts)}"
-    if solution.complete:
-        return found
-    beyond = f" that cost up to {solution.within} more" if solution.minimal_listed else ""
-    stopped = f" ({solution.stopped})" if solution.stopped else ""
-    return f"{found}, and there may be more{beyond}{stopped}"
-
-
-def _counts_of(cost: Cost, theory: Theory) -> dict[str, float]:
-    """Return the counts of a cost by name, of what maps by the theory have."""
-    counts = cost.to_dict()
-    if theory.level == "causal":
-        del counts["places"]
-    if not theory.has_paths:
-        del counts["paths"]
-    return counts
+    sure = f"{solution.weighed.sentence}; " if solution.cost and solution.weighed else ""
+    return f"{solution.headline}; {sure}{solution.seconds.total:.2f} s, {given}"
 
 
 def findings(solution: Solution, existing: SSHMap | None = None) -> Iterator[str]:

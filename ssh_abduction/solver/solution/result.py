@@ -103,7 +103,8 @@ class Solution(MapSequence):
     support: Support = field(default=Support(), repr=False, compare=False)
 
     def __repr__(self) -> str:
-        return f"<Solution {self.headline}>"
+        short = self.headline.split("; ")[:2]  # without levels
+        return f"<Solution {'; '.join(short)}>"
 
     def _repr_html_(self) -> str:
         """Return the HTML for notebooks: how the search ended, the summary, and the first map."""
@@ -134,31 +135,38 @@ class Solution(MapSequence):
     def headline(self) -> str:
         """A line with the status, the cost, and the number of minimal maps or the bound."""
         why = f" ({self.stopped})" if self.stopped else ""
-        steps, status = counted(self.steps, "steps"), self.status.value
-        bounds = [f"{k} ≥ {v:g}" for k, v in self.bound.to_dict().items()]
-        bound = ", ".join(bounds) or "no bound"
+        steps, weighed = counted(self.steps, "steps"), self.weighed
         if self.status is Status.UNSATISFIABLE:
-            return f"{status}: no map of {steps} satisfies the axioms"
+            return f"unsatisfiable: no map of {steps} satisfies the axioms"
+        bounds = [
+            f"a cost of at least {v:g} dstates" if k == "cost" else f"at least {counted(v, k)}"
+            for k, v in self.bound.to_dict().items()
+        ]
+        proven = f"any map has {', '.join(bounds)}" if bounds else "no bound is proven"
         if self.cost is None:
-            return f"{status}{why}: no map of {steps} yet; {bound}"
-        # Count only what maps by the theory have.
+            return f"{self.status.value}{why}: no map of all {steps} yet; {proven}"
+        counts = self._counts_of(self.cost)
+        least = counted(self.levels[0].count if self.levels else self.count, "minimal maps")
+        claim = "not proven minimal"
+        if weighed is not None:
+            counts += f", {weighed.nats:.1f} nats"
+            least = least.replace("minimal ", "") + " of least cost"
+            claim = "not proven to cost least"
+            proven = f"any map has {weighed.bound:.1f} nats or more"
+        if self.status is Status.FEASIBLE:
+            return f"feasible{why}: {counts}, {claim}; {proven}"
+        further = [f"{x.count} with {self._counts_of(x.cost)}" for x in self.levels[1:]]
+        perhaps = "" if self.complete else f", and there may be more{why}"
+        return f"optimal: {'; '.join([counts, least, *further])}{perhaps}"
+
+    def _counts_of(self, cost: Cost) -> str:
+        """Put the counts of a cost into words, of what maps by the theory have."""
         has = {"places": self.theory.level != "causal", "paths": self.theory.has_paths}
-        counts = ", ".join(
-            counted(v, k) if k != "faults" else f"faults that cost {v:g}"
-            for k, v in self.cost.to_dict().items()
+        return ", ".join(
+            f"faults that cost {v:g} dstates" if k == "faults" else counted(v, k)
+            for k, v in cost.to_dict().items()
             if has.get(k, True)
         )
-        least = self.levels[0].count if self.levels else self.count
-        minimal = "minimal maps"
-        if self.weighed is not None:
-            counts, minimal = f"{counts}; {self.weighed.nats:.1f} nats", "maps"
-            bound = f"each map costs {self.weighed.bound:.1f} or more"
-        if self.status is Status.FEASIBLE:
-            return f"{status}{why}: {counts}; {bound}"
-        of_cost = "" if self.weighed is None else " of least cost"
-        more = f" and {counted(self.count - least, 'maps')} with more" if self.count > least else ""
-        perhaps = "" if self.complete else f", perhaps more{why}"
-        return f"{status}: {counts}; {counted(least, minimal)}{of_cost}{more}{perhaps}"
 
     @property
     def weighed(self) -> Weighed | None:
