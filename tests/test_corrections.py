@@ -394,14 +394,9 @@ def test_solve_names_a_contradicting_correction_without_an_explanation(
     assert main(["correct", building, "--same-place", "monday:2,tuesday:1"]) == 0
     assert main(solving(folder)) == 20
     told = capsys.readouterr()
-    assert "same: monday:1, tuesday:1: it contradicts the trace (monday:1 shows b" in told.out
-    assert "same_place" not in told.out
     assert "warning: views" not in told.err
-    assert main(["correct", building, "--different", "monday:1,tuesday:1"]) == 0
-    assert main(["correct", building, "--elsewhere", "monday:1,monday:2"]) == 0
-    assert main(solving(folder)) == 20
-    told = capsys.readouterr()
-    assert "elsewhere: monday:1, monday:2: perhaps it contradicts the trace" in told.out
+    assert "same: monday:1, tuesday:1: perhaps it contradicts the trace" in told.out
+    assert "same_place: monday:2, tuesday:1: perhaps it contradicts the trace" in told.out
 
 
 def test_gateways_are_opened_and_closed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -130,7 +130,8 @@ def test_reprs_are_short() -> None:
     assert repr(RECTANGLE[0]) == "Step(view='v0', action='right')"
     assert (
         repr(solve(misread()[0], Theory.causal(), time_limit=1e-9))
-        == "<Solution feasible (time limit): 13 dstates, not proven minimal; any map has at least 13 dstates>"
+        == "<Solution feasible (time limit): 13 dstates, not proven minimal; "
+        "any map has at least 13 dstates>"
     )
 
 

@@ -10,12 +10,11 @@ import argparse
 import contextlib
 import ctypes
 import gc
-import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ssh_abduction.cli import jobs, outcome
 from ssh_abduction.cli.outcome import Guard
@@ -230,14 +229,15 @@ def _printed(
     lines: dict[int, str] = {}  # the lines that wait for an earlier trace
     codes: list[int] = []
     turn = 0
-    with _progress(len(paths)) as (pausing, advance), contextlib.closing(answers):
+    with outcome.progress_bar() as progress, contextlib.closing(answers):
+        task = progress.add_task("traces", total=len(paths))
         try:
             for answer in answers:
-                with _whole_lines(stop, pausing) as say:
+                with _whole_lines(stop, progress) as say:
                     lines[answer.number] = answer.line
                     jobs.warn_of(answer, paths[answer.number])
                     codes.append(answer.code)
-                    advance()
+                    progress.advance(task)
                     while turn in lines:
                         say(lines.pop(turn))
                         turn += 1
@@ -245,25 +245,25 @@ def _printed(
                     stop.set()
         except KeyboardInterrupt:
             stop.set()
-        with _whole_lines(stop, pausing) as say:
+        with _whole_lines(stop, progress) as say:
             for number in sorted(lines):  # lines that still wait for an answer that did not come
                 say(lines[number])
     return codes
 
 
 @contextlib.contextmanager
-def _whole_lines(
-    stop: outcome.StopFlag, pausing: Callable[[], contextlib.AbstractContextManager[object]]
-) -> Iterator[Callable[[str], None]]:
+def _whole_lines(stop: outcome.StopFlag, progress: Any) -> Iterator[Callable[[str], None]]:
     """Yield a function that prints a line. Ctrl-C neither loses a line nor cuts it in two.
 
-    But if nobody reads the output after Ctrl-C, the process ends.
+    The progress bar is hidden meanwhile, as rich would add line breaks to the line. If nobody
+    reads the output after Ctrl-C, the process ends.
     """
     guard = Guard(stop.set, given_up=stop.is_set)
 
     def say(line: str) -> None:
-        with pausing():
-            guard.say(lambda: f"{line}\n")
+        progress.stop()
+        guard.say(lambda: f"{line}\n")
+        progress.start()
 
     with outcome.on_ctrl_c(stop.set), guard:
         yield say
@@ -276,29 +276,3 @@ def _forget_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
-
-
-@contextlib.contextmanager
-def _progress(
-    total: int,
-) -> Iterator[tuple[Callable[[], contextlib.AbstractContextManager[object]], Callable[[], None]]]:
-    """Show a progress bar on a terminal. Yield functions that hide it, and that advance it."""
-    if not sys.stderr.isatty():
-        yield contextlib.nullcontext, lambda: None
-        return
-    with outcome.progress_bar() as progress:
-        task = progress.add_task("traces", total=total)
-
-        @contextlib.contextmanager
-        def pausing() -> Iterator[None]:
-            """Hide the bar while a line is printed, as rich would add line breaks to the line."""
-            progress.live.transient = True
-            progress.stop()
-            yield
-            progress.live.transient = False
-            progress.start()
-
-        yield (
-            pausing if sys.stdout.isatty() else contextlib.nullcontext,
-            partial(progress.advance, task),
-        )

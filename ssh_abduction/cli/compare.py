@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from ssh_abduction.evaluation.rungs import Rung
     from ssh_abduction.rivals.comparison import Comparison
     from ssh_abduction.rivals.differences import SharedSides
-    from ssh_abduction.rivals.explore import Experiment, ExperimentPlan, Untried
-    from ssh_abduction.rivals.machines import Consequence
+    from ssh_abduction.rivals.explore import Experiment, ExperimentPlan
 
 
 # Values in run.json that differ between runs even if all settings and results are the same.
@@ -178,9 +177,7 @@ def _lines(found: Comparison) -> Iterator[str]:
             yield from (f"  {line}" for line in best.lines)
 
 
-# The largest number of columns of a table, and of lines of a plan, that are printed. --json prints
-# all.
-SHOWN_COLUMNS, SHOWN_LINES = 6, 40
+SHOWN_LINES = 40  # of a plan; --json prints all
 # Exit codes if a limit ended the search: with a plan that may not be the best, or without a plan.
 EXIT_CUT_SHORT, EXIT_NOTHING = 10, 30
 
@@ -249,65 +246,34 @@ def run_next(options: argparse.Namespace) -> int:
 def _plan_lines(experiment: Experiment) -> Iterator[str]:
     """Yield the lines that describe an experiment to people."""
     yield experiment.sentence
-    plan = experiment.plan
-    if plan.branches:
-        shown = experiment.predictions[:SHOWN_COLUMNS]
-        more = len(experiment.predictions) - len(shown)
-        columns = zip(*(said.seen for said in shown), strict=True)
-        rows = [[act, *seen] for act, seen in zip(plan.actions, columns, strict=True)]
-        heads = (
-            f"{_rivals_in_words(said.rivals)} predict{'s' * (len(said.rivals) == 1)}"
-            for said in shown
-        )
-        yield table(["action", *heads], rows)
-        if more:
-            yield f"  and {counted(more, 'more predictions')} (--json has all)"
-        lines = list(_tree(plan, "  "))
-        if any(branch.plan.branches or branch.plan.untried for branch in plan.branches):
-            yield "the plan"
-            yield from lines[:SHOWN_LINES]
-            if len(lines) > SHOWN_LINES:
-                yield f"  and {counted(len(lines) - SHOWN_LINES, 'more lines')} (--json has all)"
-    elif plan.untried and experiment.count > 1:
-        yield from _expected(plan.untried)
+    lines = list(_tree(experiment.plan, "  "))
+    yield from lines[:SHOWN_LINES]
+    if len(lines) > SHOWN_LINES:
+        yield f"  and {counted(len(lines) - SHOWN_LINES, 'more lines')} (--json has all)"
 
 
 def _tree(plan: ExperimentPlan, indent: str) -> Iterator[str]:
-    """Yield a plan as indented lines: actions, and for each view the maps left and their plan."""
+    """Yield a plan as indented lines: actions, and what rivals expect to see after them.
+
+    Known links lead to the branches of a plan. If they distinguish no more rivals, the actions end
+    with an untried one.
+    """
+    untried = plan.untried
     if plan.branches:
         yield f"{indent}{printable(', '.join(plan.actions))}"
     for branch in plan.branches:
-        rest = branch.plan
-        left = f"{_rivals_in_words(rest.rivals)}{_untried(rest)}"
-        yield f"{indent}  {printable(str(branch.seen))}: {left}"
-        yield from _tree(rest, f"{indent}    ")
-
-
-def _untried(plan: ExperimentPlan) -> str:
-    """Say which untried action to try if known links cannot distinguish the rivals."""
-    if len(plan.rivals) == 1 or plan.branches:
-        return ""
-    if plan.untried is None:
-        return "; nothing distinguishes them"
-    actions = printable(", ".join((*plan.untried.way, plan.untried.action)))
-    return f"; known links distinguish no more of them, try {actions}"
-
-
-def _expected(untried: Untried) -> Iterator[str]:
-    """Yield a table of what the rivals predict for an untried action."""
-    shown = untried.expects[:SHOWN_LINES]
-    yield table(
-        ["maps", "leads to", "seen there", "how sure"],
-        [[_rivals_in_words(said.rivals), *_says(said.says)] for said in shown],
-    )
-    if len(untried.expects) > len(shown):
-        yield f"  and {len(untried.expects) - len(shown)} more (--json has all)"
-
-
-def _says(says: Consequence) -> tuple[str, str, str]:
-    where = "not known" if says.dstate is None else f"dstate {says.dstate}"
-    how = "known" if says.how == "link" else says.how
-    return where, "not known" if says.seen is None else str(says.seen), how
+        yield f"{indent}  {printable(str(branch.seen))}: {_rivals_in_words(branch.plan.rivals)}"
+        yield from _tree(branch.plan, f"{indent}    ")
+    if plan.branches or len(plan.rivals) == 1:
+        return
+    if untried is None:
+        yield f"{indent}nothing distinguishes them"
+        return
+    yield f"{indent}{printable(', '.join((*untried.way, untried.action)))} (untried)"
+    for expected in untried.expects:
+        seen = "not known" if expected.says.seen is None else printable(str(expected.says.seen))
+        how = "" if expected.says.seen is None else f" ({expected.says.how})"
+        yield f"{indent}  {seen}{how}: {_rivals_in_words(expected.rivals)}"
 
 
 def _rivals_in_words(rivals: Sequence[int]) -> str:
@@ -403,26 +369,15 @@ def run_evaluate(options: argparse.Namespace) -> int:
 def _doubts(found: VisitsEvaluation, relations: str | None) -> Iterator[str]:
     """Yield warnings if nothing is judged, or if the relations seem to be of another log."""
     if not found.places.judged:
-        yield _nothing_judged(found)
+        yield (
+            f"judged by {found.judge}: expected pairs of visits to judge, got none of "
+            f"{counted(found.visits, 'visits')}; evaluate a longer drive, or with truth at more "
+            "steps"
+        )
     if found.by_both is not None and found.by_both[1] < ALIKE * found.by_both[0]:
         agree = f"{found.by_both[1]} of {counted(found.by_both[0], 'pairs')} of visits only"
         ask = f"are {named(relations)} relations of this log?"
         yield f"relations and the poses of the trace agree on {agree}: {ask}"
-
-
-def _nothing_judged(found: VisitsEvaluation) -> str:
-    """Explain why no pair of visits was judged."""
-    why, places = f"the trace has {counted(found.visits, 'visits')}", found.places
-    if places.stayed:
-        near = f"{counted(places.stayed, 'pairs')} within {found.near:g} m"
-        why += f"; between the visits of {near}, the robot made no visit farther away"
-    if places.unknown:
-        pairs = counted(places.unknown, "pairs")
-        why += f"; for {pairs}, {found.judge} do not tell how far apart the visits are"
-    return (
-        f"judged by {found.judge}: expected pairs of visits to judge, got none: {why}; evaluate a "
-        "longer drive, or with truth at more steps"
-    )
 
 
 def _visits_in_words(found: VisitsEvaluation) -> str:

@@ -143,21 +143,16 @@ class Obeying:
         """List the corrections that may be the reason why the trace has no map.
 
         Each correction is dropped in turn. If the steps of the explanation still have no map, this
-        correction is not to blame, and it is not listed. Without an explanation, two steps that
-        are said to be one are compared.
+        correction is not to blame, and it is not listed. Without an explanation, all are listed.
         """
-        if solution.maps or not self.corrections:
+        if solution.status is not Status.UNSATISFIABLE or not self.corrections:
             return []
         said, source = self._said, named(self.corrections.source or "corrections")
         sentences: list[Said | Passage] = [*said.pairs, *said.gateways]
-        others = ""
         if explanation is None:
-            wrong = self._unlike(self.without)
-            if not wrong and solution.status is Status.UNSATISFIABLE:
-                return [f"{source}: {one}: perhaps it contradicts the trace" for one in sentences]
-        else:
-            wrong = self._clashing(sentences, explanation)
-            others = ", or another correction that is named here" if len(wrong) > 1 else ""
+            return [f"{source}: {one}: perhaps it contradicts the trace" for one in sentences]
+        wrong = self._clashing(sentences, explanation)
+        others = ", or another correction that is named here" if len(wrong) > 1 else ""
         return [
             f"{source}: {sentence}: it contradicts the trace{seen_at(sentence, self.trace)}{others}"
             for sentence in wrong
@@ -167,12 +162,8 @@ class Obeying:
         """Yield a line that says how to mend the corrections of `blamed`, if there are any."""
         if not blamed:
             return
-        lenient = misreading(self.without)
-        if lenient is None:
-            helps = False
-        elif explanation is None:
-            helps = bool(self._unlike(self.without)) and not self._unlike(lenient)
-        else:
+        helps = False
+        if explanation and (lenient := misreading(self.without)):
             helps = not self._has_no_map(self._said, explanation, lenient)
         them = "this correction" if len(blamed) == 1 else "one of these corrections"
         also = ", or let views and stars be misread: solve with --set misread=4" if helps else ""
@@ -182,10 +173,6 @@ class Obeying:
     def _said(self) -> Corrections:
         """The corrections about drives of this trace."""
         return self.corrections.known_in(drives_of(self.trace))
-
-    def _unlike(self, theory: Theory) -> list[Said | Passage]:
-        """The pairs of steps that are said to be one, but cannot be so by themselves."""
-        return [pair for pair in self._said.pairs if clash_alone(pair, self.trace, theory)]
 
     def _clashing(
         self, sentences: Sequence[Said | Passage], explanation: Explanation

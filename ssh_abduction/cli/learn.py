@@ -184,16 +184,6 @@ def true_dstate_names(traces: Sequence[Trace]) -> list[str] | None:
     return [str(name) for name in found] if all(name is not None for name in found) else None
 
 
-def pair(text: str) -> tuple[int, int]:
-    """Convert text such as "0,4" to two numbers. Raise ArgumentTypeError for anything else."""
-    first, comma, second = text.partition(",")
-    if not (comma and first.strip().isdecimal() and second.strip().isdecimal()):
-        raise argparse.ArgumentTypeError(
-            f"expected two dstates with a comma between them, such as 0,4, got {text!r}; write two"
-        )
-    return int(first), int(second)
-
-
 # A map and a trace whose images get the dstates of the map as labels.
 LABELLED: Rows = {
     **shared.maps_and_trace(" with images"),
@@ -315,10 +305,6 @@ def run_recognise(options: argparse.Namespace) -> int:
 @verb(
     {
         **LABELLED,
-        "--dstates I,J": (
-            "two dstates of the map (default: each pair that shares a view)",
-            {"type": pair},
-        ),
         "--plot PNG": "draw the beams over the scans, into this file",
         "--json": "print how much each beam helps, by each method, as JSON",
     }
@@ -326,7 +312,7 @@ def run_recognise(options: argparse.Namespace) -> int:
 def run_tell_apart(options: argparse.Namespace) -> int:
     """Find the laser beams that distinguish dstates with the same view.
 
-    Compare two dstates that look alike, by default each pair of dstates with the same view.
+    Compare each pair of dstates that have the same view, and two images each.
     """
     from perception.appearance import ReciprocalTransformer
     from perception.recognition import strongest, telling_features
@@ -342,13 +328,12 @@ def run_tell_apart(options: argparse.Namespace) -> int:
     views = {s.id: s.view for s in ssh_map.dstates if s.view is not None}
     alike = [(a, b) for a in views for b in views if a < b and views[a] == views[b]]
     seen = {label for label in set(labels.tolist()) if (labels == label).sum() > 1}
-    pairs = [options.dstates] if options.dstates else [p for p in alike if seen.issuperset(p)]
-    if not pairs:
+    found = {p: telling_features(images, labels, *p) for p in alike if seen.issuperset(p)}
+    if not found:
         raise MapError(
             f"{options.maps}: expected dstates that share a view, with two images each, got none; "
-            "name two with --dstates I,J"
+            "log a longer drive"
         )
-    found = {p: telling_features(images, labels, *p) for p in pairs}
     if options.json:
         records = []
         for p, f in found.items():

@@ -280,6 +280,7 @@ def progress_bar() -> Any:
         TimeElapsedColumn(),
         console=Console(stderr=True),
         redirect_stdout=False,
+        transient=True,
         disable=not sys.stderr.isatty(),
     )
 

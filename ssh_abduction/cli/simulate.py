@@ -76,7 +76,6 @@ SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").
             "whether each wall has its own texture in panoramas, or parallel walls share one "
             "(default: unique)"
         ),
-        "--set paint_seed SEED": "random seed of the textures in panoramas (default: 0)",
         "--set hours FROM,TO": (
             "hours of the day at which the drive begins and ends, which decide the light in "
             "panoramas (default: 12,12)"
@@ -127,7 +126,6 @@ def _drive(options: argparse.Namespace) -> RecordedDrive:
     for name, given in (
         ("images=panoramas", options.images != "ranges"),
         ("textures", options.textures is not None),
-        ("paint_seed", options.paint_seed is not None),
         ("hours", options.hours is not None),
         ("stars=false", not options.stars),
         ("-o -", options.output == "-"),
@@ -193,14 +191,14 @@ def _camera(options: argparse.Namespace) -> Camera | None:
     from simulator.panorama import Camera, Paint
 
     if options.images == "ranges":
-        for name in ("textures", "paint_seed", "hours"):
+        for name in ("textures", "hours"):
             if getattr(options, name) is not None:
                 raise AbductionError(
-                    f"--{name.replace('_', '-')}: expected --set images=panoramas beside it, as "
+                    f"--{name}: expected --set images=panoramas beside it, as "
                     "ranges show no light; add that"
                 )
         return None
-    paint = Paint(options.paint_seed or 0, repeated=options.textures == "repeated")
+    paint = Paint(repeated=options.textures == "repeated")
     if options.hours is None:
         return Camera(paint=paint)
     try:
