@@ -313,7 +313,7 @@ def test_show_draws_and_exports_a_map(solved: Path, capsys: pytest.CaptureFixtur
     assert main(["export", str(solved), "--to", "svg"]) == 0
     assert capsys.readouterr().out.startswith("<svg ")
     assert main(["show", str(solved), "--map", "9"]) == 1
-    assert "--map: expected 1 to 4, got 9" in capsys.readouterr().err
+    assert "expected the number of a map, 1 to 4, or its id, got '9'" in capsys.readouterr().err
 
 
 def test_facts_run_in_plain_clingo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -571,12 +571,15 @@ def test_error_messages_say_how_to_mend_the_input(
             "many.jsonl:2: expected one JSON value, got more after it; solve prints a line for "
             "each of several traces",
         ),
-        (["show", str(none), "--map", "1"], "--map: expected a map, got none"),
+        (["show", str(none), "--map", "1"], "none.json: expected maps, got none"),
         (["check", str(none), ACES], "maps: expected one to check, got none"),
         (["check", str(tmp_path / "no.json")], "no.json: expected a readable file of maps"),
         (["next", ACES], "expected a file of maps, got a trace; name the maps first"),
         (["solve", ACES, "-n", "-1"], "1 or more, got -1; None (--maps 0) lists all"),
-        (["train", str(solved), ACES, "--map", "5", "-o", "x"], "--map: expected 1 to 4, got 5"),
+        (
+            ["train", str(solved), ACES, "--map", "5", "-o", "x"],
+            "expected the number of a map, 1 to 4, or its id, got '5'",
+        ),
         (
             ["reproduce", "notched-rectangle", "--jobs", "0"],
             "--jobs: expected a number of processes",

@@ -473,17 +473,17 @@ def test_evaluate_prints_which_map_is_true(
     assert (
         re.sub(r" +", " ", out.splitlines()[-1]) == " 1 yes 8 right – – 1.000 – – – – 1.000 1.000"
     )
-    cut = {"maps": [labelled([0] * 25).to_dict()], "complete": False}
-    (tmp_path / "map.json").write_text(json.dumps(cut))
+    labelled([0] * 25).save(tmp_path / "map.json")
     assert main(["evaluate", *files]) == 0
-    assert capsys.readouterr().out.startswith(
-        "1 map, and there may be more: none is the true one\n"
-    )
+    assert capsys.readouterr().out.startswith("1 map: none is the true one\n")
     with_truth(trace, [{"place": name} for name in names]).save(tmp_path / "trace.jsonl")
     assert main(["evaluate", *files]) == 0
     assert capsys.readouterr().out.startswith(
-        "1 map, and there may be more: unknown which is the true one, as the truth names"
+        "1 map: unknown which is the true one, as the truth names"
     )
+    solve(Trace.load(ACES), max_maps=2).save(tmp_path / "map.json")
+    assert main(["evaluate", files[0], ACES]) == 0
+    assert capsys.readouterr().out.startswith("2 maps, and there may be more: ")
 
 
 def test_evaluate_errors_are_one_line(
@@ -503,7 +503,7 @@ def test_evaluate_errors_are_one_line(
             f"{solved}: maps[0]: labels: expected 9, one for each step of the trace, got 23; "
             "solve this trace",
         ),
-        ([str(none), ACES], f"{none}: maps: expected one to evaluate, got none"),
+        ([str(none), ACES], f"{none}: expected maps, got none"),
         ([solved, solved], f"{solved}:1: header: expected a trace, got maps, as solve prints them"),
         ([str(tmp_path / "nosuch"), ACES], "nosuch: expected a readable file of maps"),
     ]:

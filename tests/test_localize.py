@@ -688,9 +688,7 @@ def test_localise_uses_the_first_of_several_maps_with_a_note(
     files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     several = files / "several.json"
-    several.write_text(
-        json.dumps({"maps": [SSHMap.load(files / "maps.json").to_dict(), RING.to_dict()]})
-    )
+    several.write_text(json.dumps({"maps": [RING.to_dict(), RING.to_dict()]}))
     other = (files / "other.jsonl").read_bytes()
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(other)))
     assert main(["localise", str(several), "-"]) == 0
@@ -734,9 +732,9 @@ def test_localise_errors_are_one_line(files: Path, refuses: Callable[..., None])
     for words, message in [
         (
             [str(files / "none.json"), other],
-            "none.json: maps: expected one to localise in, got none",
+            "none.json: expected maps, got none",
         ),
-        ([maps, other, "--map", "2"], "--map: expected 1 to 1, got 2"),
+        ([maps, other, "--map", "2"], "expected the number of a map, 1 to 1, or its id, got '2'"),
         (
             [maps, other, "--set", "misread=2"],
             "misread: expected a probability from 0 to 1, got 2.0",

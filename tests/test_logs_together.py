@@ -381,7 +381,7 @@ def test_map_together_refuses_equal_names_and_several_jobs(
     assert main(["map", *logs, *out]) == 1
     assert "expected a name different from" in capsys.readouterr().err
     assert main(["map", *logs, *out, "--jobs", "2"]) == 1
-    assert "--together: expected one search for all logs" in capsys.readouterr().err
+    assert "--jobs: expected no such option with --together" in capsys.readouterr().err
     assert distinct([logs[0], logs[1], logs[0]]) == ([*logs], [(logs[0], logs[0])])
     (tmp_path / "b" / "run.log").write_text("one")
     assert distinct(logs) == ([logs[0]], [(logs[1], logs[0])])

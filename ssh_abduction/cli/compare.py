@@ -331,8 +331,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
     from ssh_abduction.evaluation.pose_truth import NEAR
 
     file = shared.trace_of(options)
-    data = shared.read_maps(options.maps)
-    maps = shared.some_maps(data, options.maps, "evaluate")
+    listing = shared.listing_of(options.maps)
+    maps = listing.maps
     trace = Trace.load(file)
     if options.truth is not None:
         trace = Trajectory.load(options.truth).told_to(trace)
@@ -355,8 +355,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         print(json_line({**record, **{visits.judge: visits.to_dict() for visits in judged}}))
         return 0
     if found is not None:
-        may_be_more = isinstance(data, dict) and data.get("complete") is False
-        print(_headline(found, may_be_more))
+        print(_headline(found, may_be_more=listing.complete is False))
         print(_truth(found, len(trace)))
         print(table(HEAD, [_row(i, one) for i, one in enumerate(found.maps, 1)]))
     for visits in judged:

@@ -274,10 +274,6 @@ class _InOrder(argparse.Action):
             )
             for name, said in HELPS.items()
         },
-        "--name WHAT NAME": (
-            "name or rename a place, path or region (p4, path2, kitchen), or the place of a step",
-            {"action": _InOrder},
-        ),
         **shared.ONE_MAP,
     }
 )
@@ -295,10 +291,6 @@ def run_correct(options: argparse.Namespace) -> int:
     for kind, value in given:
         if kind in ASSERTIONS:
             said = said.with_pair(kind, *_pair(saved, kind, value))
-        elif kind == "name":
-            what, name = value
-            said = said.with_name(name, *saved.thing_to_name(what))
-            saved = saved.named(said)
         else:
             said = said.with_gateway(kind == "open", saved.gateway(value))
     if said == before and given:

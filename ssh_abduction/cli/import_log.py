@@ -327,16 +327,15 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
         content, plain = contents[path], folder / named_after(path)
         wished = folder if len(contents) == 1 else plain
         if content in runs:
-            places = runs[content]
-            place = wished if wished in places else places[0]
+            place = wished if wished in runs[content] else runs[content][0]
         else:
             digits = content or hashlib.sha256(os.fsencode(os.path.abspath(path))).hexdigest()
-            choices = [
-                *([folder] if wished == folder else []),
-                *([plain] if content and named_so[_key(plain)] == 1 else []),
+            is_plain = content and named_so[_key(plain)] == 1
+            choices = [*([folder] if wished == folder else []), *([plain] if is_plain else [])]
+            place = next(
+                (one for one in choices if _key(one) not in owners),
                 folder / f"{_cut(plain.name)}-{digits[:DIGITS]}",
-            ]
-            place = next((one for one in choices if _key(one) not in owners), folder / digits)
+            )
             if place != wished and content:
                 is_taken = _key(wished) in owners
                 why = "has the map of another log" if is_taken else "is the name of several logs"

@@ -197,10 +197,12 @@ def run_check(options: argparse.Namespace) -> int:
     asked = shared.theory_of(options, solved)
     trace, theory = as_corrected(trace, asked, options.maps)
     theory.check_steps(trace)
-    if options.bound:
-        maps = maps_of(data, str(options.maps))
-    else:
-        maps = shared.some_maps(data, options.maps, "check", ", or check its bound (--bound)")
+    maps = maps_of(data, str(options.maps))
+    if not maps and not options.bound:
+        raise MapError(
+            f"{named(options.maps)}: maps: expected one to check, got none; see the status that "
+            "solve printed, or check its bound (--bound)"
+        )
     # Replace each "auto" once for all maps, because counting returns takes long.
     resolved = settle(trace, theory).theory
     made_by = settle(trace, solved or theory).theory

@@ -16,8 +16,7 @@ from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Rows, verb
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import AbductionError, MapError, named, said_of
-from ssh_abduction.data.map_parts import read_json
-from ssh_abduction.data.maps import SSHMap, check_labels, maps_of
+from ssh_abduction.data.maps import SSHMap, check_labels
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.learning.runner_up import SECONDS, runner_up, second_map
@@ -187,9 +186,9 @@ def true_dstate_names(traces: Sequence[Trace]) -> list[str] | None:
 # A map and a trace whose images get the dstates of the map as labels.
 LABELLED: Rows = {
     **shared.maps_and_trace(" with images"),
-    "--map N": (
-        "the number of the map that gives the labels, from 1 (default: use only labels on which "
-        "all maps agree)"
+    "--map I": (
+        "the number of the map that gives the labels, from 1, or its id (default: use only labels "
+        "on which all maps agree)"
     ),
 }
 
@@ -202,17 +201,11 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
 
     options.trace = shared.trace_of(options)
     trace = Trace.load(options.trace)
-    data = read_json(options.maps)
-    maps = maps_of(data, str(options.maps))
-    shared.check_number(options.map, maps, options.maps)
-    answer = data if isinstance(data, dict) else {}
-    labels = labels_of(
-        maps,
-        None if options.map is None else options.map - 1,
-        bool(answer.get("complete", True)),
-        answer.get("status", "optimal") == "optimal",
-    )
-    chosen = maps[(options.map or 1) - 1]
+    listing = shared.listing_of(options.maps)
+    number = None if options.map is None else listing.number(options.map)
+    is_proven = listing.minimal is not None or listing.complete is None
+    labels = labels_of(listing.maps, number, listing.complete is not False, is_proven)
+    chosen = listing.maps[number or 0]
     check_labels(chosen, trace, named(options.maps))
     sure = labels >= 0
     return images_of(trace)[sure], labels[sure], chosen, features_of(trace)

@@ -356,11 +356,7 @@ def _many(question: MapQuestion, options: argparse.Namespace, folders: dict[str,
 
 def _together(question: MapQuestion, options: argparse.Namespace) -> int:
     """Map all logs together, and return the exit code."""
-    if options.jobs is not None or options.scheduler is not None:
-        raise AbductionError(
-            "--together: expected one search for all logs, got --jobs or --scheduler; leave "
-            "them out"
-        )
+    shared.refuse(options, "--together", "jobs", "scheduler")
     logs, same = import_log.distinct(options.logs)
     warn([f"{named(log)}: the same log as {named(other)}; it is left out" for log, other in same])
     names: dict[str, str] = {}

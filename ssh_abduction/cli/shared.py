@@ -7,7 +7,7 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import fields
 from functools import partial
@@ -19,10 +19,10 @@ from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS, load_correction
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
 from ssh_abduction.data.map_parts import read_json
-from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
+from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import trace_in
 from ssh_abduction.theory.fields import CHOICES
 from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
@@ -41,6 +41,7 @@ TRACE_SAID = "trace file (JSON Lines), or - for standard input"
 JSON: Rows = {"--json": "print the answer as JSON"}
 # One of the maps in a file.
 ONE_MAP: Rows = {"--map I=1": "the number of the map, from 1, or its id"}
+MAP: Rows = {"--map I": "the number of the map, from 1, or its id (default: 1)"}
 OUTPUT_TRACE: Rows = {"-o --output TRACE!": "trace file to write, or - for standard output"}
 
 
@@ -262,25 +263,19 @@ def draw_plot(options: argparse.Namespace, name: str, *data: object) -> None:
         getattr(figures, name)(options.plot, *data)
 
 
-def check_number(number: int | None, maps: Sequence[object], where: str) -> None:
-    """Raise MapError, which names the file `where`, if there is no map with this number, from 1."""
-    if number is not None and not 1 <= number <= len(maps):
-        raise MapError(
-            f"{where}: --map: expected 1 to {len(maps)}, got {number}; show lists the maps"
-            if maps
-            else f"{where}: --map: expected a map, got none"
-        )
+def listing_of(file: str) -> Listing:
+    """Read the maps in a file, at least one, with the names that a person gave. Raises MapError."""
+    where = "standard input" if file == "-" else named(file)
+    return Listing.from_dict(read_maps(file), where).named_beside(file)
 
 
-def some_maps(data: Any, file: str, purpose: str, mend: str = "") -> list[SSHMap]:
-    """Return the maps in the data of a file, at least one. Raises MapError."""
-    maps = maps_of(data, str(file))
-    if not maps:
-        raise MapError(
-            f"{named(file)}: maps: expected one to {purpose}, got none; see the status that solve "
-            f"printed{mend}"
-        )
-    return maps
+def refuse(options: argparse.Namespace, beside: str, *names: str) -> None:
+    """Raise AbductionError if one of the named options is given beside what `beside` names."""
+    for name in names:
+        if getattr(options, name) not in (None, False):
+            raise AbductionError(
+                f"--{name.replace('_', '-')}: expected no such option with {beside}; leave it out"
+            )
 
 
 def check_jobs(jobs: int | None, things: str, default: int = 1) -> None:

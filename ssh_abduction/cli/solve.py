@@ -29,7 +29,6 @@ from ssh_abduction.cli.outcome import Guard
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import answer_lines, front_as_text
 from ssh_abduction.data.drives import together
-from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import attributes_of
@@ -110,40 +109,23 @@ def run_solve(options: argparse.Namespace) -> int:
     if options.output is not None:
         shared.check_output(options.output, "the solution")
     if options.onto is not None:
+        shared.refuse(options, "--onto", "front", "jobs", "scheduler", "joint_trace")
         return _onto(options)
-    # Many traces are solved each by itself, by `batch`.
-    many = options.jobs is not None or options.scheduler is not None
-    alone = many or (len(options.traces) > 1 and not options.together)
-    if options.corrections is not None and (alone or options.front is not None):
-        raise AbductionError(
-            "--corrections: expected one trace, or --together, got many traces, --jobs, "
-            "--scheduler or --front; leave it out"
-        )
-    if options.front is not None and options.work_limit is not None:
-        raise AbductionError(
-            "--work-limit: expected none with --front, which searches once for each number of "
-            "faults; give --time-limit"
-        )
+    many = options.jobs is not None or options.scheduler is not None or len(options.traces) > 1
+    if options.together:
+        shared.refuse(options, "--together", "jobs", "scheduler", "front")
+    elif many:
+        several = "several traces, --jobs or --scheduler"
+        shared.refuse(options, several, "front", "corrections", "output", "joint_trace")
+    else:
+        shared.refuse(options, "one trace", "joint_trace")
     if options.front is not None:
+        shared.refuse(options, "--front", "corrections", "work_limit")
         return _front(options)
-    if options.together and many:
-        raise AbductionError(
-            "--together: expected one search for all traces, got --jobs or --scheduler; leave "
-            "them out"
-        )
-    if alone:
-        if options.output is not None:
-            raise AbductionError(
-                "--output: expected one trace, or --together, got many traces; take --json, which "
-                "prints a line for each"
-            )
+    if many and not options.together:
         from ssh_abduction.cli import batch
 
         return batch.run(options)
-    if options.joint_trace is not None and not options.together:
-        raise AbductionError(
-            "joint_trace: expected --together, got one trace; add it, or leave joint_trace out"
-        )
     trace = _joint(options.traces) if options.together else Trace.load(options.traces[0])
     if options.joint_trace is not None:
         folder = Path(options.joint_trace).parent
@@ -356,12 +338,6 @@ def _progress(prints_meanwhile: bool) -> Iterator[Any]:
 
 
 def _onto(options: argparse.Namespace) -> int:
-    for name in ("front", "jobs", "scheduler", "joint_trace"):
-        if getattr(options, name) is not None:
-            flag = f"--{name.replace('_', '-')}"
-            raise AbductionError(
-                f"{flag}: expected no such option when a drive is added to a map; leave it out"
-            )
     existing = Solution.load(options.onto)
     trace = together([Trace.load(path) for path in options.traces])
     said = corrections_of(options)
@@ -400,12 +376,6 @@ def _front(options: argparse.Namespace) -> int:
     The exit code is 0 if the search was completed, 20 if no map has so few faults, and 10 if
     the search was stopped.
     """
-    several = len(options.traces) > 1 or options.together
-    if several or options.jobs is not None or options.scheduler is not None:
-        raise AbductionError(
-            "--front: expected one trace, got several, or --together, --jobs or --scheduler; ask "
-            "for each trace by itself"
-        )
     front = fault_front(
         Trace.load(options.traces[0]),
         shared.theory_of(options, Theory.causal()),

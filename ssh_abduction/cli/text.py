@@ -47,7 +47,13 @@ def answer_lines(
     `existing` is the map to which drives were added, if there was one.
     """
     yield headline(solution, explanation)
-    yield from findings(solution, existing)
+    yield from by_displacements(solution)
+    if solution.joined:
+        yield printable((_kept(existing, solution) if existing else "") + solution.joined)
+    if solution.maps and (floors := floors_in_words(solution.maps[0])):
+        yield floors
+    if solution.weighed is None and solution.sureness:  # else the headline says it
+        yield solution.sureness
     if solution.status is Status.UNSATISFIABLE:
         if explanation and solution.trace is not None:
             yield from explanation.sentences
@@ -66,13 +72,18 @@ def answer_lines(
             first = "step" if steps == 1 else f"{steps} steps"
             yield f"\nbest map of the first {first}\n{describe(partial_map)}"
         return
-    yield first_map(solution)
-    count, backbone = found_in(solution), solution.shared
+    count, backbone, held = found_in(solution), solution.shared, len(solution.maps)
+    yield f"\n{'map 1' if count > 1 else 'map'}\n{describe(solution.maps[0])}"
     if backbone and (count > 1 or not solution.complete):
         yield f"\n{summary_of(solution, count, backbone)}"
     if backbone and not solution.minimal_listed and solution.trace is not None:
         yield describe_backbone(backbone, solution.trace)
-    yield from told_apart(solution)
+    if held > 1:
+        from ssh_abduction.rivals.comparison import compare  # loads numpy
+
+        some = "" if count == held else f" (of the first {held} found)"
+        yield f"\nwhat tells the maps apart{some}"
+        yield from compared(compare(Listing(solution.maps, drives=solution.drives)))
 
 
 def front_as_text(front: Front, most: int) -> str:
@@ -124,21 +135,6 @@ def headline(solution: Solution, explanation: Explanation | None) -> str:
     return f"{solution.headline}; {sure}{solution.seconds.total:.2f} s, {given}"
 
 
-def findings(solution: Solution, existing: SSHMap | None = None) -> Iterator[str]:
-    """Yield the lines between the headline and the maps: what joins drives, and how surely.
-
-    `existing` is the map to which drives were added, if there was one.
-    """
-    yield from by_displacements(solution)
-    if solution.joined:
-        standing = _kept(existing, solution) if existing else ""
-        yield printable(standing + solution.joined)
-    if solution.maps and (floors := floors_in_words(solution.maps[0])):
-        yield floors
-    if solution.weighed is None and solution.sureness:  # else the headline says it
-        yield solution.sureness
-
-
 def _kept(existing: SSHMap, solution: Solution) -> str:
     """Say whether drives that were added to a map joined its pieces."""
     found, names = solution.maps[0], ", ".join(solution.support.onto)
@@ -148,22 +144,6 @@ def _kept(existing: SSHMap, solution: Solution) -> str:
     if len(left) == pieces:
         return f"the map of {names} is kept; "
     return f"the {pieces} pieces of the map of {names} are kept, and joined to {len(left)}; "
-
-
-def first_map(solution: Solution) -> str:
-    """Describe the first of the maps that a search found."""
-    return f"\n{'map 1' if found_in(solution) > 1 else 'map'}\n{describe(solution.maps[0])}"
-
-
-def told_apart(solution: Solution) -> Iterator[str]:
-    """Yield lines about how the maps of a solution differ."""
-    if len(solution.maps) > 1:
-        from ssh_abduction.rivals.comparison import compare  # loads numpy
-
-        held = len(solution.maps)
-        some = "" if found_in(solution) == held else f" (of the first {held} found)"
-        yield f"\nwhat tells the maps apart{some}"
-        yield from compared(compare(Listing(solution.maps, drives=solution.drives)))
 
 
 def by_displacements(solution: Solution) -> Iterator[str]:

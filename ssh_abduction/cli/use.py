@@ -9,7 +9,6 @@ import argparse
 import shlex
 import signal
 import tempfile
-import warnings
 import webbrowser
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -21,8 +20,7 @@ from ssh_abduction.cli.correct import as_corrected
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import trace_path, verb
 from ssh_abduction.cli.text import describe, steps_in_words, table
-from ssh_abduction.data.checks import a_whole_number
-from ssh_abduction.data.corrections import beside, named_beside
+from ssh_abduction.data.corrections import beside
 from ssh_abduction.data.errors import (
     AbductionError,
     LocaliserError,
@@ -35,12 +33,12 @@ from ssh_abduction.data.errors import (
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.map_parts import described, read_json, write_map
-from ssh_abduction.data.maps import SSHMap, maps_of
-from ssh_abduction.data.schema import FieldReader, only_known
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.runtime import program
-from ssh_abduction.solver import drives_in, end_all
+from ssh_abduction.solver import end_all
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
@@ -70,7 +68,7 @@ NOWHERE = "–"
             "- for standard input; or a folder that the command 'map' wrote",
             {"type": trace_path},
         ),
-        "--map N": "the number of the map, from 1 (default: 1)",
+        **shared.MAP,
         "--trace TRACE": (
             "the trace that was mapped; its steps tell which stars were seen at each dstate, and "
             "how reliable views and links are (default: the trace that solve -o or map wrote with "
@@ -100,7 +98,7 @@ def run_localise(options: argparse.Namespace) -> int:
     localiser, trace = _localiser(options)
     beliefs = [belief.to_dict() for belief in localiser.beliefs(trace)]
     if options.json:
-        head = {"map": options.map or 1, "dstates": len(localiser.ssh_map.dstates)}
+        head = {"map": options.map, "dstates": len(localiser.ssh_map.dstates)}
         head["chances"] = asdict(localiser.chances)
         lines = [json_line({"step": step, **belief}) for step, belief in enumerate(beliefs)]
         print(json_line(head)[:-1] + ', "beliefs": [\n' + ",\n".join(lines) + "\n]}")
@@ -126,17 +124,14 @@ def _localiser(options: argparse.Namespace) -> tuple[Localiser, Trace]:
     """
     from ssh_abduction.online.localiser import Chances, Localiser
 
-    data = shared.read_maps(options.maps)
-    maps = named_maps(shared.some_maps(data, options.maps, "localise in"), data, options.maps)
-    shared.check_number(options.map, maps, options.maps)
-    if len(maps) > 1 and options.map is None:
-        warnings.warn(
-            f"{named(options.maps)}: the first of {len(maps)} maps is taken; choose one with --map",
-            stacklevel=1,
-        )
+    listing = shared.listing_of(options.maps)
+    if options.map is None and len(listing.maps) > 1:
+        first = f"the first of {len(listing.maps)} maps is taken; choose one with --map"
+        warn([f"{named(options.maps)}: {first}"])
+    options.map = listing.number(options.map or "1") + 1
     given = only_known(**{name: getattr(options, name) for name in CHANCES})
     chances = replace(Chances.none() if options.zero_one else Chances(), **given)
-    ssh_map = maps[(options.map or 1) - 1]
+    ssh_map = listing.maps[options.map - 1]
     mapped = shared.mapped_trace(options.maps, options.trace)
     other = Trace.load(options.other)
     recogniser = _recogniser(options, ssh_map, mapped, other)
@@ -257,7 +252,7 @@ def _names(words: list[str] | None, given: Collection[str]) -> list[str]:
 @verb(
     {
         "maps": shared.MAPS_SAID,
-        "--map N": "show only the map with this number, from 1 (default: all)",
+        "--map I": "show only the map with this number, from 1, or this id (default: all)",
     }
 )
 def run_show(options: argparse.Namespace) -> int:
@@ -265,16 +260,11 @@ def run_show(options: argparse.Namespace) -> int:
 
     Regions are also printed.
     """
-    data, where = read_json(options.maps), str(options.maps)
-    maps = named_maps(maps_of(data, where), data, where)
-    shared.check_number(options.map, maps, options.maps)
-    if not maps:
-        print("no map")
+    listing = shared.listing_of(options.maps)
+    if options.map is not None:
+        print(_with_regions(listing.maps[listing.number(options.map)]))
         return 0
-    if options.map:
-        print(_with_regions(maps[options.map - 1]))
-    else:
-        print("\n\n".join(f"map {i + 1}\n{_with_regions(m)}" for i, m in enumerate(maps)))
+    print("\n\n".join(f"map {i}\n{_with_regions(m)}" for i, m in enumerate(listing.maps, 1)))
     return 0
 
 
@@ -282,13 +272,6 @@ def _with_regions(ssh_map: SSHMap) -> str:
     """Describe a map and its regions: sets of places beside paths, or behind one place."""
     regions = [f"  {described(region, ssh_map.called)}" for region in ssh_map.regions or ()]
     return "\n".join([describe(ssh_map), *regions])
-
-
-def named_maps(found: Sequence[SSHMap], data: Any, file: str) -> tuple[SSHMap, ...]:
-    """Return the maps found in a file, with the names of corrections.yaml. Raises MapError."""
-    steps = len(found[0].dstate_at) if found else 0
-    drives = drives_in(FieldReader(file), data, steps) if found else ()
-    return named_beside(found, drives, file)
 
 
 # Repeats ssh_abduction.output.export, whose import of networkx would delay all verbs.
@@ -403,7 +386,7 @@ def run_view(options: argparse.Namespace) -> int:
         shlex.quote(options.trace) if options.trace else "TRACE",
         "".join(f" {shlex.quote(flag)}" for flag in flags),
     )
-    localised = _run(options, trace, data)
+    localised = _run(options, trace, listing)
     if options.serve:
         assert trace is not None
         return _serve(options, listing, trace, theory, localised, called)
@@ -430,7 +413,7 @@ def _check(options: argparse.Namespace, trace: Trace | None) -> None:
         raise AbductionError(f"port: expected 0 to 65535, got {options.port}; name a free port")
 
 
-def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
+def _run(options: argparse.Namespace, trace: Trace | None, listing: Listing) -> Run | None:
     """Make the localised run that the options ask for; None if they ask for none."""
     from ssh_abduction.page.content import Run
 
@@ -443,48 +426,36 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
             "trace that was mapped"
         )
     if options.belief is not None:
-        return _with_beliefs(followed, options.belief, maps_of(data, "maps"))
+        return _with_beliefs(followed, options.belief, listing)
     from ssh_abduction.online.localiser import Localiser
 
     return Run(followed, lambda ssh_map: Localiser(ssh_map, trace=trace).beliefs(followed))
 
 
-def _with_beliefs(followed: Trace, file: str, maps: Sequence[SSHMap]) -> Run:
+def _with_beliefs(followed: Trace, file: str, listing: Listing) -> Run:
     """Make a run with the beliefs of a file that `localise --json` wrote. Raises MapError."""
     from ssh_abduction.page.content import Run
 
     record = read_json(file)
     record = record if isinstance(record, dict) else {}
-    beliefs, number = record.get("beliefs"), record.get("map", 1)
+    beliefs = record.get("beliefs")
     if not isinstance(beliefs, list):
         raise MapError(
             f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write "
             "them with localise --json"
         )
-    mend = "run localise with these maps"
-    a_whole_number(f"{named(file)}: map", number, MapError, 1, len(maps), what="a map", mend=mend)
-    chosen = maps[number - 1]
+    with said_of(named(file), MapError):
+        number = listing.number(record.get("map", 1))
+    chosen = listing.maps[number]
     size = record.get("dstates", len(chosen.dstates)), len(beliefs)
     if size != (len(chosen.dstates), len(followed)):
         raise MapError(
             f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, in "
-            f"map {number} with {len(chosen.dstates)} dstates, got {size[1]} in a map with "
+            f"map {number + 1} with {len(chosen.dstates)} dstates, got {size[1]} in a map with "
             f"{brief(size[0])} dstates; run localise with these maps, or name that run with --run"
         )
-    labels = chosen.renumbered().dstate_at
-    visited = dict.fromkeys([*chosen.dstate_at, *range(len(chosen.dstates))])
-    new = {s: i for i, s in enumerate(visited)}  # the page numbers dstates by first visit
-    try:
-        renumbered = [
-            {**belief, "probabilities": [[new[s], p] for s, p in belief["probabilities"]]}
-            for belief in beliefs
-        ]
-    except (KeyError, TypeError, ValueError):
-        raise MapError(
-            f"{named(file)}: probabilities: expected pairs [dstate, probability], got something "
-            "else; localise again"
-        ) from None
-    return Run(followed, lambda ssh_map: renumbered if ssh_map.dstate_at == labels else None)
+    labels = chosen.dstate_at
+    return Run(followed, lambda ssh_map: beliefs if ssh_map.dstate_at == labels else None)
 
 
 def _serve(
