@@ -68,7 +68,7 @@ def along(first: int, stop: int, name: str) -> Trace:
     return Trace.from_steps(views, ["travel"] * len(gone), displacements=gone, name=name)
 
 
-@pytest.mark.parametrize(("places", "shared"), [(4, 1), (12, 0), (12, 1)])
+@pytest.mark.parametrize(("places", "shared"), [(4, 0), (12, 0), (12, 1)])
 def test_drive_joins_the_pieces_of_the_existing_map(places: int, shared: int) -> None:
     """One common place was too little to join the first two drives."""
 

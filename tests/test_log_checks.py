@@ -110,7 +110,6 @@ def of_two_clocks(scans: Scans) -> Scans:
             lambda scans: with_poses(scans[:100], lambda x, y, h: (x, y, h + math.radians(100))),
             "drives backwards for 18 % of its way",
         ),
-        (in_blocks, "So does a log that is not in the order of the drive"),
         (kidnapped, "do not fit those before them, once: from scan 100 (line or message 171) on"),
         (covered, "The laser sees no wall in 50 scans, from scan 100 "),
         (of_two_lasers, "The laser changes before scan 60"),
@@ -142,7 +141,7 @@ def test_few_points_do_not_show_that_the_robot_was_carried(points: int, found: l
 
 
 def test_missing_odometry_does_not_turn_wrongly(scans: Scans) -> None:
-    notes = notes_of(with_poses(scans[:300:3], lambda x, y, h: (0.0, 0.0, 0.0)))
+    notes = notes_of(with_poses(scans[:150:3], lambda x, y, h: (0.0, 0.0, 0.0)))
     assert "Record the odometry" in notes
     assert "turn differently" not in notes
 
@@ -175,10 +174,10 @@ def test_note_says_if_scans_that_contradict_others_are_far_from_them(
     scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(log_checks, "contradicting_scans", lambda log, track: [17])
-    _, track, notes = tracked(RobotLog((*scans[:17], *scans[21:]), source="drive"))
+    _, track, notes = tracked(RobotLog((*scans[:17], *scans[21:80]), source="drive"))
     assert not track.is_reliable
     assert any("m apart: take all scans" in note for note in notes)
-    assert "take all scans" not in notes_of(scans)
+    assert "take all scans" not in notes_of(scans[:80])
 
 
 def test_good_log_gets_no_warning(scans: tuple[Scan, ...]) -> None:
@@ -193,7 +192,9 @@ def test_short_log_gets_no_warning_of_going_back_and_forth(
 
 
 def test_odometry_jumps_do_not_make_headings_degrees(scans: tuple[Scan, ...]) -> None:
-    assert "headings are wrong" not in notes_of(in_blocks(scans))
+    notes = notes_of(in_blocks(scans))
+    assert "So does a log that is not in the order of the drive" in notes
+    assert "headings are wrong" not in notes
 
 
 @pytest.mark.parametrize(("count", "unit"), [(100, "centimetres"), (1000, "millimetres")])

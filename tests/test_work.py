@@ -43,8 +43,8 @@ def answer_by_a_random_clock(trace: Trace, theory: Theory, work: float, seed: in
 @pytest.mark.parametrize("theory", [Theory.topological(), COSTS, Theory.causal()], ids=str)
 def test_one_work_limit_gives_one_answer(work: float, theory: Theory) -> None:
     trace = Trace.load(ROUTE)
-    first, *others = (answer_by_a_random_clock(trace, theory, work, seed) for seed in range(3))
-    assert others == [first, first]
+    first, other = (answer_by_a_random_clock(trace, theory, work, seed) for seed in range(2))
+    assert other == first
 
 
 @pytest.mark.parametrize(("seed", "work"), [(900, 0.3), (902, 0.6)])
