@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
@@ -211,13 +211,11 @@ class Pilot:
 
     def _look_around(self) -> Here:
         """Turn once around, and find the place in the panorama."""
-        driver = self.driver
-        panorama = Panorama(driver.look())
-        for _ in range(round(math.tau / TURN)):
-            turned = self._turn(TURN)
-            panorama.add(driver.look(), turned)
-        ranges = panorama.ranges
-        return Here(ranges, Place.of(ranges, self.reach, driver.laser.reach), panorama.headings[-1])
+        images = [(0.0, self.driver.look())]
+        turns = range(round(math.tau / TURN))
+        images += [(self._turn(TURN), self.driver.look()) for _ in turns]
+        ranges, heading = panorama(images)
+        return Here(ranges, Place.of(ranges, self.reach, self.driver.laser.reach), heading)
 
     def _face(self, heading: float) -> None:
         """Turn on the spot to a heading, in radians relative to the panorama."""
@@ -451,35 +449,29 @@ def _end(streets: Sequence[Street], points: NDArray[np.complex128], reach: float
     return None
 
 
-class Panorama:
-    """Ranges in all directions, one per degree, collected from images of a turning robot.
+def panorama(images: Iterable[tuple[float, Array]]) -> tuple[Array, float]:
+    """Join the images of a robot that turns on the spot to ranges in all directions.
 
-    The panorama is in the frame of the robot at the first image, (180,) metres.
+    Args:
+        images: Images, (180,) metres, each with the turn in radians since the image before, by
+            odometry.
+
+    Returns:
+        The range at each degree, counterclockwise from the first heading: (360,) metres; NaN if
+        unknown. It is the median over all images, so that a beam that is lost in one image does not
+        matter. And the heading at the last image, in radians.
     """
-
-    def __init__(self, image: Array) -> None:
-        self.headings = [0.0]  # heading of the robot at each image in radians, 0 at the first
-        self._rows = [_around(image, 0.0)]
-        self._first = self._rows[0]  # For each degree, the first range that was seen.
-
-    @property
-    def ranges(self) -> Array:
-        """The range at each degree, counterclockwise: (360,), metres; NaN if unknown.
-
-        It is the median over all images, so that a beam that is lost in one image does not matter.
-        """
-        rows = np.array(self._rows)
-        shown = ~np.isnan(rows).all(axis=0)
-        ranges = np.full(360, np.nan)
-        ranges[shown] = np.nanmedian(rows[:, shown], axis=0)
-        return ranges
-
-    def add(self, image: Array, turned: float) -> None:
-        """Add an image, (180,) metres, after a turn that odometry measured in radians."""
-        heading = compass(self._first, image, self.headings[-1] + turned, turned)
-        self.headings.append(heading)
-        self._rows.append(_around(image, heading))
-        self._first = np.where(np.isnan(self._first), self._rows[-1], self._first)
+    heading, rows = 0.0, list[Array]()
+    first = np.full(360, np.nan)  # For each degree, the first range that was seen.
+    for turned, image in images:
+        if rows:
+            heading = compass(first, image, heading + turned, turned)
+        rows.append(_around(image, heading))
+        first = np.where(np.isnan(first), rows[-1], first)
+    shown = ~np.isnan(first)
+    ranges = np.full(360, np.nan)
+    ranges[shown] = np.nanmedian(np.array(rows)[:, shown], axis=0)
+    return ranges, heading
 
 
 def compass(ranges: Array, image: Array, about: float, turned: float) -> float:

@@ -19,7 +19,6 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -361,11 +360,10 @@ class _PlanReader:
 
     def number(self, text: str | None, where: str) -> float:
         """Read a number of at most a million."""
-        value: float | None = None
-        with suppress(ValueError):
+        try:
             value = float(text or "")
-        self.need(value is not None, where, "a number", text)
-        assert value is not None
+        except ValueError:
+            value = math.nan
         self.need(abs(value) <= 1e6, where, "a number of at most 1,000,000", text)
         return value
 

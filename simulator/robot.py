@@ -23,7 +23,6 @@ from operator import itemgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.world import Array, World
@@ -89,14 +88,6 @@ class Body:
             )
 
 
-@dataclass(frozen=True)
-class Report:
-    """The motion of a robot by odometry since the last report."""
-
-    displacement: Displacement  # in the frame of the robot at the last report
-    covariance: NDArray[np.float64]  # (3, 3), of its noise, without systematic errors
-
-
 class SimulatedRobot:
     """A robot with its true pose, which only the simulator knows, and its odometry.
 
@@ -126,15 +117,18 @@ class SimulatedRobot:
         self.odometry = _moved(self.odometry, forward_told, turn_told)
         self.driven += abs(forward_told)
 
-    def report(self) -> Report:
-        """Return the motion by odometry since the last call, or since the start."""
+    def report(self) -> tuple[Displacement, Array]:
+        """Return the motion by odometry since the last call, or since the start.
+
+        It is relative to the pose at the last call, and comes with the covariance, (3, 3), of its
+        noise, without systematic errors.
+        """
         cos, sin = math.cos(self._reported[2]), math.sin(self._reported[2])
         into = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        said = Report(
-            displacement_between(self._reported, self.odometry), into @ self._covariance @ into.T
-        )
+        displacement = displacement_between(self._reported, self.odometry)
+        covariance = into @ self._covariance @ into.T
         self._reported, self._covariance = self.odometry, np.zeros((3, 3))
-        return said
+        return displacement, covariance
 
     def _add_covariance(self, forward: float, turn: float) -> None:
         """Add the covariance of a reported motion (metres, radians), to first order."""
@@ -404,13 +398,13 @@ class Recorder:
     turn: float = math.radians(10)  # radians between scans if the robot turns
     # Pose after each motion, or after each part of a long motion.
     poses: list[Pose] = field(default_factory=list)
-    # For each world (each arrangement of the clutter), the indices of poses at which a scan is
-    # taken.
-    scans: list[tuple[World, list[int]]] = field(default_factory=list)
+    # For each scan, the world (as the clutter is arranged then), and the index of its pose.
+    scans: list[tuple[World, int]] = field(default_factory=list)
     metres: float = 0.0  # distance driven so far
     _seconds: list[float] = field(default_factory=list)  # Time of each pose.
     _way: float = 0.0  # Metres since the last scan.
     _turned: float = 0.0
+    _world: World = field(init=False)  # The world of the last motion.
 
     def __post_init__(self) -> None:
         mend = f"a scan each {EVERY} m is usual"
@@ -419,7 +413,7 @@ class Recorder:
     @property
     def taken(self) -> int:
         """The number of scans so far."""
-        return sum(len(numbers) for _, numbers in self.scans)
+        return len(self.scans)
 
     def note(self, world: World, pose: Pose) -> None:
         """Record the pose after a motion in this world.
@@ -445,11 +439,10 @@ class Recorder:
         self._seconds.append(before + way / SPEED + turned / SPIN)
         self._way, self._turned = self._way + way, self._turned + turned
         self.poses.append(pose)
-        if not self.scans or self.scans[-1][0] is not world:
-            self.scans.append((world, []))
+        self._world = world
         is_due = self._way >= self.every - TINY or self._turned >= self.turn - TINY
         if is_due or len(self.poses) == 1:
-            self.scans[-1][1].append(len(self.poses) - 1)
+            self.scans.append((world, len(self.poses) - 1))
             self._way = self._turned = 0.0
 
     def drive(self, name: str, laser: Laser, odometer: Odometer, seed: int) -> RecordedDrive:
@@ -458,15 +451,17 @@ class Recorder:
         Scans and odometry have random generators of their own, with this seed, so their
         noise does not change the trajectory.
         """
-        if self.scans[-1][1][-1:] != [len(self.poses) - 1]:
-            self.scans[-1][1].append(len(self.poses) - 1)
+        if self.scans[-1][1] != len(self.poses) - 1:
+            self.scans.append((self._world, len(self.poses) - 1))
         # Use generators 2 and 3 of this seed. The drive itself uses others.
         sight, wheels = (np.random.default_rng([seed, k]) for k in (2, 3))
         poses = np.array(self.poses)
-        numbers = [number for _, part in self.scans for number in part]
-        ranges = np.vstack(
-            [laser.scan(world, poses[part], sight) for world, part in self.scans if part]
-        )
+        numbers = [number for _, number in self.scans]
+        parts = groupby(self.scans, key=lambda scan: id(scan[0]))
+        found = [
+            (part[0][0], [number for _, number in part]) for part in (list(p) for _, p in parts)
+        ]
+        ranges = np.vstack([laser.scan(world, poses[part], sight) for world, part in found])
         return RecordedDrive(
             name=name,
             ranges=np.where(ranges < laser.reach, ranges, np.inf),

@@ -25,7 +25,6 @@ from simulator.robot import (
     Odometer,
     RecordedDrive,
     Recorder,
-    Report,
     SimulatedRobot,
     meetings,
 )
@@ -33,6 +32,7 @@ from simulator.world import Array, World, are_square
 from ssh_abduction.data.checks import a_flag, a_number, a_whole_number, an_instance
 from ssh_abduction.data.odometry import (
     Covariance,
+    Displacement,
     Odometry,
     Pose,
     displacement_between,
@@ -313,11 +313,10 @@ def _legs(
 def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:
     """The truth about a pose: the pose, and the nearest true dstate if the world has any."""
     found = world.nearest(pose)
-    where = {"pose": [round(float(v), 5) for v in pose]}
-    if not found:
-        return dict(where)
-    named = {"dstate": found.name, "place": found.place, "path": found.path}
-    return {**named, "direction": found.direction, **where}
+    fields = ("place", "path", "direction") if found else ()
+    names = {"dstate": found.name} if found else {}
+    pose = [round(float(v), 5) for v in pose]
+    return {**names, **{name: getattr(found, name) for name in fields}, "pose": pose}
 
 
 @dataclass
@@ -338,7 +337,7 @@ class StepLog:
         The image has the ranges, or the pixels of a panorama, row by row. The tolerance is that of
         the poses at both ends of the displacement. `more` has further fields of the step.
         """
-        driver, report = self.driver, self.driver.robot.report()
+        driver, (moved, covariance) = self.driver, self.driver.robot.report()
         if self.camera is None:
             image = tuple(round(float(r), 4) for r in ranges)
         else:
@@ -346,26 +345,23 @@ class StepLog:
             shot = self.camera.shot(driver.world, driver.robot.pose, self.rng, hour, self.walls)
             image = tuple(shot.ravel().tolist())
         if self.begun:
-            dx, dy, turned = (round(v, DIGITS) for v in report.displacement)
-            more |= {
-                "displacement": (dx, dy, turned),
-                "covariance": covariance_of(report, tolerance),
-            }
+            more["displacement"] = tuple(round(v, DIGITS) for v in moved)
+            more["covariance"] = covariance_of(moved, covariance, tolerance)
         self.begun = True
         return Step(image=image, **more)
 
 
-def covariance_of(report: Report, tolerance: Tolerance) -> Covariance:
+def covariance_of(moved: Displacement, covariance: Array, tolerance: Tolerance) -> Covariance:
     """Compute the covariance of a displacement between fixed points, reported by odometry.
 
-    It includes the errors of odometry and of hill-climbing, which ends anywhere within its
-    tolerance.
+    It includes the errors of odometry, whose covariance is given, (3, 3), and of hill-climbing,
+    which ends anywhere within its tolerance.
     """
-    dx, dy, _ = report.displacement
+    dx, dy, _ = moved
     left = np.diag([tolerance.close**2, tolerance.close**2, tolerance.straight**2]) / 3
     # A wrong heading moves the end sideways.
     by_start = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
-    whole = report.covariance + by_start @ left @ by_start.T + left
+    whole = covariance + by_start @ left @ by_start.T + left
     a, b, c = (tuple(float(f"{v:.8g}") for v in row) for row in (whole + whole.T) / 2)
     return a, b, c  # type: ignore[return-value]
 
@@ -457,53 +453,41 @@ class DriveWatch:
 
     def because(self, before: Pose) -> str:
         """The likely causes of an error since a pose, to end a message; empty if there are none."""
+        found = "; or ".join(self._causes(before))
+        return f". Likely cause: {found}" if found else ""
+
+    def _causes(self, before: Pose) -> Iterator[str]:
+        """Yield the likely causes of an error since a pose, each with what to do."""
         world, body, noise = self.world, self.driver.robot.body, self.driver.laser.noise
         is_square, half = world.angles == "right", self._half_width(before)
         fits = (0.0 if is_square else 0.6 * half) <= world.reach <= 1.25 * half
+        if half < math.inf and not fits:
+            widths = f"{world.reach:g} m, and half the width of the street there is {half:.2f} m"
+            yield f"reach is {widths} (give that as reach)"
+        if is_square and not are_square(world.segments):
+            said = 'walls meet at other than right angles, and the world says "right"'
+            yield f'{said} (write "angles": "any")'
+        if body.odometry > NOISY:
+            share = f"{100 * body.odometry:.0f} %"
+            yield f"the odometry errs by {share} (give less --set odometry_noise)"
+        if body.slip > NOISY:
+            yield f"a motion errs by {100 * body.slip:.0f} % (give the body less slip)"
+        if abs(body.bend) > math.radians(2):
+            bend = f"{math.degrees(body.bend):.1f} degrees in each metre"
+            yield f"the odometry bends by {bend} (give less --set bend_error)"
+        if noise > BLURRED:
+            yield f"ranges err by {100 * noise:.0f} cm (give the laser less noise)"
         start = world.nearest(world.start)
-        away = math.dist(start.pose[:2], world.start[:2]) if start else 0.0
-        off = _off_axis(world)
-        causes = (
-            (
-                half < math.inf and not fits,
-                f"reach is {world.reach:g} m, and half the width of the street there is {half:.2f} "
-                "m (give that as reach)",
-            ),
-            (
-                is_square and not are_square(world.segments),
-                'walls meet at other than right angles, and the world says "right" (write '
-                '"angles": "any")',
-            ),
-            (
-                body.odometry > NOISY,
-                f"the odometry errs by {100 * body.odometry:.0f} % (give less --set "
-                "odometry_noise)",
-            ),
-            (
-                body.slip > NOISY,
-                f"a motion errs by {100 * body.slip:.0f} % (give the body less slip)",
-            ),
-            (
-                abs(body.bend) > math.radians(2),
-                f"the odometry bends by {math.degrees(body.bend):.1f} degrees in each metre (give "
-                "less --set bend_error)",
-            ),
-            (
-                noise > BLURRED,
-                f"ranges err by {100 * noise:.0f} cm (give the laser less noise)",
-            ),
-            (
-                away > self._near,
-                f"the start is {away:.1f} m off the nearest dstate of the world, "
-                f"{start.name if start else ''} (move the start)",
-            ),
-            (
-                is_square and off > FACING / 2,
-                f"the start heads {math.degrees(off):.0f} degrees off the walls (turn the start)",
-            ),
-        )
-        found = "; or ".join(text for applies, text in causes if applies)
-        return f". Likely cause: {found}" if found else ""
+        if start and (away := math.dist(start.pose[:2], world.start[:2])) > self._near:
+            off = f"{away:.1f} m off the nearest dstate of the world, {start.name}"
+            yield f"the start is {off} (move the start)"
+        # The smallest angle between the start and the longest wall, or a wall at a right angle.
+        ways = world.segments[:, 2:] - world.segments[:, :2]
+        x, y = ways[int(np.hypot(*ways.T).argmax())]
+        off_axis = abs(math.remainder(world.start[2] - math.atan2(y, x), math.pi / 2))
+        if is_square and off_axis > FACING / 2:
+            turned = f"{math.degrees(off_axis):.0f} degrees off the walls"
+            yield f"the start heads {turned} (turn the start)"
 
     def _half_width(self, before: Pose) -> float:
         """Half the width of the street in metres, without clutter; infinite without walls.
@@ -515,13 +499,6 @@ class DriveWatch:
         middle = np.append((np.array(before[:2]) + self.driver.robot.pose[:2]) / 2, 0.0)
         ranges = meetings(self.world.segments, middle[None], angles).min(2)[0]
         return float((ranges[:180] + ranges[180:]).min()) / 2
-
-
-def _off_axis(world: World) -> float:
-    """The smallest angle between the start heading and right-angled walls, in radians."""
-    ways = world.segments[:, 2:] - world.segments[:, :2]
-    longest = ways[int(np.hypot(*ways.T).argmax())]
-    return abs(math.remainder(world.start[2] - math.atan2(longest[1], longest[0]), math.pi / 2))
 
 
 def _at(what: str, pose: Sequence[float]) -> str:

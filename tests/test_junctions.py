@@ -17,7 +17,7 @@ from streets import drawn
 
 from simulator.driver import Driver
 from simulator.errors import SimulatorError
-from simulator.junctions import Panorama, Pilot, Place, compass
+from simulator.junctions import Pilot, Place, compass, panorama
 from simulator.robot import BEARINGS, Body, Laser, SimulatedRobot
 from simulator.tours import simulate
 from simulator.world import World
@@ -130,12 +130,13 @@ def test_compass_measures_a_turn_to_half_a_degree(
 def test_panorama_of_noisy_images_equals_exact_ranges() -> None:
     """Images of a turning robot, with noise, and with turns that are off by 3 %."""
     rng, pose = np.random.default_rng(0), (0.1, 0.2, 0.5)
-    panorama = Panorama(Laser().scan(FIVE, np.array([pose]), rng)[0])
-    for k in range(1, 25):
+    images = []
+    for k in range(25):
         image = Laser().scan(FIVE, np.array([(*pose[:2], pose[2] + math.radians(15 * k))]), rng)[0]
-        panorama.add(image, math.radians(15.45))
-    assert panorama.headings[-1] == pytest.approx(math.tau, abs=math.radians(0.5))
-    assert np.median(np.abs(panorama.ranges - exact_panorama(FIVE, pose))) < 0.01
+        images.append((math.radians(15.45), image))
+    ranges, heading = panorama(images)
+    assert heading == pytest.approx(math.tau, abs=math.radians(0.5))
+    assert np.median(np.abs(ranges - exact_panorama(FIVE, pose))) < 0.01
 
 
 # --- control laws

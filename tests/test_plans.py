@@ -311,11 +311,14 @@ def test_true_map_with_close_doors_satisfies_the_axioms(tmp_path: Path, seed: in
     ("text", "message"),
     [
         ("", "expected a plan in XML, got something else"),
-        ("<building/>", "scale/represented_distance: expected a number, got none; mend it"),
+        (
+            "<building/>",
+            "scale/represented_distance: expected a number of at most 1,000,000, got none; mend it",
+        ),
         (xml(unit="ell"), "scale/real_distance/um: expected m or cm or mm, got 'ell'; mend it"),
         (
             xml().replace('x="50" y="50"', 'x="left" y="50"'),
-            r"space\[0\]\.centroid\.x: expected a number, got 'left'; mend it",
+            r"space\[0\]\.centroid\.x: expected a number of at most 1,000,000, got 'left'; mend it",
         ),
         (
             xml().replace("<id>a</id>", "<id>z</id>", 1),
