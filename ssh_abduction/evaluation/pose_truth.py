@@ -320,21 +320,25 @@ def _verdicts(
     )
     places = np.full((len(at), len(at)), UNKNOWN, np.uint8)
     dstates = np.full((len(visit), len(visit)), UNKNOWN, np.uint8)
+
+    def judged(step: int, others: Any) -> tuple[Verdicts, Array]:
+        """Judge pairs of a step and others: UNKNOWN, APART, or near. Return also the headings."""
+        distance, heading, doubt = (values[others] for values in truth.seen_from(step))
+        verdicts = np.where(distance > near, APART, STAYED).astype(np.uint8)
+        verdicts[~(np.abs(distance - near) >= doubt)] = UNKNOWN
+        return verdicts, heading
+
     for v, first in enumerate(at):
-        distance, _, doubt = truth.seen_from(first)
-        far, unknown = distance[at] > near, ~(np.abs(distance[at] - near) >= doubt[at])
+        row = judged(first, at)[0]
         # For each later visit, whether the robot was away at some visit before it.
-        left = np.cumsum((far & ~unknown)[v:-1]) > 0
-        places[v, v + 1 :] = np.where(unknown, UNKNOWN, np.where(far, APART, STAYED))[v + 1 :]
-        places[v, v + 1 :][left & (places[v, v + 1 :] == STAYED)] = RETURN
+        left = np.cumsum(row[v:-1] == APART) > 0
+        places[v, v + 1 :] = np.where(left & (row[v + 1 :] == STAYED), RETURN, row[v + 1 :])
         later = visit > v
         for step in steps[visit == v]:
-            distance, heading, doubt = (values[later] for values in truth.seen_from(step))
-            far, unknown = distance > near, ~(np.abs(distance - near) >= doubt)
-            returned = np.where(
-                left[visit[later] - v - 1], np.where(heading <= turned, RETURN, APART), STAYED
-            )
-            dstates[step, later] = np.where(unknown, UNKNOWN, np.where(far, APART, returned))
+            row, heading = judged(step, later)
+            returned = np.where(heading <= turned, RETURN, APART)
+            is_back = left[visit[later] - v - 1] & (row == STAYED)
+            dstates[step, later] = np.where(is_back, returned, row)
     return places, dstates
 
 

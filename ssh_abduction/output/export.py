@@ -105,10 +105,12 @@ def export_map(
         return nav2(roads, name, frame) if to == "nav2" else tmap2(roads, name, frame)
     if level == "places":
         graph = _graph_of_places(ssh_map, to, turns)
-    elif to == "networkx-json":
-        graph = to_networkx(ssh_map)
+    elif to == "dot":
+        return to_dot(ssh_map)
+    elif to == "graphml":
+        return to_graphml(ssh_map)
     else:
-        return to_dot(ssh_map) if to == "dot" else to_graphml(ssh_map)
+        graph = to_networkx(ssh_map)
     if to == "networkx-json":
         return json_line(nx.node_link_data(graph, edges="edges"))
     return "\n".join(nx.generate_graphml(graph))
@@ -188,44 +190,37 @@ def nav2(roads: Roads, name: str, frame: str) -> str:
     # All ids must differ, so the ids of edges follow those of nodes.
     first = max(stop.id for stop in roads.stops) + 1
     at = {stop.id: [round(stop.x, DIGITS), round(stop.y, DIGITS)] for stop in roads.stops}
-    nodes = [_feature("Point", at[stop.id], _point(stop, roads, frame)) for stop in roads.stops]
-    edges = [
-        _feature("LineString", [at[r.start], at[r.end]], _way(r, first + i))
-        for i, r in enumerate(roads.roads)
-    ]
-    return json_line({"type": "FeatureCollection", "name": name, "features": nodes + edges})
+    features = []
+    for stop in roads.stops:
+        metadata = {
+            "level": roads.level,
+            "metric": roads.metric,
+            **stop.properties,
+            "heading": round(stop.heading, DIGITS),
+            **only_known(floor=stop.floor, name=stop.name),
+        }
+        node = {"id": stop.id, "frame": frame, "metadata": metadata}
+        features.append(_feature("Point", at[stop.id], node))
+    for number, road in enumerate(roads.roads, first):
+        # Nav2 reads no null, so leave out what is unknown.
+        way = {"action": road.action, "path": road.path, "direction": road.direction}
+        edge = {
+            "id": number,
+            "startid": road.start,
+            "endid": road.end,
+            "cost": round(road.cost, DIGITS),
+            "metadata": {
+                "travelled": road.action is not None,
+                **only_known(**way, path_name=road.name),
+            },
+        }
+        features.append(_feature("LineString", [at[road.start], at[road.end]], edge))
+    return json_line({"type": "FeatureCollection", "name": name, "features": features})
 
 
 def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "type": "Feature",
-        "properties": properties,
-        "geometry": {"type": kind, "coordinates": coordinates},
-    }
-
-
-def _point(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
-    metadata = {
-        "level": roads.level,
-        "metric": roads.metric,
-        **stop.properties,
-        "heading": round(stop.heading, DIGITS),
-        **only_known(floor=stop.floor, name=stop.name),
-    }
-    return {"id": stop.id, "frame": frame, "metadata": metadata}
-
-
-def _way(road: Road, number: int) -> dict[str, Any]:
-    """Make an edge. Its metadata leave out what is unknown, as Nav2 reads no null."""
-    way = {"action": road.action, "path": road.path, "direction": road.direction}
-    metadata = {"travelled": road.action is not None, **only_known(**way, path_name=road.name)}
-    return {
-        "id": number,
-        "startid": road.start,
-        "endid": road.end,
-        "cost": round(road.cost, DIGITS),
-        "metadata": metadata,
-    }
+    geometry = {"type": kind, "coordinates": coordinates}
+    return {"type": "Feature", "properties": properties, "geometry": geometry}
 
 
 def tmap2(roads: Roads, name: str, frame: str) -> str:
@@ -256,7 +251,17 @@ def tmap2(roads: Roads, name: str, frame: str) -> str:
             "child": "topo_map",
             "parent": frame,
         },
-        "actions": {ACTION: _action()},
+        # The later version looks up the action of an edge here.
+        "actions": {
+            ACTION: {
+                "action_type": f"nav2_msgs.action.{ACTION}",
+                "action_server": "/navigate_to_pose",
+                "composable": False,
+                "action_goal_template": {
+                    "pose": {"header": {"frame_id": "${node.nav_frame}"}, "pose": "${node.pose}"}
+                },
+            }
+        },
         "nodes": [
             _node(stop, leaving[stop.id], names, name, frame, FACING[roads.level])
             for stop in roads.stops
@@ -264,18 +269,6 @@ def tmap2(roads: Roads, name: str, frame: str) -> str:
     }
     text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=2**16)
     return text
-
-
-def _action() -> dict[str, Any]:
-    """Describe the action of all edges, for the later version, which looks it up in the map."""
-    return {
-        "action_type": f"nav2_msgs.action.{ACTION}",
-        "action_server": "/navigate_to_pose",
-        "composable": False,
-        "action_goal_template": {
-            "pose": {"header": {"frame_id": "${node.nav_frame}"}, "pose": "${node.pose}"}
-        },
-    }
 
 
 def _node(

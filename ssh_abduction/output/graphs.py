@@ -61,17 +61,13 @@ def to_networkx(
     checked_map(ssh_map)
     one_of("level", level, LEVELS, MapError)
     degrees_of(turns)
-    graph: nx.Graph[Any]
-    place_of: dict[Any, int | None]
     if level == "causal":
-        graph = _causal(ssh_map)
-        place_of = {s.id: s.place for s in ssh_map.dstates}
+        graph: nx.Graph[Any] = _causal(ssh_map)
+        place_of: dict[Any, int | None] = {s.id: s.place for s in ssh_map.dstates}
     elif level == "places":
-        graph = _places(ssh_map, turns)
-        place_of = {p: p for p in ssh_map.places}
+        graph, place_of = _places(ssh_map, turns), {p: p for p in ssh_map.places}
     else:
-        graph = _topological(ssh_map)
-        place_of = {("place", p): p for p in ssh_map.places}
+        graph, place_of = _topological(ssh_map), {("place", p): p for p in ssh_map.places}
     if ssh_map.regions is not None:
         graph.graph["regions"] = [
             region.to_dict() | only_known(name=ssh_map.name_of("region", region.id))
@@ -162,7 +158,7 @@ def _topological(ssh_map: SSHMap) -> nx.Graph[Any]:
 
 def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
     """Make the graph of places, with an edge for each pair of neighbours on a path."""
-    from ssh_abduction.output.layout import layout, travelled  # loads scipy
+    from ssh_abduction.output.layout import layout, neighbours, travelled  # loads scipy
 
     found = layout(ssh_map, turns)
     graph: nx.MultiGraph[Any] = nx.MultiGraph(metric=found.metric)
@@ -180,11 +176,7 @@ def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
             graph.add_edge(p, q, key=path.id, path=path.id, order=index, travelled=went, **more)
     if not ssh_map.paths:
         at = [s.place for s in ssh_map.dstates]
-        ends = [(at[s], at[x]) for s, _, x in ssh_map.links]
-        pairs = {
-            (min(a, b), max(a, b)) for a, b in ends if a is not None and b is not None and a != b
-        }
-        for p, q in sorted(pairs):
+        for p, q in neighbours((at[s], at[x]) for s, _, x in ssh_map.links):
             metres = math.dist(found.places[p], found.places[q]) if found.metric else None
             graph.add_edge(p, q, travelled=True, **only_known(metres=metres))
     return graph

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 from typing import Any, NamedTuple, TypeAlias
@@ -221,15 +221,13 @@ def _floor_by_floor(ssh_map: SSHMap, found: Layout) -> Layout:
     spots = {i: (x, y) for i, (x, y, _) in enumerate(found.dstates)}
     moves = _moves_of(ssh_map.floors, spots, GAP)
     of_place = {s.place: moves[s.id] for s in ssh_map.dstates}
-    places = {
-        p: (x + of_place[p][0], y + of_place[p][1]) if p in of_place else (x, y)
-        for p, (x, y) in found.places.items()
-    }
-    dstates = tuple(
-        (x + moves[i][0], y + moves[i][1], heading)
-        for i, (x, y, heading) in enumerate(found.dstates)
-    )
+    places = {p: _sum(at, of_place.get(p, (0.0, 0.0))) for p, at in found.places.items()}
+    dstates = tuple((*_sum(spots[i], moves[i]), s[2]) for i, s in enumerate(found.dstates))
     return replace(found, places=places, dstates=dstates)
+
+
+def _sum(one: Point, other: Point) -> Point:
+    return one[0] + other[0], one[1] + other[1]
 
 
 def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
@@ -238,7 +236,11 @@ def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
     In each pair, the place with the lower id comes first.
     """
     ends = [(ssh_map.dstates[s], ssh_map.dstates[x]) for s, _, x in ssh_map.links]
-    pairs = {(a.place, b.place) for a, b in ends if a.path == b.path == path.id}
+    return neighbours((a.place, b.place) for a, b in ends if a.path == b.path == path.id)
+
+
+def neighbours(pairs: Iterable[tuple[int | None, int | None]]) -> list[tuple[int, int]]:
+    """Sort the pairs of two different known places, without duplicates, the lower id first."""
     return sorted(
         {(min(p, q), max(p, q)) for p, q in pairs if p is not None and q is not None and p != q}
     )

@@ -28,7 +28,7 @@ from ssh_abduction.data.map_parts import Region, course_named, list_in_words
 from ssh_abduction.data.maps import DState, MapPath, SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import noun_of
-from ssh_abduction.output.layout import Layout, Turns, layout, travelled, untravelled
+from ssh_abduction.output.layout import Layout, Turns, layout, neighbours, travelled, untravelled
 
 Point: TypeAlias = tuple[float, float]
 
@@ -330,13 +330,10 @@ class _Drawing:
 
     def edges(self) -> list[Mark]:
         """Draw a line between two places if an action leads from one to the other."""
-        site = [s.site for s in self.map.dstates]
-        pairs = {
-            tuple(sorted((site[s], site[x])))
-            for s, _, x in self.map.links
-            if self.map.dstates[s].floor == self.map.dstates[x].floor
-        }
-        return [self.broad(p, q, COLOURS[0]) for p, q in sorted(pairs) if p != q]
+        at = self.map.dstates
+        ends = [(at[s], at[x]) for s, _, x in self.map.links]
+        pairs = neighbours((s.site, x.site) for s, x in ends if s.floor == x.floor)
+        return [self.broad(p, q, COLOURS[0]) for p, q in pairs]
 
     def broad(self, p: int, q: int, colour: str) -> Line:
         """Draw a broad line between two sites, where the robot travelled."""
@@ -497,18 +494,12 @@ class _Drawing:
 
     def floor_labels(self) -> list[Mark]:
         """Draw the names of floors above their dstates on the left."""
-        return [
-            Label(
-                (
-                    min(self.at[s][0] for s in members),
-                    max(self.at[s][1] for s in members) + FLOOR / self.scale,
-                ),
-                f"floor {i}",
-                size=16,
-                is_bold=True,
-            )
-            for i, members in enumerate(self.map.floors)
-        ]
+        labels: list[Mark] = []
+        for i, members in enumerate(self.map.floors):
+            xs, ys = zip(*(self.at[s][:2] for s in members), strict=True)
+            above = min(xs), max(ys) + FLOOR / self.scale
+            labels.append(Label(above, f"floor {i}", size=16, is_bold=True))
+        return labels
 
     def scale_bar(self, marks: Sequence[Mark]) -> list[Mark]:
         """Draw a scale bar of 1, 2 or 5 times a power of ten metres, below the map on the left."""
@@ -545,12 +536,7 @@ def streets_in(ssh_map: SSHMap, region: Region) -> list[tuple[int, int]]:
     place = [s.place for s in ssh_map.dstates]
     pairs = [(place[s], place[x]) for s, _, x in ssh_map.links]
     pairs += [ends for path in ssh_map.paths for ends in pairwise(path.order)]
-    inside = {
-        (min(p, q), max(p, q))
-        for p, q in pairs
-        if p in region.places and q in region.places and p is not None and q is not None and p != q
-    }
-    return sorted(inside)
+    return neighbours(ends for ends in pairs if {*ends} <= {*region.places})
 
 
 def place_title(ssh_map: SSHMap, place: int) -> str:
