@@ -36,7 +36,7 @@ from ssh_abduction.checker.reading import Check, Found, Reading, course_of, head
 from ssh_abduction.checker.sides import is_pair
 from ssh_abduction.checker.topological import bearing_changes, slot_changes
 from ssh_abduction.data.groups import firsts
-from ssh_abduction.data.maps import Fault, SSHMap, checked_map
+from ssh_abduction.data.maps import FAULTS, Fault, SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import SHORT_TURN, look_at_clock
 from ssh_abduction.theory import encodings
@@ -304,14 +304,7 @@ def _key(fault: Fault) -> tuple[object, ...]:
 
 def _is_allowed(m: Reading, kind: str) -> bool:
     """Tell whether the theory has a price for faults of this kind."""
-    prices = {
-        "misread": m.theory.misread,
-        "misseen": m.theory.misread,
-        "slipped": m.theory.slipped,
-        "jumped": m.theory.jumped,
-        "changed": m.theory.changed,
-    }
-    return bool(prices.get(kind))
+    return kind in FAULTS and bool(getattr(m.theory, "misread" if kind == "misseen" else kind))
 
 
 def _what_is_wrong(m: Reading, fault: Fault) -> str | None:

@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from ssh_abduction.checker.reading import Found, MapLink, Reading, heading_of
 from ssh_abduction.checker.topological import stars_of
-from ssh_abduction.data.groups import minimal_part, parts, reached
+from ssh_abduction.data.groups import NodeClasses, minimal_part, parts, reached
 from ssh_abduction.data.odometry import Closure, Odometry, match_in_words
 from ssh_abduction.data.star import Openings, Star
 from ssh_abduction.data.step import QUARTERS
@@ -432,16 +432,14 @@ class Edges:
         A turn around faces what was behind. A gateway leads to one gateway, so if two arms are one,
         the arms at their far ends are one. None if a gateway leads to two places.
         """
-        one = {(s, side): (s, side) for s in self.place_of for side in (1, -1)}
+        one = NodeClasses[Arm]()
 
         def join(first: Arm, second: Arm) -> bool:
-            changed = False
+            """Join two arms, and the arms behind them. Return whether they were not one yet."""
+            is_new = not one.are_one(first, second)
             for turned in (1, -1):
-                old, new = one[first[0], turned * first[1]], one[second[0], turned * second[1]]
-                if old != new:
-                    changed = True
-                    one.update({arm: new for arm, gateway in one.items() if gateway == old})
-            return changed
+                one.merge((first[0], turned * first[1]), (second[0], turned * second[1]))
+            return is_new
 
         for s, turn, t in self.turns:
             if turn == "around":
@@ -453,11 +451,11 @@ class Edges:
             beyond: dict[Arm, Arm] = {}
             for s, t in self.travels:
                 for here, there in (((s, 1), (t, -1)), ((t, -1), (s, 1))):
-                    other = beyond.setdefault(one[here], there)
+                    other = beyond.setdefault(one.of(here), there)
                     if self.place_of[other[0]] != self.place_of[there[0]]:
                         return None
                     changed = join(other, there) or changed
-        return one
+        return {(s, side): one.of((s, side)) for s in self.place_of for side in (1, -1)}
 
     def _some_option_draws(self, options: list[list[Option]]) -> bool:
         """Tell whether one option can be chosen for each place so that they make a drawing.

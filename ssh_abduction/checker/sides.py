@@ -54,29 +54,9 @@ class RightBranch:
         return f"ahead on {course_named(self.branch)}, which {where} by {self.turn}"
 
 
-@dataclass(frozen=True)
-class Conflict:
-    """A contradiction between the sides on which a place lies and another axiom.
-
-    Attributes:
-        axiom: The name of the contradicted axiom.
-        branches: The branches that put the place on its sides.
-        steps: The steps that show the contradiction.
-        message: A sentence that describes it.
-    """
-
-    axiom: str
-    branches: tuple[RightBranch, ...]
-    steps: tuple[int, ...]
-    message: str
-
-    @property
-    def axioms(self) -> set[str]:
-        """Names of the axioms that take part in the contradiction."""
-        mirrored = {"symmetric_sides"} if any(b.mirrored for b in self.branches) else set()
-        return {self.axiom, "branch_side", "side_of_branch"} | mirrored
-
-
+# A contradiction between the sides on which a place lies and another axiom: the names of all axioms
+# that take part, the steps that show it, and a sentence.
+_Conflict: TypeAlias = tuple[set[str], tuple[int, ...], str]
 # For each course, the places to its right, each with the branch that leads to it. Places to the
 # left of a course are to the right of the opposite course.
 _Right = Mapping[Course, Mapping[int, RightBranch]]
@@ -129,14 +109,14 @@ def _ahead(m: Reading, place: int, course: Course) -> Iterable[int]:
     return m.orders[path].after(place, direction) if path in m.orders else ()
 
 
-def _conflicts(m: Reading) -> list[Conflict]:
+def _conflicts(m: Reading) -> list[_Conflict]:
     """Find the places whose sides contradict another axiom."""
     right = branches_right_of(m, partial(_ahead, m))
     disjoint = _both_sides(m, right) if "sides_disjoint" in m.axioms else ()
     return [*disjoint, *(_on_and_beside(m, right) if "path_between_sides" in m.axioms else ())]
 
 
-def _both_sides(m: Reading, right: _Right) -> Iterator[Conflict]:
+def _both_sides(m: Reading, right: _Right) -> Iterator[_Conflict]:
     """Find the places both to the right and to the left of a path."""
     for (h, direction), places in right.items():
         other = right.get((h, -direction), {}) if direction == 1 else {}
@@ -144,10 +124,10 @@ def _both_sides(m: Reading, right: _Right) -> Iterator[Conflict]:
             b, c = places[q], other[q]
             steps = (*b.turn.steps, *c.turn.steps, *m.steps_at(q))
             message = f"Place {q} would lie both right and left of path {h}: it is {b}, and {c}."
-            yield Conflict("sides_disjoint", (b, c), steps, message)
+            yield _axioms("sides_disjoint", b, c), steps, message
 
 
-def _on_and_beside(m: Reading, right: _Right) -> Iterator[Conflict]:
+def _on_and_beside(m: Reading, right: _Right) -> Iterator[_Conflict]:
     """Find the places both on a path and beside it."""
     for (h, _direction), places in right.items():
         for q in places.keys() & m.on(h):
@@ -155,7 +135,13 @@ def _on_and_beside(m: Reading, right: _Right) -> Iterator[Conflict]:
             there = [m.along[h][q]] if q in m.along.get(h, ()) else []
             steps = (*b.turn.steps, *m.steps_at(q), *m.steps_of(*there))
             message = f"Place {q} is on path {h} and would lie beside it: it is {b}."
-            yield Conflict("path_between_sides", (b,), steps, message)
+            yield _axioms("path_between_sides", b), steps, message
+
+
+def _axioms(contradicted: str, *branches: RightBranch) -> set[str]:
+    """Name the axioms that take part in a contradiction."""
+    mirrored = {"symmetric_sides"} if any(b.mirrored for b in branches) else set()
+    return {contradicted, "branch_side", "side_of_branch"} | mirrored
 
 
 def is_pair(pair: object) -> bool:
@@ -165,9 +151,9 @@ def is_pair(pair: object) -> bool:
 
 def _sides(name: str, m: Reading) -> Found:
     """Check the axiom `name` about sides: yield the conflicts in which it takes part."""
-    for conflict in m.once(_conflicts):
-        if name in conflict.axioms:
-            yield conflict.steps, conflict.message
+    for axioms, steps, message in m.once(_conflicts):
+        if name in axioms:
+            yield steps, message
 
 
 branch_side = partial(_sides, "branch_side")
