@@ -407,10 +407,16 @@ def test_search_without_a_limit_continues_until_it_has_a_map(
     ],
 )
 def test_ladder_takes_a_quarter_of_the_limit(
-    limit: float, rung: float, runs: Path, hall: Path, monkeypatch: pytest.MonkeyPatch
+    limit: float,
+    rung: float,
+    runs: Path,
+    hall: Path,
+    imported_hall: Imported,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """There are four rungs, each with at least one unit of work and at most ten."""
     found, asked = Solution.load(runs / "hall" / "maps.json"), list[float]()
+    monkeypatch.setattr(log_maps, "import_log", lambda *_: imported_hall)
     monkeypatch.setattr(LogMapping, "solve", lambda *args, **given: found)
     monkeypatch.setattr(
         log_maps, "ladder", lambda *args, **given: asked.append(given["work_limit"]) or []

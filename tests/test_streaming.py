@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tracemalloc
 from collections.abc import Iterator
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from perception.errors import LogError
 from perception.places.distinctive import DELAY, Visit, find_visits
 from perception.places.following import follow
 from perception.places.importing import stream_visits
+from perception.places.track import Track
 from perception.readers.scans import Damage, LaserScanner, RobotLog, Scan
 from simulator.robot import meetings
 
@@ -22,13 +24,16 @@ ROOM = [(0, 0, 6, 0), (0, 0, 0, 5), (0, 5, 2.4, 5), (3.6, 5, 6, 5), (6, 0, 6, 5)
 ROOM += [(2.4, 5, 2.4, 12), (3.6, 5, 3.6, 12), (2.4, 12, 3.6, 12)]
 ROUND = [(1, 1), (5, 1), (5, 4), (1, 4)]
 DRIVES = {
-    "fork": (FORK, [(1, 0), (18, 0), (10, 0), (10, 8)]),
+    "fork": (FORK, [(1, 0), (18, 0), (10, 0), (10, 8), (10, 0), (1, 0)]),
     "rounds in a room": (ROOM, [*ROUND * 3, (3, 4), (3, 11), (3, 4), (5, 1)]),
 }
 
 
-def drive(name: str) -> RobotLog:
-    return log_of(*DRIVES[name])[0]  # type: ignore[arg-type]
+@cache
+def drive(name: str) -> tuple[RobotLog, Track]:
+    """A log, and its track."""
+    log = log_of(*DRIVES[name])[0]  # type: ignore[arg-type]
+    return log, follow(log)
 
 
 def fields(visits: list[Visit]) -> list[tuple[object, ...]]:
@@ -46,15 +51,15 @@ def fields(visits: list[Visit]) -> list[tuple[object, ...]]:
 
 @pytest.mark.parametrize("name", ["fork", pytest.param("rounds in a room", marks=pytest.mark.slow)])
 def test_streamed_visits_equal_those_of_the_whole_log(name: str) -> None:
-    log = drive(name)
+    log, track = drive(name)
     streamed = list(stream_visits(iter(log.scans)))
     assert len(streamed) >= 3
     assert all(visit.patch is not None for visit in streamed)
-    assert fields(streamed) == fields(list(find_visits(log, follow(log))))
+    assert fields(streamed) == fields(list(find_visits(log, track)))
 
 
 def test_visit_is_final_within_the_promised_distance() -> None:
-    log, fed = log_of(FORK, [(1, 0), (18, 0), (10, 0), (10, 8), (10, 0), (1, 0)])[0], 0
+    (log, track), fed = drive("fork"), 0
 
     def scans() -> Iterator[Scan | Damage]:
         nonlocal fed
@@ -63,7 +68,7 @@ def test_visit_is_final_within_the_promised_distance() -> None:
         yield Damage(1, "the end")
         fed = 0
 
-    way = follow(log).way
+    way = track.way
     late = [way[fed] - way[visit.end] for visit in stream_visits(scans()) if fed]
     assert len(late) >= 3
     assert max(late) <= DELAY
