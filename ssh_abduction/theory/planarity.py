@@ -73,16 +73,45 @@ def can_be_drawn(
     place_of = [place for edge in edges for place in edge]
     if not all(allows(place, ()) for place in set(place_of)):
         return False
+    rings = _on_rings(place_of)
     ends_at: dict[Place, list[int]] = {}
-    for end in sorted(end for edge in _on_rings(place_of) for end in (2 * edge, 2 * edge + 1)):
-        ends_at.setdefault(place_of[end], []).append(end)
+    for end, place in enumerate(place_of):
+        if end // 2 in rings:
+            ends_at.setdefault(place, []).append(end)
     orders = {
         place: clockwise_orders(ends, partial(allows, place)) for place, ends in ends_at.items()
     }
+
+    def drawn(before: dict[Place, Ends], place: Place) -> Iterator[dict[Place, Ends]]:
+        """Draw one more place, in each order in which its edges to drawn places do not cross."""
+        found = ({**before, place: order} for order in orders[place])
+        return (more for more in found if is_planar(_between(more, place_of)))
+
     nothing: dict[Place, Ends] = {}
-    return has_way(
-        nothing, range(len(orders)), lambda drawn, _: _one_place_more(drawn, orders, place_of)
-    )
+    return has_way(nothing, _from_near_to_far(ends_at, place_of), drawn)
+
+
+def _from_near_to_far(
+    ends_at: Mapping[Place, Sequence[int]], place_of: Sequence[Place]
+) -> list[Place]:
+    """Sort places so that each has most of its edges to earlier places, if they are connected."""
+    found: dict[Place, None] = {}
+    while len(found) < len(ends_at):
+        near = {
+            place: sum(place_of[end ^ 1] in found for end in ends)
+            for place, ends in ends_at.items()
+            if place not in found
+        }
+        found[max(near, key=lambda place: near[place])] = None
+    return list(found)
+
+
+def _between(drawn: Mapping[Place, Ends], place_of: Sequence[Place]) -> dict[Place, Ends]:
+    """Return the clockwise orders around drawn places, of the ends of edges between them."""
+    return {
+        place: tuple(end for end in ends if place_of[end ^ 1] in drawn)
+        for place, ends in drawn.items()
+    }
 
 
 def _on_rings(place_of: Sequence[Place]) -> set[int]:
@@ -116,77 +145,6 @@ def clockwise_orders(
         )
         orders = [order for order in each_looking(longer) if allows(order)]
     return orders
-
-
-def _one_place_more(
-    drawn: dict[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
-) -> Iterator[dict[Place, Ends]]:
-    """Draw one more place, in each possible way by the clockwise `orders` around it.
-
-    The place is a neighbour of a drawn place. Of all neighbours, it has the fewest possible ways.
-    """
-    near = {
-        place_of[end ^ 1]: None
-        for ends in drawn.values()
-        for end in ends
-        if place_of[end ^ 1] not in drawn
-    }
-    among = near or {place: None for place in orders if place not in drawn}
-    fewest: list[dict[Place, Ends]] | None = None
-    for place in sorted(among, key=lambda place: len(orders[place])):
-        ways = [
-            more
-            for order in orders[place]
-            if _leaves_room(more := {**drawn, place: order}, orders, place_of)
-        ]
-        if fewest is None or len(ways) < len(fewest):
-            fewest = ways
-        if len(fewest) <= 1 or not near:
-            break
-    return iter(fewest or ())
-
-
-def _leaves_room(
-    drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
-) -> bool:
-    """Whether each connected part of the places that are not drawn fits into one face.
-
-    To test this, shrink each such part to one place. Its ends are in the order in which the face
-    meets them.
-    """
-
-    def beside(place: Place) -> Iterator[Place]:
-        others = (place_of[end ^ 1] for end in next(iter(orders[place]), ()))
-        return (other for other in others if other not in drawn)
-
-    pieces = parts((place for place in orders if place not in drawn), beside)
-    part = {place: number for number, piece in enumerate(pieces) for place in piece}
-    following = {
-        end: ends[i - len(ends) + 1] for ends in drawn.values() for i, end in enumerate(ends)
-    }
-    # The ends of each part, in the order in which its face meets them.
-    met: dict[int, list[int]] = {}
-    left = set(following)
-    while left:
-        here = start = left.pop()
-        there: dict[int, list[int]] = {}
-        while True:
-            other = here ^ 1
-            if other not in following:
-                there.setdefault(part[place_of[other]], []).append(other)
-                here = following[here]
-            else:
-                here = following[other]
-            if here == start:
-                break
-            left.remove(here)
-        for number, ends in there.items():
-            if number in met:
-                return False
-            met[number] = ends
-    return is_planar(
-        {**drawn, **{("rest", number): tuple(reversed(ends)) for number, ends in met.items()}}
-    )
 
 
 def has_way(
