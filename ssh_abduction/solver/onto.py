@@ -38,7 +38,6 @@ from ssh_abduction.data.groups import first_index_of, firsts, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.step import Action, Step
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.data.words import counted
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.limits import EARLY, LimitError, Stop, Watch
 from ssh_abduction.solver.board import Judging
@@ -49,7 +48,7 @@ from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_
 from ssh_abduction.solver.schedule import turn
 from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.solution.result import Solution
-from ssh_abduction.solver.solution.weighed import IMPROBABLE, Weighed
+from ssh_abduction.solver.solution.weighed import IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE
 from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond
@@ -149,15 +148,14 @@ def solve_onto(
     # 4. The minimal maps of this trace that keep the old map.
     pinned = _pinned(theory, digest, ssh_map)
     found = solving.solve(part, pinned, tuple(_sketched(digest, ssh_map, part, in_use)))
-    kept = [m for m in found.maps if not any(_broken(m.dstate_at, _places_in(m), digest, ssh_map))]
 
     # 5. Their labels for all steps of all drives.
-    labelled = (replace(m, dstate_at=digest.labels_of_all(m, ssh_map)) for m in kept)
+    labelled = (replace(m, dstate_at=digest.labels_of_all(m, ssh_map)) for m in found.maps)
     maps = tuple(_begun(m, joint, in_use) for m in labelled)
     if not maps and found.stopped in _LIMITS and (grown := _grown(ssh_map, old, problem)):
         found, maps = replace(found, status=Status.FEASIBLE, cost=Cost.of(grown)), (grown,)
     if not maps:
-        raise _contradiction(old, trace, ssh_map, digest, found)
+        raise _contradiction(trace, found)
     assert found.cost is not None
     return replace(
         found,
@@ -175,7 +173,7 @@ def solve_onto(
         trace=joint,
         support=Support(
             warnings=found.support.warnings,
-            weighed=None if short or not kept else _weighed(found, digest, ssh_map),
+            weighed=None if short or not found.maps else _weighed(found, pinned),
             onto=tuple(drive.name for drive in drives_of(old)),
         ),
     )
@@ -298,72 +296,36 @@ def _pinned(theory: Theory, digest: Digest, ssh_map: SSHMap) -> Theory:
     return theory.replace(**moved)
 
 
-def _places_in(found: SSHMap) -> list[int | None]:
-    """Return the place of each step of a map."""
-    return [found.dstates[s].place for s in found.dstate_at]
-
-
-def _broken(
-    dstates: Sequence[int], places: Sequence[int | None], digest: Digest, ssh_map: SSHMap
-) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Find what a map of a digest and a new drive changes in the existing map.
-
-    The map is given by the dstate and the place of each step. Returns pairs of dstates of the
-    existing map that are merged, and pairs of dstates whose places are merged or split. A dstate
-    that is split is paired with itself.
-    """
-    number: dict[int, int] = {}
-    place: dict[int, int | None] = {}
-    split = set[tuple[int, int]]()
-    for s, x, p in zip(digest.labels, dstates, places, strict=False):
-        place.setdefault(s, p)
-        if number.setdefault(s, x) != x:
-            split.add((s, s))
-    pairs = [pair for pair in combinations(number, 2) if digest.must_differ(*pair)]
-    merged = {(s, x) for s, x in pairs if number[s] == number[x]}
-    moved = {
-        (s, x)
-        for s, x in pairs
-        if (ssh_map.dstates[s].place == ssh_map.dstates[x].place) != (place[s] == place[x])
-        and ssh_map.dstates[s].place is not None
-    }
-    return sorted(split | merged), sorted(moved)
-
-
-def _weighed(found: Solution, digest: Digest, ssh_map: SSHMap) -> Weighed | None:
-    """Return the costs of the maps found, with the rivals that keep the existing map."""
+def _weighed(found: Solution, pinned: Theory) -> Weighed | None:
+    """Return the costs of the maps found, with the rivals that satisfy all assertions."""
     if found.weighed is None:
         return None
-    rivals = tuple(
-        rival
-        for rival in found.weighed.rivals
-        if not any(_broken(rival.dstates, rival.places or rival.dstates, digest, ssh_map))
-    )
+    rivals = tuple(rival for rival in found.weighed.rivals if _obeys(rival, pinned))
     return replace(found.weighed, rivals=rivals) if rivals else None
 
 
-def _contradiction(
-    old: Trace, trace: Trace, ssh_map: SSHMap, digest: Digest, found: Solution
-) -> SolverError:
-    """Make the error that says what contradicts the existing map, and what to do."""
+def _obeys(rival: Rival, theory: Theory) -> bool:
+    """Whether a rival, which may be estimated, satisfies what a theory asserts."""
+    return all(
+        (at[i] == at[j]) == kind.startswith("same")
+        for kind in ASSERTIONS
+        for at in [rival.dstates if kind in ("same", "different") else rival.at]
+        for i, j in getattr(theory, kind)
+        if max(i, j) < len(at)
+    )
+
+
+def _contradiction(trace: Trace, found: Solution) -> SolverError:
+    """Make the error that says that new drives contradict the existing map, and what to do."""
     new = ", ".join(drive.name for drive in drives_of(trace))
     if found.stopped in _LIMITS:
         return SolverError(
             f"onto: expected a map that keeps the existing one, found none for {new} before the "
             f"search ended ({found.stopped}); give it more time or memory"
         )
-    reason, parts = "no map keeps the existing map", []
-    if found.maps:
-        best, first = found.maps[0], first_index_of(ssh_map.dstate_at)
-        dstates, places = _broken(best.dstate_at, _places_in(best), digest, ssh_map)
-        steps = [[step_name(drives_of(old), first[s]) for s in pair] for pair in places[:3]]
-        parts += [counted(len(dstates), "dstates")] if dstates else []
-        parts += [f"the places of {', '.join(map(' and '.join, steps))}"] if steps else []
-        size = counted(len(best.dstates), "dstates")
-        reason = f"the best map found, of {size}, changes {' and '.join(parts)}"
     return SolverError(
-        f"onto: expected a drive that agrees with the existing map, got {new}: {reason}; solve all "
-        "drives together (solve --together)"
+        f"onto: expected a drive that agrees with the existing map, got {new}: no map keeps the "
+        "existing map; solve all drives together (solve --together)"
     )
 
 
