@@ -100,7 +100,7 @@ def main() -> None:
     end_after(AROUND)
     if not outcome:
         outcome = (
-            {**of_solution(answer, trace, theory), **asdict(search.grounding)}
+            {**of_solution(answer, trace, theory), **asdict(answer.effort.grounding)}
             if tool.startswith(OURS)
             else of_machine(answer, trace, PEERS[tool].proves)
         )

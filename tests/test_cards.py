@@ -39,11 +39,7 @@ def test_card_of_a_solution_shows_its_first_map_and_backbone() -> None:
     assert "optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps" in text
     assert solution.summary in text
     assert len(list(tree.iter(f"{SVG}svg"))) == 1
-    assert rows(tree)[:3] == [
-        ["map", "dstates", "places", "paths"],
-        ["1", "19", "10", "4"],
-        ["2", "19", "10", "4"],
-    ]
+    assert "4 maps; the first is shown below" in text
     assert len(solution._repr_html_()) < 60_000
 
 

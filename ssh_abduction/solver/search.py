@@ -205,16 +205,6 @@ class Search:
         """The backbone: what the minimal maps known so far share; None if none is known."""
         return self.parts.rivals.backbone
 
-    @property
-    def prefix(self) -> int:
-        """The number of first steps of the trace that were given to clingo."""
-        return self.parts.engine.size
-
-    @property
-    def grounding(self) -> Grounding:
-        """The numbers of rules and atoms of the ground program that clingo solved last."""
-        return self.parts.engine.asker.grounding
-
     def __iter__(self) -> Iterator[SSHMap]:
         from ssh_abduction.solver.derived_regions import (
             Deriving,  # after the search, which needs none

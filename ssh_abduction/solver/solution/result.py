@@ -114,8 +114,7 @@ class Solution(MapSequence):
             sentences += [f"warning: {warning}" for warning in self.warnings]
         parts = [cards.paragraph(sentence) for sentence in sentences]
         if self.count > 1:
-            title = f"{counted(self.count, 'maps')}; the first is shown below"
-            parts.append(cards.folded(title, table_of_maps(self)))
+            parts.append(cards.paragraph(f"{self.count} maps; the first is shown below"))
         if self.maps:
             parts.append(cards.map_card(self.maps[0]))
         elif self.partial is not None:
@@ -569,18 +568,3 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
     said = {name: value for name, value in more.items() if value or value == []}
     plain_data: dict[str, Any] = plain(end | said)
     return plain_data
-
-
-def table_of_maps(solution: Solution) -> str:
-    """Return an HTML table with a row for each map: its counts, and perhaps its chi-square."""
-    costs = solution.costs
-    chi2 = [ssh_map.fit.chi2 if ssh_map.fit else None for ssh_map in solution.maps]
-    columns: dict[str, list[object]] = {"map": [*range(1, solution.count + 1)]}
-    columns |= {
-        name: [getattr(cost, name) for cost in costs]
-        for name in ("dstates", "places", "paths", "excuses", "faults")
-    }
-    columns |= {"chi-square": ["" if chi is None else f"{chi:.1f}" for chi in chi2]}
-    # Columns of zeros are left out.
-    shown = {name: column for name, column in columns.items() if any(column)}
-    return cards.html_table([*shown], zip(*shown.values(), strict=True), "maps")
