@@ -16,7 +16,7 @@ from strategies import TOYS, theories, traces
 from ssh_abduction import SSHMap, Theory, Trace, check, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, Odometry, TraceError
-from ssh_abduction.explain.axioms import Axioms, Piece
+from ssh_abduction.explain.axioms import Axioms, Piece, active_at
 from ssh_abduction.explain.no_map import explain_trace
 from ssh_abduction.explain.pair_reasons import explain_pair
 from ssh_abduction.explain.verdict import Derivation, Link, PairExplanation, Side, Verdict
@@ -49,7 +49,7 @@ def map_with(
     """A map in which the pair is otherwise, if only these axioms hold at these steps."""
     piece = Piece.of(settle(trace, theory), derivation.steps)
     pair = piece.steps.index(derivation.first), piece.steps.index(derivation.second)
-    active = [facts.active(axiom, piece.steps.index(step)) for axiom, step in links]
+    active = [active_at(axiom, piece.steps.index(step)) for axiom, step in links]
     return Axioms(piece, never, relaxed=True).map_with(
         active, [(facts.are_one(*pair), not derivation.one)]
     )

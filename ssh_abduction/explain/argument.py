@@ -18,7 +18,14 @@ import clingo
 from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS
 from ssh_abduction.data.odometry import match_in_words
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain.axioms import Assumption, Axioms, Piece
+from ssh_abduction.explain.axioms import (
+    Assumption,
+    Axioms,
+    Piece,
+    active_at,
+    conclusion_of,
+    read_conclusion,
+)
 from ssh_abduction.explain.no_map import clashes_of, why_apart
 from ssh_abduction.explain.verdict import Derivation, Inference, Link
 from ssh_abduction.solver import facts
@@ -121,7 +128,7 @@ class Argument:
         first, second = pair
         self._pair = piece.steps.index(first), piece.steps.index(second)
         self._axioms = Axioms(piece, stop, relaxed=True)
-        self._goal = facts.conclusion("one_dstate" if one else "two_dstates", *self._pair)
+        self._goal = conclusion_of("one_dstate" if one else "two_dstates", *self._pair)
         self._supposed: Assumption = (facts.are_one(*self._pair), not one)
         order = piece.theory.axioms
         clash = self._axioms.smallest_clash([self._supposed])
@@ -230,7 +237,7 @@ class Argument:
             if conclusion in premises:
                 return
             premises[conclusion], links[conclusion] = self._support(conclusion)
-            for premise in sorted(premises[conclusion], key=lambda p: facts.read_conclusion(p)[1]):
+            for premise in sorted(premises[conclusion], key=lambda p: read_conclusion(p)[1]):
                 visit(premise)
             order.append(conclusion)
 
@@ -288,7 +295,7 @@ class Argument:
             given += ((symbol, True) for symbol in _active(earlier))
             core = self._axioms.core(_active(line.group), given)
         needed = [symbol for symbol, _ in core or ()]
-        again = tuple(link for link in earlier if facts.active(*link) in needed)
+        again = tuple(link for link in earlier if active_at(*link) in needed)
         premises = [symbol for symbol in needed if symbol in self._born and symbol != conclusion]
         return premises, again + line.group
 
@@ -298,7 +305,7 @@ class Argument:
         A premise should be about a step of the pair. Under the supposition, it should be about the
         second step or about both, not about the first step alone.
         """
-        name, steps = facts.read_conclusion(symbol)
+        name, steps = read_conclusion(symbol)
         supposed = self._lines[self._born[symbol]].supposed
         preferred = _PREFERRED.index(name) if name in _PREFERRED else len(_PREFERRED)
         return (
@@ -321,7 +328,7 @@ class Argument:
         line = self._line_of(conclusions[0])
         known = [symbol for symbol, born in self._born.items() if born <= self._lines.index(line)]
         self._words.know(known)
-        said = [facts.read_conclusion(c) for c in conclusions if c is not None]
+        said = [read_conclusion(c) for c in conclusions if c is not None]
         says = tuple(dict.fromkeys(self._words.of(c, would=line.supposed) for c in said)) or (
             "this is a contradiction",
         )
@@ -345,14 +352,12 @@ class Argument:
         self._words.know(self._born)
         if not premises[conclusion]:
             conclusion = goal
-        found = [
-            (self._line_of(p).supposed, facts.read_conclusion(p)) for p in premises[conclusion]
-        ]
+        found = [(self._line_of(p).supposed, read_conclusion(p)) for p in premises[conclusion]]
         found.sort(key=lambda premise: (premise[0], premise[1][1]))
         # these conclusions about the pair only repeat the supposition
         obvious = [(name, self._pair) for name in ("one_place", "one_dstate", "two_dstates")]
         clauses = [self._words.of(p, would=supposed) for supposed, p in found if p not in obvious]
-        said = [] if conclusion is None else [facts.read_conclusion(conclusion)]
+        said = [] if conclusion is None else [read_conclusion(conclusion)]
         reasons = [
             self._words.reason(axiom, t, said, self._pair, short=True)
             for axiom, t in links[conclusion]
@@ -362,7 +367,7 @@ class Argument:
 
 def _active(links: Iterable[tuple[str, int]]) -> list[clingo.Symbol]:
     """Return the atoms that switch on these links."""
-    return [facts.active(axiom, t) for axiom, t in links]
+    return [active_at(axiom, t) for axiom, t in links]
 
 
 class Words:
@@ -378,7 +383,7 @@ class Words:
         """Read which pairs of steps are along one course (path and direction), to name paths."""
         self._courses = {
             (steps[0], steps[1])
-            for name, steps in map(facts.read_conclusion, conclusions)
+            for name, steps in map(read_conclusion, conclusions)
             if name == "one_course"
         }
 

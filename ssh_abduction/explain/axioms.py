@@ -10,7 +10,7 @@ import clingo
 
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, named_steps
-from ssh_abduction.data.groups import minimal_part
+from ssh_abduction.data.groups import gathered, minimal_part
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import closures_among
 from ssh_abduction.data.trace import Action, Step, Trace
@@ -31,6 +31,10 @@ Assumption: TypeAlias = tuple[clingo.Symbol, bool]
 Refusal: TypeAlias = frozenset[Equality]
 
 
+# The atom that holds if at least one of the picked conclusions does not hold.
+SOME_FAIL = clingo.Function("some_fail")
+
+
 class Interrupted(Exception):  # noqa: N818 - not an error
     """Raised to end the work because the caller's function `stop` returned True."""
 
@@ -41,6 +45,18 @@ class _ModelMap(NamedTuple):
     labels: tuple[int, ...]
     places: tuple[int | None, ...]
     ssh_map: SSHMap
+
+    @classmethod
+    def of(cls, model: clingo.Model, piece: Piece) -> _ModelMap:
+        """Read a model of clingo for a piece."""
+        found: dict[str, dict[int, int]] = {"is": {}, "at": {}}
+        for name, args in map(facts.read_atom, model.symbols(shown=True)):
+            if name in found:
+                found[name][args[0]] = args[1]
+        steps = range(len(piece.trace))
+        labels = tuple(found["is"][t] for t in steps)
+        places = tuple(found["at"].get(t) for t in steps)
+        return cls(labels, places, facts.read_map(model, piece.trace, piece.theory))
 
     def has(self, equalities: Collection[Equality]) -> bool:
         """Tell whether all these (in)equalities of steps hold in the model."""
@@ -61,13 +77,40 @@ class _ArgumentModel(NamedTuple):
     @classmethod
     def of(cls, model: clingo.Model) -> _ArgumentModel:
         """Read a model of clingo."""
-        return cls(*facts.read_argument(model))
+        atoms = gathered((symbol.name, symbol) for symbol in model.symbols(atoms=True))
+        broken = (
+            clingo.Function("active", symbol.arguments) for symbol in atoms.get("violation", ())
+        )
+        return cls(
+            frozenset(atoms.get("so", ())), frozenset(broken), frozenset(atoms.get("same", ()))
+        )
 
     def suits(self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]) -> bool:
         """Tell whether these axioms and assumptions hold in the model."""
         return self.broken.isdisjoint(active) and all(
             (symbol in self.one) == true for symbol, true in assumed
         )
+
+
+def active_at(axiom: str, t: int) -> clingo.Symbol:
+    """Return the atom that says that an axiom must hold at step t (explain.lp)."""
+    return clingo.Function("active", [clingo.Function(axiom), *facts.number_symbols(t)])
+
+
+def conclusion_of(name: str, *steps: int) -> clingo.Symbol:
+    """Return the atom of a conclusion, such as `one_dstate`, about some steps."""
+    return clingo.Function("so", [clingo.Function(name, facts.number_symbols(*steps))])
+
+
+def read_conclusion(symbol: clingo.Symbol) -> tuple[str, tuple[int, ...]]:
+    """Return the name and the steps of a conclusion, from its atom."""
+    said = symbol.arguments[0]
+    return said.name, tuple(argument.number for argument in said.arguments)
+
+
+def picked(symbol: clingo.Symbol) -> clingo.Symbol:
+    """Return the external atom that picks a conclusion for SOME_FAIL."""
+    return clingo.Function("picked", [symbol])
 
 
 def _forget(_: clingo.Model) -> None:
@@ -106,13 +149,13 @@ class Axioms:
             for t in range(len(trace))
             if axiom != Planar.axiom or t == last
         )
-        self._pairs = {facts.active(axiom, t): (axiom, t) for axiom, t in pairs} if relaxed else {}
-        self._drawn = {facts.active(Planar.axiom, last)} & self._pairs.keys()
+        self._pairs = {active_at(axiom, t): (axiom, t) for axiom, t in pairs} if relaxed else {}
+        self._drawn = {active_at(Planar.axiom, last)} & self._pairs.keys()
         self._placed = [
             symbol for symbol, (axiom, _) in self._pairs.items() if axiom == "one_place"
         ]
         if self._drawn:
-            self._control.tell(facts.rests_on(Planar.axiom, last, "one_place"))
+            self._control.tell(f":- {active_at(Planar.axiom, last)}, violation(one_place,T).")
 
     def _ground(self, piece: Piece, *, relaxed: bool) -> None:
         """Ground the axioms for all steps. Raises Interrupted if `stop` returns True."""
@@ -157,7 +200,7 @@ class Axioms:
             if refused is None:
                 return answer.ssh_map
             axiom, refusal = refused
-            where = facts.active(axiom, self._judged_at(axiom, refusal)) if self._pairs else None
+            where = active_at(axiom, self._judged_at(axiom, refusal)) if self._pairs else None
             self._forbid(refusal, where)
         return None
 
@@ -166,10 +209,17 @@ class Axioms:
 
         The file encodings/derivation.lp defines the possible conclusions.
         """
-        self._control.tell(facts.told_of(steps))
+        self._control.tell(" ".join(f"told_of({t})." for t in sorted({*steps})))
         self._control.ground([("conclusions", [])])
-        self._conclusions = facts.conclusions_of(self._control)
-        self._control.tell(facts.may_fail(self._conclusions))
+        possible = self._control.symbolic_atoms.by_signature("so", 1)
+        self._conclusions = [atom.symbol for atom in possible]
+        self._control.tell(
+            "\n".join(
+                f"#external {picked(c)}. {SOME_FAIL} :- {picked(c)}, not {c}. "
+                f"#heuristic {c} : {picked(c)}. [1,false]"
+                for c in self._conclusions
+            )
+        )
 
     def consequences(
         self,
@@ -200,7 +250,7 @@ class Axioms:
 
         doubtful = found - frozenset(known)
         self._pick(doubtful)
-        while doubtful and self._solve(keep, active, [*assumed, (facts.some_fail(), True)]):
+        while doubtful and self._solve(keep, active, [*assumed, (SOME_FAIL, True)]):
             doubtful &= found
             self._pick(doubtful)
         return found
@@ -208,7 +258,7 @@ class Axioms:
     def _pick(self, doubtful: frozenset[clingo.Symbol]) -> None:
         """Ask the next query for a model in which one of these conclusions fails."""
         for symbol in doubtful ^ self._picked:
-            self._control.assign_external(facts.picked(symbol), symbol in doubtful)
+            self._control.assign_external(picked(symbol), symbol in doubtful)
         self._picked = doubtful
 
     def core(
@@ -231,8 +281,7 @@ class Axioms:
         found: list[_ModelMap] = []
 
         def keep(model: clingo.Model) -> None:
-            ssh_map = facts.read_map(model, self._piece.trace, self._piece.theory)
-            found.append(_ModelMap(*facts.read_steps(model), ssh_map))
+            found.append(_ModelMap.of(model, self._piece))
 
         return found[0] if self._solve(keep, active, assumed) else None
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache, lru_cache
 from itertools import product
 
-from clingo import Control, Function, Model, Number, String, Symbol, SymbolType
+from clingo import Function, Model, Number, String, Symbol, SymbolType
 
 from ssh_abduction.data.drives import starts_of, stretches_of
 from ssh_abduction.data.groups import numbered
@@ -302,16 +302,6 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
     return with_changes(ssh_map, trace, theory) or ssh_map
 
 
-def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
-    """Read the dstate and the place (or None) of each step from an answer that may break axioms."""
-    found: dict[str, dict[int, int]] = {"is": {}, "at": {}}
-    for name, args in map(read_atom, model.symbols(shown=True)):
-        if name in found:
-            found[name][args[0]] = args[1]
-    steps = range(len(found["is"]))
-    return tuple(found["is"][t] for t in steps), tuple(found["at"].get(t) for t in steps)
-
-
 def views_of(
     labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
 ) -> dict[int, View | None]:
@@ -373,11 +363,6 @@ def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = 
     return f":- {', '.join(atoms)}."
 
 
-def rests_on(axiom: str, t: int, other: str) -> str:
-    """Return the rule: if an axiom is active at step t, another axiom holds at every step."""
-    return f":- {active(axiom, t)}, violation({other},T)."
-
-
 def exactly(number: int, count: Count) -> str:
     """Return the rule that a map has this many dstates, places or paths, if `of_number` is true."""
     counted = {
@@ -392,68 +377,6 @@ def exactly(number: int, count: Count) -> str:
 def of_number(number: int, count: Count) -> Symbol:
     """Return the external atom that switches the rule of `exactly` on."""
     return Function("of_number", [Function(count), *number_symbols(number)])
-
-
-def active(axiom: str, t: int) -> Symbol:
-    """Return the atom that says that an axiom must hold at step t (explain.lp)."""
-    return Function("active", [Function(axiom), *number_symbols(t)])
-
-
-def told_of(steps: Iterable[int]) -> str:
-    """Return the facts that name the steps that conclusions may be about."""
-    return " ".join(f"told_of({t})." for t in sorted(set(steps)))
-
-
-def conclusion(name: str, *steps: int) -> Symbol:
-    """Return the atom of a conclusion, such as `one_dstate`, about some steps."""
-    return Function("so", [Function(name, number_symbols(*steps))])
-
-
-def read_conclusion(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
-    """Return the name and the steps of a conclusion, from its atom."""
-    said = symbol.arguments[0]
-    return said.name, tuple(argument.number for argument in said.arguments)
-
-
-def conclusions_of(control: Control) -> list[Symbol]:
-    """Return the atoms of all conclusions that are possible in a ground control."""
-    return [atom.symbol for atom in control.symbolic_atoms.by_signature("so", 1)]
-
-
-def read_argument(model: Model) -> tuple[frozenset[Symbol], frozenset[Symbol], frozenset[Symbol]]:
-    """Read three sets of atoms from an answer in which axioms may be broken.
-
-    The sets are the conclusions that hold; `active(N,T)` for each axiom N that is broken at step T;
-    and `same(I,T)` for each pair of steps at one dstate.
-    """
-    conclusions, broken, one = set[Symbol](), set[Symbol](), set[Symbol]()
-    for symbol in model.symbols(atoms=True):
-        if symbol.name == "so":
-            conclusions.add(symbol)
-        elif symbol.name == "violation":
-            broken.add(Function("active", symbol.arguments))
-        elif symbol.name == "same":
-            one.add(symbol)
-    return frozenset(conclusions), frozenset(broken), frozenset(one)
-
-
-def picked(symbol: Symbol) -> Symbol:
-    """Return the external atom that picks a conclusion for `some_fail`."""
-    return Function("picked", [symbol])
-
-
-def some_fail() -> Symbol:
-    """Return the atom that holds if at least one of the picked conclusions does not hold."""
-    return Function("some_fail")
-
-
-def may_fail(conclusions: Iterable[Symbol]) -> str:
-    """Return the rules that define `some_fail` and `picked` for some conclusions."""
-    return "\n".join(
-        f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}. "
-        f"#heuristic {c} : {picked(c)}. [1,false]"
-        for c in conclusions
-    )
 
 
 COURSE = {"pos": 1, "neg": -1}
