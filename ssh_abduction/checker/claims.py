@@ -16,7 +16,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, groupby
 from typing import Any
 
 from ssh_abduction.data.checks import an_object
@@ -33,38 +33,25 @@ REASONS = ("work limit", "time limit", "memory limit", "interrupted", "maps limi
 
 
 def false_claims(
-    answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int
+    answer: Mapping[str, Any],
+    maps: Sequence[SSHMap],
+    steps: int,
+    theory: Theory,
+    proven: int | None,
 ) -> tuple[str, ...]:
     """Find the false claims in the JSON that `solve --json` printed. Each claim is checked.
 
     `steps` is the number of steps of the trace. In the theory no field is "auto". `proven` is the
     lower bound on dstates by the certificate of the answer. The certificate may also say that
-    clingo refuted some numbers of dstates. These count in the bound, but are not checked.
+    clingo refuted some numbers of dstates. These count in the bound, but are not checked. If
+    `proven` is None, the certificate is not checked, because that needs the trace, nor are costs
+    and bounds if the theory allows faults.
     """
-    claims = _Claims(answer, maps, steps, theory, proven)
-    return tuple(
-        fault
-        for check in (claims.sizes, claims.twice, claims.status, claims.cost, claims.bound)
-        for fault in check()
-    )
-
-
-def contradictions(
-    answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory
-) -> Iterator[str]:
-    """Find contradictions between the claims of an answer and its maps.
-
-    This is as in `false_claims`, but the certificate of the answer is not checked, because that
-    needs the trace. If the theory allows faults, costs and bounds are not compared.
-    """
-    claims = _Claims(answer, maps, steps, theory, sys.maxsize)
-    for check in (
-        claims.sizes,
-        claims.twice,
-        claims.status,
-        *(() if theory.has_faults else (claims.cost, claims.bound)),
-    ):
-        yield from check()
+    is_priced = proven is not None or not theory.has_faults
+    claims = _Claims(answer, maps, steps, theory, sys.maxsize if proven is None else proven)
+    checks = [claims.sizes, claims.twice, claims.status]
+    checks += [claims.cost, claims.bound] if is_priced else []
+    return tuple(false for check in checks for false in check())
 
 
 class _Claims:
@@ -216,15 +203,10 @@ class _Claims:
                     f"are of one level, got {best} and {here}"
                 )
         yield from self._costs_of_each()
-        shown = [_shown(counts) for counts in self.counts]
-        begins = [
-            i for i in range(len(shown)) if i == 0 or self._preferred(i) != self._preferred(i - 1)
-        ]
-        ends = [*begins[1:], len(shown)]
-        levels = [
-            {"cost": shown[begin], "count": end - begin}
-            for begin, end in zip(begins, ends, strict=False)
-        ]
+        levels = []
+        for _, level in groupby(range(len(self.counts)), key=self._preferred):
+            first, *others = level
+            levels.append({"cost": _shown(self.counts[first]), "count": 1 + len(others)})
         if "levels" in self.answer and self.answer["levels"] != levels:
             yield (
                 f"levels: expected {brief(levels)}, as the maps have these, got "
@@ -404,23 +386,20 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
             f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got "
             f"{brief(refuted)}; write it with solve --json"
         )
-    word_of, has_words = _words_of(certificate), "words" in certificate
-    pairs = list(combinations(steps, 2))
-    reasons = (
-        word_of.get(frozenset(pair), []) if has_words else _common_actions(trace, *pair)
-        for pair in pairs
-    )
-    faults = [
-        fault
-        for (i, j), word in zip(pairs, reasons, strict=True)
-        if (fault := _not_apart(trace, i, j, word))
-    ]
+    words = _words_of(certificate) if "words" in certificate else None
+
+    def word(i: int, j: int) -> Sequence[str]:
+        """Return the word that should show that two steps are at different dstates."""
+        return _common_actions(trace, i, j) if words is None else words.get(frozenset((i, j)), [])
+
+    pairs = combinations(steps, 2)
+    faults = [fault for i, j in pairs if (fault := _not_apart(trace, i, j, word(i, j)))]
     return ProvenBound(len(steps), tuple(refuted), tuple(faults))
 
 
 def _words_of(certificate: Mapping[str, Any]) -> dict[frozenset[int], list[str]]:
     """Return the word of each pair of steps for which a certificate has one."""
-    words = certificate.get("words", [])
+    words = certificate["words"]
     found: dict[frozenset[int], list[str]] = {}
     for entry in words if isinstance(words, list) else [words]:
         if (

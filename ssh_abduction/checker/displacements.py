@@ -30,6 +30,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -186,14 +187,9 @@ def _refused_alone(
             left = np.flatnonzero(least > most)
             if not len(left):
                 break
-            first, last = rows[left, 0], rows[left, 1]
-            square = _square(
-                filtered.closing(first, last)[:, :freedom],
-                filtered.covariance(first, last)[:, :freedom, :freedom],
-            )
-            least[left] = np.minimum(
-                least[left], np.where(filtered.is_known(first, last), square + unlikely, 0.0)
-            )
+            square = _square(*_alone(filtered, rows[left])) + unlikely
+            is_known = filtered.is_known(rows[left, 0], rows[left, 1])
+            least[left] = np.minimum(least[left], np.where(is_known, square, 0.0))
         if len(rows) and least.max() > most:
             worst = int(least.argmax())
             yield _return_of(rows[worst]), float(least[worst]), most
@@ -220,9 +216,8 @@ def _refused_together(
             left = np.flatnonzero(least > most)
             if not len(left):
                 break
-            least[left] = np.minimum(
-                least[left], _square_together(filtered, rows, first[left], second[left]) + unlikely
-            )
+            square = _square_together(filtered, rows, first[left], second[left])
+            least[left] = np.minimum(least[left], square + unlikely)
         # the clearest pair exceeds its threshold most
         excess = least - most
         if len(excess) and excess.max() > clearest:
@@ -262,22 +257,25 @@ class _EachReturn:
     """
 
     def __init__(self, filtered: ErrorFilter, rows: Steps) -> None:
-        first, last = rows[:, 0], rows[:, 1]
-        places = rows[:, 2] == 2
-        off, covariance, repeated = (
-            filtered.closing(first, last),
-            filtered.covariance(first, last),
-            filtered.repeated_since(first, last),
-        )
-        covariance[places, 2, :] = covariance[places, :, 2] = 0.0
-        covariance[places, 2, 2] = 1.0
+        off, covariance = _alone(filtered, rows)
+        repeated = filtered.repeated_since(rows[:, 0], rows[:, 1])
         inverse = np.linalg.inv(covariance)
-        inverse[places, 2, 2] = 0.0  # the heading of a return to a place does not count
+        inverse[rows[:, 2] == 2, 2, 2] = 0.0
         self.square = np.einsum("mi,mij,mj->m", off, inverse, off)
-        self.inverse, self.repeated = (
-            inverse.reshape(-1, 9),
-            (repeated @ repeated.swapaxes(1, 2)).reshape(-1, 9),
-        )
+        self.inverse = inverse.reshape(-1, 9)
+        self.repeated = (repeated @ repeated.swapaxes(1, 2)).reshape(-1, 9)
+
+
+def _alone(filtered: ErrorFilter, rows: Steps) -> tuple[Array, Array]:
+    """Compute the closing errors, (m, 3), of returns and their covariances, (m, 3, 3).
+
+    The heading of a return to a place does not count: its error is 0 and its variance 1.
+    """
+    first, last, free = rows[:, 0], rows[:, 1], rows[:, 2] == 2
+    off, covariance = filtered.closing(first, last), filtered.covariance(first, last)
+    off[free, 2] = covariance[free, 2, :2] = covariance[free, :2, 2] = 0.0
+    covariance[free, 2, 2] = 1.0
+    return off, covariance
 
 
 def _unsafe(
@@ -325,38 +323,24 @@ def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
 
 def _square_together(filtered: ErrorFilter, rows: Steps, here: Steps, others: Steps) -> Array:
     """Compute the chi-square of each pair of returns; 0 if a closing error is unknown."""
-    m = len(others)
-    begin, end = (
-        np.maximum(rows[others, 0], rows[here, 0]),
-        np.minimum(rows[others, 1], rows[here, 1]),
-    )
-    common = filtered.since(begin, end)
+    one, other = rows[here], rows[others]
+    begin, end = np.maximum(one[:, 0], other[:, 0]), np.minimum(one[:, 1], other[:, 1])
     mixed = (
-        filtered.onward(end, rows[here, 1])
-        @ common
-        @ filtered.onward(end, rows[others, 1]).swapaxes(1, 2)
+        filtered.onward(end, one[:, 1])
+        @ filtered.since(begin, end)
+        @ filtered.onward(end, other[:, 1]).swapaxes(1, 2)
     )
-    mixed += filtered.repeated_since(rows[here, 0], rows[here, 1]) @ filtered.repeated_since(
-        rows[others, 0], rows[others, 1]
-    ).swapaxes(1, 2)
+    repeated = [filtered.repeated_since(row[:, 0], row[:, 1]) for row in (one, other)]
+    mixed += repeated[0] @ repeated[1].swapaxes(1, 2)
     mixed += _common_ends(rows, here, others)[:, None, None] * filtered.at_end
-    joint, off = np.zeros((m, 6, 6)), np.zeros((m, 6))
-    for k, which in enumerate((here, others)):
-        part = slice(3 * k, 3 * k + 3)
-        off[:, part] = filtered.closing(rows[which, 0], rows[which, 1])
-        joint[:, part, part] = filtered.covariance(rows[which, 0], rows[which, 1])
-    joint[:, :3, 3:], joint[:, 3:, :3] = mixed, mixed.swapaxes(1, 2)
-    # the heading of a return to a place does not count
-    for k, which in enumerate((here, others)):
-        free = rows[which, 2] == 2
-        off[free, 3 * k + 2] = 0.0
-        joint[free, 3 * k + 2, :] = joint[free, :, 3 * k + 2] = 0.0
-        joint[free, 3 * k + 2, 3 * k + 2] = 1.0
-    known = filtered.is_known(rows[here, 0], rows[here, 1]) & filtered.is_known(
-        rows[others, 0], rows[others, 1]
+    mixed[one[:, 2] == 2, 2, :] = mixed[other[:, 2] == 2, :, 2] = 0.0
+    (off, covariance), (other_off, other_covariance) = (
+        _alone(filtered, row) for row in (one, other)
     )
-    square: Array = np.where(known, _square(off, joint), 0.0)
-    return square
+    joint = np.block([[covariance, mixed], [mixed.swapaxes(1, 2), other_covariance]])
+    is_known = [filtered.is_known(row[:, 0], row[:, 1]) for row in (one, other)]
+    square = _square(np.hstack([off, other_off]), joint)
+    return np.where(is_known[0] & is_known[1], square, 0.0)
 
 
 def _square(off: Array, covariance: Array) -> Array:
@@ -526,31 +510,18 @@ class Drifts:
     """Iterates over possible drifts of the heading. The first one is no drift.
 
     For each drift it yields an `ErrorFilter` with the poses for this drift, and the chi-square of
-    the drift itself. Poses are computed at their first use.
+    the drift itself. Poses are computed at their first use. `none` is the filter without a drift.
     """
 
     def __init__(self, trace: Trace) -> None:
-        self._trace, self._odometry = trace, trace.odometry or Odometry()
-        self._made: dict[int, ErrorFilter] = {}
-
-    @property
-    def none(self) -> ErrorFilter:
-        """The error filter that uses the poses without a drift of heading."""
-        return self._filter(0)
-
-    def _filter(self, number: int) -> ErrorFilter:
-        """Return the filter for a drift of `number` / BENDS_A_SIGMA standard deviations."""
-        step = self._odometry.bend / BENDS_A_SIGMA
-        if number not in self._made:
-            self._made[number] = ErrorFilter(self._trace, self._odometry, number * step, step / 2)
-        return self._made[number]
+        odometry = trace.odometry or Odometry()
+        step = odometry.bend / BENDS_A_SIGMA
+        self._filter = cache(lambda n: ErrorFilter(trace, odometry, n * step, step / 2))
+        most = MOST_BENDS * BENDS_A_SIGMA if odometry.bend else 0
+        self._numbers = sorted(range(-most, most + 1), key=lambda n: (abs(n), n))
+        self.none = self._filter(0)
 
     def __iter__(self) -> Iterator[tuple[ErrorFilter, float]]:
-        numbers = (
-            range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1)
-            if self._odometry.bend
-            else [0]
-        )
-        for n in sorted(numbers, key=lambda n: (abs(n), n)):
+        for n in self._numbers:
             look_at_clock()
             yield self._filter(n), max(abs(n) - 0.5, 0.0) ** 2 / BENDS_A_SIGMA**2

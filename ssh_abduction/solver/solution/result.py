@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from ssh_abduction.checker.claims import contradictions
+from ssh_abduction.checker.claims import false_claims
 from ssh_abduction.data.checks import a_whole_number, one_of
 from ssh_abduction.data.drives import (
     Drive,
@@ -403,7 +403,7 @@ class Solution(MapSequence):
         steps = read.integer(record["steps"], "steps")
         trace = trace_in(record, where) if trace is None else trace
         theory = theory_in(record["theory"], where)
-        if (false := next(contradictions(record, maps, steps, theory), None)) is not None:
+        for false in false_claims(record, maps, steps, theory, None):
             raise MapError(f"{where}: {false}; it was changed by hand, or cut")
         _check_steps(where, maps, steps, theory, trace)
         support = Support.of_file(read, record, steps)
