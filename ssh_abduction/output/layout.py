@@ -96,9 +96,12 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
     """
     degrees = degrees_of(turns)
     poses = drawable_poses(ssh_map)
+    if poses is None and not ssh_map.places:
+        return _floor_by_floor(ssh_map, _spread(ssh_map))
     if poses is None:
-        found = _straight(ssh_map, degrees) if ssh_map.places else _spread(ssh_map)
-        return _floor_by_floor(ssh_map, found)
+        spots, headings = StraightDrawing(ssh_map, degrees).positions()
+        dstates = tuple((*spots[s.site], headings[s.id]) for s in ssh_map.dstates)
+        return _floor_by_floor(ssh_map, Layout({p: spots[p] for p in ssh_map.places}, dstates))
     at = [(pose.x, pose.y, pose.heading) for pose in poses]
     first = {s.place: s.id for s in reversed(ssh_map.dstates)}  # the first dstate of each place
     spreads = tuple(pose.spread for pose in poses)
@@ -259,16 +262,6 @@ def untravelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
         for p, q in pairwise(path.order)
         if (min(p, q), max(p, q)) not in streets and part.get(p) == part.get(q)
     ]
-
-
-def _straight(ssh_map: SSHMap, degrees: Mapping[str, tuple[float, float]]) -> Layout:
-    """Lay out a map with straight paths."""
-    drawing = StraightDrawing(ssh_map, degrees)
-    at, headings = drawing.positions()
-    return Layout(
-        {p: at[p] for p in ssh_map.places},
-        tuple((*at[s.site], headings[s.id]) for s in ssh_map.dstates),
-    )
 
 
 def _spread(ssh_map: SSHMap) -> Layout:

@@ -128,7 +128,10 @@ class Roads:
         if level == "places" and not ssh_map.places:
             raise MapError(NO_PLACES)
         stops = tuple(_stops(ssh_map, drawn, level))
-        ends = _streets(ssh_map) if level == "places" else _links(ssh_map)
+        # If several actions lead from one dstate to another, the first by name counts.
+        links = sorted(ssh_map.links, reverse=True)
+        ends = {(s, x): _way(ssh_map, s, action, x) for s, action, x in links if s != x}
+        ends = _streets(ssh_map) if level == "places" else ends
         at = {stop.id: (stop.x, stop.y) for stop in stops}
         floor = {stop.id: stop.floor for stop in stops}
         dstates = ssh_map.dstates if level == "dstates" else ()
@@ -215,18 +218,6 @@ def _stops(ssh_map: SSHMap, drawn: Layout, level: str) -> Iterator[Stop]:
             regions,
             tuple(name for name in names if name is not None),
         )
-
-
-def _links(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
-    """Find the action, path and direction from each dstate to each other one to which a link leads.
-
-    If several actions link them, the first by name counts.
-    """
-    return {
-        (s, x): _way(ssh_map, s, action, x)
-        for s, action, x in sorted(ssh_map.links, reverse=True)
-        if s != x
-    }
 
 
 def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
