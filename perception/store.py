@@ -8,21 +8,18 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 import skops.io
-from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator
 from sklearn.pipeline import Pipeline
 
 from perception.appearance import PanoramaTransformer, ReciprocalTransformer
 from perception.errors import PerceptionError
 from perception.images import refuse_huge
-from perception.recognition import ImageLikelihood, PlaceRecogniser
+from perception.recognition import PlaceRecogniser
 from perception.views import Predictor, ViewClusterer
 from ssh_abduction.data.errors import brief, is_whole
 from ssh_abduction.data.files import save_file
@@ -38,59 +35,6 @@ OURS = tuple(
         Predictor,
     )
 )
-
-
-@dataclass(frozen=True)
-class Stored:
-    """Content of a file that `save` wrote."""
-
-    model: Any  # the fitted estimator or pipeline
-    # Labels that the model predicts, sorted; empty if the model has no classes.
-    classes: tuple[Any, ...]
-    # Version of each program that saved the model, by name: python, numpy, scikit-learn, skops,
-    # ssh-abduction.
-    versions: Mapping[str, str]
-
-    def likelihood(self) -> ImageLikelihood | None:
-        """Make the densities of images at the places that the model knows.
-
-        None if the model is no recogniser of places or has one image.
-        """
-        try:
-            return ImageLikelihood.of(self.model)
-        except PerceptionError:
-            return None
-
-    def labels(self, images: ArrayLike) -> list[int]:
-        """Predict the label of each image, (n, d).
-
-        Raises PerceptionError if the images have another length than the learnt ones, or
-        the model is damaged. `load` does not notice all damage of a file.
-        """
-        table = np.asarray(images, np.float64)
-        try:
-            learnt = getattr(self.model, "n_features_in_", table.shape[1])
-            if is_whole(learnt) and learnt != table.shape[1]:
-                raise PerceptionError(
-                    f"images: expected {learnt} ranges, as the recogniser learnt, got "
-                    f"{table.shape[1]}; give images of the same laser"
-                )
-            found = np.asarray(self.model.predict(table))
-            labels = [int(label) for label in found]
-            sound = found.shape == (len(table),) and found.dtype.kind in "iu"
-        except PerceptionError:
-            raise
-        except Exception as error:  # Each part of a damaged model fails in its own way.
-            raise PerceptionError(
-                f"recogniser: expected a recogniser that works, got {type(error).__name__}: "
-                f"{error}; train it again"
-            ) from None
-        if not sound:
-            raise PerceptionError(
-                f"recogniser: expected whole numbers as labels, got {found.dtype} of shape "
-                f"{found.shape}; train it again"
-            )
-        return labels
 
 
 def save(model: Any, path: str | os.PathLike[str]) -> None:
@@ -122,8 +66,8 @@ def written(model: Any, name: str = "recogniser") -> bytes:
     return data
 
 
-def load(path: str | os.PathLike[str]) -> Stored:
-    """Read a recogniser that `save` wrote, without running anything in the file.
+def load(path: str | os.PathLike[str]) -> Any:
+    """Read an estimator or pipeline that `save` wrote, without running anything in the file.
 
     Raises PerceptionError if the file is unreadable or has other content.
     """
@@ -149,7 +93,7 @@ def load(path: str | os.PathLike[str]) -> Stored:
         ) from error
     _check_parts(held, path)
     try:
-        return Stored(_learnt_again(held["model"]), tuple(held["classes"]), held["versions"])
+        return _learnt_again(held["model"])
     except Exception as error:  # Each part of a damaged model fails in its own way.
         raise PerceptionError(
             f"{path}: model: expected a fitted one, got {type(error).__name__}: {error}; "

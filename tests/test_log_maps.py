@@ -205,14 +205,14 @@ def test_stored_recogniser_recognises_another_drive(
     trace = Trace.load(runs / "hall" / "trace.jsonl")
     labels = Solution.load(runs / "hall" / "maps.json").maps[0].labels
     stored = load(runs / "hall" / "recogniser.skops")
-    assert stored.labels([step.image for step in trace]) == list(labels)
+    assert stored.predict([step.image for step in trace]).tolist() == list(labels)
     # On another drive the laser has other noise, and the first steps are missing.
     noise = np.random.default_rng(1)
     steps = [
         replace(step, image=tuple(np.abs(step.image + noise.normal(0, 0.02, len(step.image)))))
         for step in trace.steps[3:]
     ]
-    assert np.mean(np.array(stored.labels([s.image for s in steps])) == labels[3:]) > 0.8
+    assert np.mean(stored.predict([s.image for s in steps]) == labels[3:]) > 0.8
     other = replace(trace, steps=tuple(steps))
     other.save(tmp_path / "other.jsonl")
     call = ["localise", str(runs / "hall" / "maps.json"), str(tmp_path / "other.jsonl")]

@@ -245,7 +245,7 @@ def test_learner_of_panoramas_accepts_any_clusterer(run: Trace) -> None:
 def test_recogniser_of_panoramas_survives_a_round_trip(run: Trace, tmp_path: Path) -> None:
     images, labels = images_of(run), np.arange(len(run)) % 8
     save(recogniser(features=features_of(run)).fit(images, labels), tmp_path / "r.skops")
-    assert load(tmp_path / "r.skops").labels(images) == labels.tolist()
+    assert load(tmp_path / "r.skops").predict(images).tolist() == labels.tolist()
 
 
 @pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")

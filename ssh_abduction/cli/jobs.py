@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
 
 from ssh_abduction.cli.outcome import EXIT_ERROR, StopFlag, on_ctrl_c, warn
@@ -247,33 +246,15 @@ def answers_on_cluster(
             ) from None
         most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
         absence = Absence(lambda: len(client.ncores()), question.limit, address)
-        attempt = partial(_on_workers, question, client, most, absence)
-        for answer in _answers(question, paths, attempt, stop.is_set):
+        killed: list[File] = []
+        for answer in _on_workers(question, client, most, absence, [*enumerate(paths)], killed):
             yield answer
             if stop.is_set():
                 return
-
-
-def _answers(
-    question: FileQuestion,
-    paths: Sequence[str],
-    attempt: Callable[[list[File], list[File]], Iterator[Any]],
-    stopped: Callable[[], bool],
-) -> Iterator[Any]:
-    """Yield answers in any order, and find out which files kill their workers.
-
-    When a worker is killed, all files that it was working on are suspects. Try each suspect again
-    alone. If its worker is killed again, the file is to blame, and a process here makes some map
-    soon. `attempt` appends the suspects to its second argument.
-    """
-    suspects: list[File] = []
-    yield from attempt([*enumerate(paths)], suspects)
-    for task in suspects:
-        again: list[File] = []
-        yield from attempt([task], again)
-        for _ in again:
+        # A process here makes some map of a file whose workers were all killed.
+        for task in killed:
             lost = workers.Lost(task[0], late=False)
-            yield from hurried_answer(question, (*task, None), lost, stopped)
+            yield from hurried_answer(question, (*task, None), lost, stop.is_set)
 
 
 class Absence:

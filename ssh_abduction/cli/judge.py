@@ -12,7 +12,6 @@ import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -408,7 +407,10 @@ def run_explain(options: argparse.Namespace) -> int:
     maps, found, data = _maps_of(options)
     trace, theory = as_corrected(trace, shared.theory_of(options, found), maps, options.corrections)
     given: dict[str, Any] = {n: getattr(options, n) for n in ("time_limit", "memory_limit")}
-    listing = _listing_of(maps, data, len(trace)) if found and options.steps else None
+    listing: Listing | None = None
+    if maps and options.steps and data and data.get("maps"):
+        listing = Listing.from_dict(data, named(maps)).named_beside(maps)
+        listing = listing if listing.steps == len(trace) else None
     if listing is not None:
         given["known"] = listing.maps
     of_place = _place_asked(options.steps, listing)
@@ -426,8 +428,17 @@ def run_explain(options: argparse.Namespace) -> int:
         question = PairQuestion(trace, first, second, theory, **given)
     else:
         question = TraceQuestion(trace, theory, **given)
-    as_text = partial(_as_text, pair, options.time_limit)
-    written = partial(_as_json, pair) if options.json else as_text
+
+    def written(answer: Answer) -> str:
+        if options.json:
+            in_map = {"map": pair.to_dict()} if pair else {}
+            return json_line(answer.to_dict() | in_map) + "\n"
+        lines = [*([str(pair)] if pair else []), str(answer)]
+        is_limited = answer.stopped in (None, "time limit")
+        if is_limited and _exit_code(answer) == EXIT_UNKNOWN:
+            seconds = f"{options.time_limit:g} s"
+            lines.append(f"undecided within {seconds}; --time-limit gives it more time")
+        return "\n".join(lines) + "\n"
 
     def last_words(why: Stop) -> tuple[str, int]:
         answer = question.known(why)
@@ -477,28 +488,6 @@ def _maps_of(options: argparse.Namespace) -> tuple[str | None, Theory | None, An
         return file, None, None
     data, options.theory = read_json(file), None
     return file, shared.theory_of_maps(data, file), data
-
-
-def _listing_of(file: str | None, data: Any, steps: int) -> Listing | None:
-    """Read the maps in the data of a file; None if it has no maps of a trace with `steps` steps."""
-    if file is None or not data.get("maps"):
-        return None
-
-    listing = Listing.from_dict(data, named(file))
-    return listing.named_beside(file) if listing.steps == steps else None
-
-
-def _as_text(in_map: PairInMap | None, seconds: float, explanation: Answer) -> str:
-    lines = [*([str(in_map)] if in_map else []), str(explanation)]
-    is_limited = explanation.stopped in (None, "time limit")
-    if is_limited and _exit_code(explanation) == EXIT_UNKNOWN:
-        lines.append(f"undecided within {seconds:g} s; --time-limit gives it more time")
-    return "\n".join(lines) + "\n"
-
-
-def _as_json(in_map: PairInMap | None, explanation: Answer) -> str:
-    record = explanation.to_dict()
-    return json_line(record | ({"map": in_map.to_dict()} if in_map else {})) + "\n"
 
 
 def _exit_code(explanation: Answer) -> int:

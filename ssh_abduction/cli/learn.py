@@ -279,14 +279,13 @@ def run_recognise(options: argparse.Namespace) -> int:
     """
     from perception.errors import PerceptionError
     from perception.images import images_of
+    from perception.recognition import ImageLikelihood
     from perception.store import load
 
     stored = load(options.recogniser)
     images = images_of(Trace.load(options.trace))
     with said_of(options.recogniser, PerceptionError):
-        labels: list[int | None] = [*stored.labels(images)]
-        if (likelihood := stored.likelihood()) is not None:
-            labels = likelihood.labels(images)
+        labels = ImageLikelihood.of(stored).labels(images)
     if options.json:
         print(json.dumps(labels))
     else:

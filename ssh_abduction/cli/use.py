@@ -147,7 +147,7 @@ def _recogniser(
     if options.recogniser:
         from perception.store import load
 
-        return load(options.recogniser).model
+        return load(options.recogniser)
     is_log = options.trace is None and shared.trace_beside(options.maps) is not None
     if not is_log or mapped is None or other.steps[0].image is None:
         return None
