@@ -17,7 +17,9 @@ from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.runtime.clock import counting, look_at_clock, now, work_done
+from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
+from ssh_abduction.solver.work import CONFLICT
 
 ROUTE = Path(__file__).parent.parent / "examples" / "aces3-route.jsonl"
 COSTS = Theory.topological().replace(weigh="cost")
@@ -134,3 +136,17 @@ def test_part_obeys_the_watch_around_it() -> None:
     look_at_clock(300_000)
     with pytest.raises(LimitError):
         part.check()
+
+
+def test_conflicts_that_use_up_the_work_are_no_proof() -> None:
+    """Nine pigeons do not fit into eight holes. Clasp needs more conflicts to prove it."""
+    asker = Asker(Watch(work=100 * CONFLICT))
+    asker.control.add(
+        "base", [], "1 { in(X,1..8) } 1 :- X = 1..9. :- in(X,H), in(Y,H), X < Y. :~ in(1,1). [1]"
+    )
+    asker.control.ground([("base", [])])
+    with counting(is_on=True):
+        asker.watch.start()
+        for mode, models in (("opt", 0), ("ignore", 1)):
+            with pytest.raises(LimitError):
+                list(asker.answers(lambda _: True, mode, models))

@@ -294,6 +294,7 @@ class Asker:
         ):
             self.solve_seconds += time.perf_counter() - began
             handle.resume()
+            came = 0
             while True:
                 if not self._has_come(handle, until):
                     return False
@@ -301,6 +302,7 @@ class Asker:
                 if model is None:
                     result = handle.get()
                     break
+                came += 1
                 count_work(round(MICRO * ANSWER))
                 answer = read(model)
                 # Where work is counted, clasp must stand still at an answer when a caller stops.
@@ -310,9 +312,11 @@ class Asker:
                 if not ahead or counts_work():
                     self.watch.check()  # a limit of work must not stop clasp while it searches
                     handle.resume()
-        if result.interrupted and most == allowed >= 0:
+        # A limit of conflicts ends a search without `interrupted`.
+        is_cut = result.interrupted or not (result.exhausted or came == models > 0)
+        if is_cut and most == allowed >= 0:
             self.watch.check()
-        if result.interrupted and conflicts < 0:
+        if is_cut and conflicts < 0:
             raise LimitError("interrupted")
         return bool(result.exhausted)
 
