@@ -83,7 +83,7 @@ _log = log_of(__name__)
 
 
 class Search:
-    """A stream of the minimal maps of a trace, in constant memory.
+    """A stream of the minimal maps of a trace. It keeps at most a hash of each.
 
     Iterate over the search once to get the maps. Then `solution()` says how the search ended.
 

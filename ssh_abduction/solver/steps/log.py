@@ -102,21 +102,19 @@ class Log:
     def replay(
         self,
         labels: Sequence[int],
-        known: int | None = None,
         place_of: Sequence[int | None] | None = None,
     ) -> Replay:
         """Replay the trace over the map that `labels` make of its first steps.
 
-        If `known` is given, the map is made only from this many labels. `place_of` has the place of
-        each dstate, to check the evidence about places; None if the map has no places.
+        `place_of` has the place of each dstate, to check the evidence about places; None if the map
+        has no places.
         """
-        actions, seen = self.actions, self.seen
-        known = len(labels) if known is None else known
+        actions, seen, known = self.actions, self.seen, len(labels)
         if known == len(seen):
             return Replay(tuple(labels), Outcome.PREDICTED)
         links = {(labels[t], actions[t]): labels[t + 1] for t in range(known - 1)}
         sights = {(labels[t], seen[t]) for t in range(known)}
-        found = list(labels[:known])
+        found = list(labels)
         label = found[-1]
         outcome = Outcome.PREDICTED
         for t in range(known, len(seen)):

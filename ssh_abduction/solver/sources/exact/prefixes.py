@@ -66,13 +66,6 @@ from ssh_abduction.theory.evidence import Equality
 _log = log_of(__name__)
 
 FIRST_PREFIX = 8  # steps of the first prefix; clingo solves it at once
-# Hold back at most this many maps until it is known that the prefix is long enough. If there are
-# more, yield them, and the others as they are found, so that memory stays constant.
-HELD_BACK = 1000
-# If all maps are wanted and evidence may reject some of them: until this many maps are remembered,
-# forbid each rejected set of equalities and list the maps again. After that, only skip rejected
-# maps.
-REMEMBERED = 10_000
 # Without these axioms a dstate may be at several places or along several courses, but a map shows
 # only one.
 SHOWN_ONCE = frozenset({"one_place", "one_course"})
@@ -208,97 +201,64 @@ class Prefixes:
         return True
 
     def minimal_maps(self) -> Iterator[SSHMap]:
-        """Yield every minimal map once, after `find_minimum` has proven the minimal cost."""
-        streamed: list[int] = []  # sizes of the prefixes whose maps were yielded
-        held: list[SSHMap] = []  # maps of this prefix that replay to the end, not yet yielded
-        self._name_more_paths(self._known.cost)
-        try:
-            while True:
-                held.clear()
-                stuck = yield from self._maps_of_prefix(held, streamed)
-                if not stuck:
-                    break
-                self.engine.grow(self.engine.next_size(stuck))
-                self._name_more_paths(self._known.cost)
-        except (LimitError, StageTimeError):
-            yield from held  # these maps replay to the end at the minimal cost: they are minimal
-            raise
-        yield from held
+        """Yield every minimal map once, after `find_minimum` has proven the minimal cost.
 
-    def _maps_of_prefix(
-        self, held: list[SSHMap], streamed: list[int]
-    ) -> Generator[SSHMap, None, int]:
-        """Find the minimal maps of this prefix that replay to the end.
-
-        They are appended to `held`, or yielded if there are many, or if the prefix is the whole
-        trace. `streamed` has the sizes of earlier prefixes whose maps were yielded. Maps that
-        already replay from such a prefix are left out, as they were yielded, too. Returns the last
-        step at which a replay fails; 0 if all minimal maps replay to the end.
+        A map of a prefix that replays to the end at this cost is minimal, so it is yielded at once.
         """
-        enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
+        given = set[int]()  # hashes of maps, for maps that a longer prefix shows again
+        self._name_more_paths(self._known.cost)
+        while stuck := (yield from self._maps_of_prefix(given)):
+            self.engine.grow(self.engine.next_size(stuck))
+            self._name_more_paths(self._known.cost)
+
+    def _maps_of_prefix(self, given: set[int]) -> Generator[SSHMap, None, int]:
+        """Yield the minimal maps of this prefix, until one does not replay to the end.
+
+        Returns the step at which its replay fails; 0 if all minimal maps replay to the end. Maps in
+        `given` are left out, and maps that a later list may show again are added to it.
+        """
         asked = self._most and self._most + 1
-        streaming = self.engine.size == len(self._task.trace)
-        stuck, can_forbid = 0, True
-        given = set[SSHMap]()  # maps that were yielded or held, if evidence may reject others
+        is_listed_once = (
+            not asked and not self._judging.may_refuse and self.engine.size == len(self._task.trace)
+        )
+        can_forbid = True
         while True:
             came, refusal = 0, None
             for found in self.engine.maps_of_cost(self._known.cost, asked):
                 came += 1
-                # 1. A map that does not replay to the end shows that the prefix has to grow.
                 replayed = self._replay(found.map)
                 if replayed.outcome is not Outcome.PREDICTED:
-                    stuck = max(stuck, len(replayed.labels))
-                    if not streaming:
-                        break
-                    continue
-                # 2. Leave out maps that were given before, of this prefix or of an earlier one.
+                    return len(replayed.labels)
                 whole = self._whole(found.map, replayed)
-                if whole in given or any(
-                    self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed
-                ):
+                key = hash(whole)
+                if key in given:
                     continue
-                # 3. Leave out maps that evidence rejects. If the engine can forbid them, list anew.
-                remembers = self._judging.may_refuse and (asked or len(given) < REMEMBERED)
+                # Leave out maps that evidence rejects. If the engine can forbid them, list anew.
                 if self._judging.why_refused(whole):
-                    refusal = (
-                        self._judging.why_refused(found.map) if can_forbid and remembers else None
-                    )
+                    refusal = self._judging.why_refused(found.map) if can_forbid else None
                     if refusal:
                         break
                     continue
-                if remembers:
-                    given.add(whole)
-                # 4. Give the map, or hold it back until its prefix is known to be long enough.
-                if streaming:
-                    yield whole
-                    continue
-                held.append(whole)
-                if len(held) == enough:
-                    streaming = True
-                    yield from held
-                    held.clear()
+                if not is_listed_once:
+                    given.add(key)
+                yield whole
             if refusal:
                 can_forbid = self._forbid_in_engine(refusal)
-                continue
-            if stuck or not asked or came < asked:
-                break
-            # Clingo stopped at the number of maps asked for. But evidence rejected some of these,
-            # so ask for more.
-            asked *= 2
-        if stuck and streaming:
-            streamed.append(self.engine.size)
-        return stuck
+            elif asked and came >= asked:
+                # Clingo stopped at the number of maps asked for, and some of these were left out.
+                asked *= 2
+            else:
+                return 0
 
-    def _replay(self, ssh_map: SSHMap, known: int | None = None) -> Replay:
+    def _replay(self, ssh_map: SSHMap) -> Replay:
         """Replay the trace over a map of a prefix.
 
         If stars (the openings seen at a step) need to agree only within their spread, also find out
-        at the end whether the stars of all steps fit the map. If `known` is given, use only the
-        links between the first `known` steps.
+        at the end whether the stars of all steps fit the map.
         """
         log = self._task.log
         replayed = log.replay(
-            ssh_map.dstate_at, known, [s.place for s in ssh_map.dstates] if log.pairs else None
+            ssh_map.dstate_at, [s.place for s in ssh_map.dstates] if log.pairs else None
         )
         replays = replayed.outcome is Outcome.PREDICTED and len(ssh_map.dstate_at) < len(
             replayed.labels
