@@ -1,58 +1,18 @@
-"""The map that joins only what it must exists if, and only if, the trace has a map at all."""
+"""Clashes: steps that have no map by themselves, found after a limit."""
 
 from __future__ import annotations
 
-import random
 from pathlib import Path
 from unittest.mock import Mock, patch
 
 import pytest
-from brute_force import consistent_maps
 
-from ssh_abduction import SSHMap, Theory, Trace, check, solve
+from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main, outcome
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.solver import Search, Status, candidates
 from ssh_abduction.solver.search import clash_in
-from ssh_abduction.solver.sources.symbolic.sketched import separate_map
 from ssh_abduction.theory.settle import settle
-
-ACTIONS = ("travel", "around", "around", "around", "right", "left")
-THEORIES = (
-    Theory(star="none"),
-    Theory(star="none", boundary="none", path_order="partial"),
-    Theory(star="none", all_on_paths=True),
-    Theory(star="pattern", boundary="none"),
-)
-STARS = ((1, 0, 0, 0), (0, 1, 0, 0), (1, 1, 0, 0))
-
-
-def turning(seed: int, steps: int, views: str, actions: tuple[str, ...] = ACTIONS) -> Trace:
-    """A trace of random actions and views, with many turns around."""
-    chance = random.Random(seed)
-    done = chance.choices(actions, k=steps)
-    stars = chance.choices(STARS[: chance.choice((2, 3))], k=steps + 1)
-    return Trace.from_steps(chance.choices(views, k=steps + 1), done, stars=stars)
-
-
-@pytest.mark.parametrize("theory", THEORIES, ids=range(len(THEORIES)))
-def test_separate_map_exists_if_any_map_does(theory: Theory) -> None:
-    exists = []
-    for seed in range(25):
-        trace = turning(seed, 5, "aaab")
-        settled = settle(trace, theory).theory
-        found = separate_map(trace, settled)
-        exists.append(next(iter(consistent_maps(trace, theory)), None) is not None)
-        assert (found is not None and not check(trace, found, theory)) == exists[-1], seed
-    assert 5 < sum(exists) < 25
-
-
-def test_turns_around_that_show_new_views_have_a_quick_map() -> None:
-    """Steps 0 and 2 look alike, but a turn around leads from them to different views."""
-    search = Search(Trace.from_steps("abac", ["around"] * 3), Theory(star="none"))
-    search.parts.candidates.sketch()
-    assert search.parts.known.best is not None
-    assert search.parts.known.best.dstate_at == (0, 1, 2, 3)
 
 
 def test_clash_of_a_whole_visit_is_found_after_the_limit(

@@ -163,7 +163,6 @@ def test_each_sketch_gets_a_share_of_the_time() -> None:
     with (
         patch.multiple(search, OVERTIME=100.0),
         patch.object(candidates.Candidates, "_go_on_to_end", deaf),
-        patch.object(candidates.Candidates, "_offer_separate", lambda _: None),
         patch.object(candidates.Candidates, "beam", lambda *_: None),
     ):
         assert solve(trace, time_limit=1e-6).status is Status.UNKNOWN

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import threading
-from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from functools import partial
@@ -26,9 +25,7 @@ from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.symbolic.sketch import Sketch, sketch_beyond, sketches_of
 from ssh_abduction.solver.sources.symbolic.sketched import (
     first_contradiction,
-    has_no_frames,
     mended_sketch,
-    separate_map,
 )
 from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
 from ssh_abduction.solver.values import Found
@@ -208,48 +205,26 @@ class Candidates:
         kinds: list[Callable[[], None]] = [
             partial(self._go_on_to_end, sketch) for sketch in sketches
         ]
-        if has_no_frames(theory):
-            # The paths of this map often cross where there is no place.
-            kinds.insert(0 if theory.planar else len(kinds), self._offer_separate)
         if theory.misread or theory.slipped or theory.jumped:
             kinds.append(self._offer_mended)
         return [self.merge, *kinds]
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
-        """Extend a map to the end of the trace and offer it, unless a step contradicts it."""
-        if (wrong := first_contradiction(sketch, self._task.trace)) is None:
-            self._offer_or_blame(sketch.map())
-        else:
-            self.contradicting[wrong] = None
+        """Extend a map to the end of the trace and offer it, unless a step contradicts it.
 
-    def _offer_separate(self) -> None:
-        """Offer a map in which steps share a dstate only if the axioms force them to."""
-        trace, theory = self._task.trace, self._task.theory
-        if (ssh_map := separate_map(trace, theory)) is not None:
-            self._offer_or_blame(ssh_map)
-            return
-        # The first steps of a trace contradict no more than all steps.
-        wrong = bisect_left(
-            range(len(trace)),
-            True,
-            lo=1,
-            key=lambda size: separate_map(trace.prefix(size), theory.of_steps(0, size)) is None,
-        )
-        self.contradicting[wrong - 1] = None
-
-    def _offer_or_blame(self, ssh_map: SSHMap) -> None:
-        """Offer a map. If no map is known then, note the steps at which this one breaks axioms."""
-        self.offer(ssh_map)
-        broken = self._judging.broken
-        if self._known.best is None and broken is not None and broken.steps:
-            last = max(broken.steps)
-            # The next travel may put these steps on a path.
-            later = (
-                t
-                for t in range(last, len(self._task.trace) - 1)
-                if self._task.trace.actions[t].kind == "travel"
-            )
-            self.contradicting |= dict.fromkeys((next(later, last - 1) + 1, last))
+        If no map is known then, note the step that contradicts this one, or the last step at which
+        it breaks an axiom. The next travel may put these steps on a path, so note its end, too.
+        """
+        wrong = first_contradiction(sketch, self._task.trace)
+        if wrong is None:
+            self.offer(sketch.map())
+            broken = self._judging.broken
+            if self._known.best is None and broken is not None and broken.steps:
+                wrong = max(broken.steps)
+        if wrong is not None:
+            actions = enumerate(self._task.trace.actions[wrong:], wrong)
+            later = (t + 1 for t, action in actions if action.kind == "travel")
+            self.contradicting |= dict.fromkeys((wrong, next(later, wrong)))
 
     def _offer_mended(self) -> None:
         """Offer a map made without a search. Treat steps that contradict it as wrong."""
@@ -288,7 +263,8 @@ class Candidates:
 
 def has_quick_map(trace: Trace, theory: Theory) -> bool:
     """Whether the checker accepts one of the surest maps that are made without a search."""
-    maps = [separate_map(trace, theory)] if has_no_frames(theory) else []
-    sketches = sketches_of(trace.steps[0], theory)[-2:]
-    maps += [sketch.map() for sketch in sketches if first_contradiction(sketch, trace) is None]
-    return any(m is not None and next(violations(trace, m, theory), None) is None for m in maps)
+    return any(
+        first_contradiction(sketch, trace) is None
+        and next(violations(trace, sketch.map(), theory), None) is None
+        for sketch in sketches_of(trace.steps[0], theory)[-2:]
+    )
