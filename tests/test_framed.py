@@ -115,7 +115,6 @@ def test_framed_maps_equal_those_of_the_plain_encoding(
     }
     fitted = {
         "BETTERING": data.draw(st.sampled_from([0, fitting.BETTERING]), label="bettering"),
-        "CLASHES": data.draw(st.sampled_from([1, fitting.CLASHES]), label="clashes"),
     }
     many_pairs = data.draw(st.sampled_from([5, same.MANY_PAIRS]), label="many pairs")
     off = off - {"names"}
@@ -220,7 +219,7 @@ def test_framed_mapper_maps_a_maze_step_by_step() -> None:
             search = mapper._keeper.search
             engine = search and search.parts.prefixes.engine
             if isinstance(engine, LabelsFirst):
-                paths.add((engine._labels.program.batch, len(engine._labels.program._said)))
+                paths.add((engine._labels.program.batch, len(engine._labels.program._paths)))
     assert max(paths)[0] > 5
     assert any(told for _, told in paths)
 
@@ -357,7 +356,7 @@ def test_lazy_rules_for_order_and_sides_give_the_same_maps() -> None:
     expected = solve(walk.trace, Theory.topological(), max_maps=None)
     for off, kind, asked in (
         ("", VisitProgram, "give_sides"),
-        ("sides", Fitting, "clashes"),
+        ("sides", Fitting, "clash"),
     ):
         finding = patch.object(kind, asked, autospec=True, side_effect=getattr(kind, asked))
         with finding as found:
@@ -379,13 +378,13 @@ def test_refused_path_becomes_a_rule_for_clingo() -> None:
     assert asked._fitting
     labels = asked._labels.fewest()
     assert isinstance(labels, list)
-    contrary, twice = asked._fitting.contrary(labels)
+    contrary = asked._fitting.contrary(labels)
     program = asked._labels.program
     standing = {labels[node]: program.chart.facing[node] for node in program.place_of}
     assert contrary
-    assert asked._labels.give_sides(labels, contrary, twice)
-    (told,) = asked._labels.program._said
-    assert told in {("path", standing[dstate]) for dstate in contrary}
+    assert asked._labels.give_sides(labels, contrary)
+    (told,) = asked._labels.program._paths
+    assert told in {standing[dstate] for dstate in contrary}
 
 
 @pytest.mark.parametrize(
@@ -410,7 +409,7 @@ def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
         assert labels
         chart = engine._labels.chart
         control = engine._fitting._base(labels, engine._fitting._members(labels))
-        contrary, _ = engine._fitting.contrary(labels)
+        contrary = engine._fitting.contrary(labels)
         contradicted += len(contrary)
 
         def atoms(name: str, arity: int, control: Control = control) -> set[tuple[int, ...]]:

@@ -39,9 +39,6 @@ from ssh_abduction.theory.pairs import Earlier
 # computed in a matrix of steps x steps (64 MB at most) for at most this many steps. In longer
 # traces, only the pairs that evidence names are excluded.
 COMPARED = 8000
-# Improve the greedy clique of one view by at most this many swaps, or by an eighth of the steps
-# with the view if that is less. A swap takes as long as growing a clique, and clingo has to wait.
-SWAPS = 60
 
 Matrix = NDArray[np.bool_]
 
@@ -191,11 +188,11 @@ def _ranked(keys: NDArray[np.int_]) -> NDArray[np.int_]:
 
 def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
     """Grow a clique among the nodes of each view, greedily. Return their union, sorted."""
-    shown = np.asarray(seen)
+    shown, random = np.asarray(seen), np.random.default_rng(0)
     found: list[int] = []
     for view in range(int(shown.max()) + 1):
         steps = np.flatnonzero(shown == view)
-        found += [int(steps[i]) for i in _greedy_clique(apart[np.ix_(steps, steps)])]
+        found += [int(steps[i]) for i in grown_clique(apart[np.ix_(steps, steps)], [], random)]
     return sorted(found)
 
 
@@ -226,17 +223,6 @@ def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) 
     for g, h in pairs:
         rivals[number[g], number[h]] = rivals[number[h], number[g]] = g != h
     return [members[i] for i in large_clique(rivals)]
-
-
-def _greedy_clique(apart: Matrix) -> list[int]:
-    """Grow a clique greedily, and improve it: remove some of its nodes, and grow it again."""
-    random = np.random.default_rng(0)
-    best = grown_clique(apart, [], random)
-    for _ in range(min(SWAPS, len(apart) // 8) if 1 < len(best) < len(apart) else 0):
-        kept = random.permutation(best)[random.integers(1, len(best)) :]
-        other = grown_clique(apart, kept.tolist(), random)
-        best = other if len(other) >= len(best) else best
-    return best
 
 
 def grown_clique(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:

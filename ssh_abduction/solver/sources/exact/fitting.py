@@ -19,13 +19,13 @@ alone is a similar problem. So clingo also gets the few *homes* that each place 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import permutations
 from typing import TypeAlias
 
 import numpy as np
-from clingo import Function, Model
+from clingo import Model
 from numpy.typing import NDArray
 
 from ssh_abduction.data.drives import stretches_of
@@ -35,7 +35,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, Control, mapped
-from ssh_abduction.solver.asp.facts import number_symbols, places_in_order, read_atom
+from ssh_abduction.solver.asp.facts import places_in_order, read_atom
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.steps.apart import pairwise_distinct
 from ssh_abduction.solver.steps.chart import Chart, FramedChart, Link
@@ -46,11 +46,6 @@ from ssh_abduction.theory.theory import Theory
 
 # After this many conflicts, stop improving paths one by one; raise the bound from below instead.
 BETTERING = 20_000
-# Give clingo up to this many clashes at once. Each of them saves a question, and one control lists
-# them all.
-CLASHES = 30
-# With these options, clasp lists the answers with minimal sets of shown atoms.
-SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 # Clasp prepares to solve for about these multiples of the time and the memory that grounding took.
 # It cannot be stopped meanwhile.
 PREPARING = (1.6, 2.1)
@@ -62,8 +57,8 @@ KEPT = 10
 SEGMENTS = ("base", "again", "segments")
 PLACES = ("least", "paths")
 
-# A path and two of its places, the earlier one first.
-_Ahead: TypeAlias = tuple[int, int, int]
+# For each predicate, the arguments of its atoms in an answer.
+_Answer: TypeAlias = dict[str, list[tuple[int, ...]]]
 # The labels of all nodes, and the options of clasp.
 _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...]]
 
@@ -135,7 +130,7 @@ class Fitting:
         reader = self._reader(labels, options)
         most, control = int(mode == "ignore"), reader.control
         answers = self._asker.answers(
-            reader.read, mode, most, control=control, conflicts=conflicts, ahead=True
+            read_answer, mode, most, control=control, conflicts=conflicts, ahead=True
         )
         theory = self.task.theory
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), theory), answers))
@@ -151,47 +146,23 @@ class Fitting:
         self._controls[question] = control
         return PathReader(control, self.task.trace, self.task.theory, self._chart, labels)
 
-    def contrary(self, labels: Sequence[int]) -> tuple[list[int], list[int]]:
-        """Find out why no places and paths fit labels.
+    def contrary(self, labels: Sequence[int]) -> list[int]:
+        """List a dstate of each segment that contradicts the axioms, the shortest segment first."""
+        control = self._base(labels, self._members(labels))
+        length = Counter(dstate for dstate, *_ in _atoms(control, "on_segment", 3))
+        found = (dstate for (dstate,) in _atoms(control, "contrary", 1))
+        return sorted(found, key=lambda dstate: (length[dstate], dstate))
 
-        Returns a dstate of each segment that contradicts the axioms, the shortest segment first.
-        Also returns the dstates at which two paths cross, if these paths seem to meet again.
-        """
-        control = self._base(labels, self._members(labels), ("base", "again"))
-        atoms = control.symbolic_atoms
-        length: dict[int, int] = {}
-        for atom in atoms.by_signature("on_segment", 3):
-            dstate = atom.symbol.arguments[0].number
-            length[dstate] = length.get(dstate, 0) + 1
+    def clash(self, labels: Sequence[int]) -> list[Member]:
+        """Find a clash of these labels, which no places and paths fit."""
 
-        def found(name: str, arity: int) -> set[int]:
-            return {x.symbol.arguments[0].number for x in atoms.by_signature(name, arity)}
-
-        contrary = sorted(found("contrary", 1), key=lambda dstate: (length[dstate], dstate))
-        return contrary, sorted(found("again", 2))
-
-    def clashes(self, labels: Sequence[int]) -> list[list[Member]]:
-        """Find up to `CLASHES` clashes of these labels, which no places and paths fit."""
-        members = self._members(labels)
-        control = self._base(labels, members)
-        if control.symbolic_atoms[Function("violated")] is not None:
-            # Clingo finds sets that clash whichever segments and places are one.
-            control = self._base(labels, members, ("base", "clash"), SMALLEST, chosen=True)
-            numbers = self._asker.answers(
-                lambda model: [x.arguments[0].number for x in model.symbols(shown=True)],
-                "ignore",
-                CLASHES,
-                control=control,
-            )
-            return [[members[number] for number in sorted(found)] for found in numbers]
-
-        def clash(some: list[Member]) -> bool:
+        def clashes(some: list[Member]) -> bool:
             return not any(
                 self._has_answer(self._control(labels, some, single=single))
                 for single in (True, False)
             )
 
-        return [minimal_part(clash, members)]
+        return minimal_part(clashes, self._members(labels))
 
     def _has_answer(self, control: Control) -> bool:
         """Whether a control has an answer, that is, places and paths."""
@@ -232,13 +203,11 @@ class Fitting:
         parts: Iterable[str] = ("base",),
         options: Sequence[str] = (),
         *,
-        chosen: bool = False,
         whole: bool = False,
     ) -> Control:
         """Make a control of paths.lp for some members, with these parts ground.
 
-        If `chosen`, clingo chooses a subset of the members. If `whole`, the labels of all nodes
-        count; otherwise only those that the members name.
+        If `whole`, the labels of all nodes count; otherwise only those that the members name.
         """
         theory, where = self.task.theory, self._where(labels)
         dstates = where if whole else [where[step] for member in members for step in member.steps]
@@ -246,9 +215,7 @@ class Fitting:
         base += facts.preferred(theory)
         base += facts.sides(theory)
         base += ["total."] if theory.path_order == "total" else []
-        for number, member in enumerate(members):
-            base += [f"{{ member({number}) }}."] if chosen else []
-            base += [f"{x} :- member({number})." if chosen else f"{x}." for x in member.atoms]
+        base += [f"{atom}." for member in members for atom in member.atoms]
         if isinstance(self._chart, FramedChart):
             # All nodes of a dstate see the same star (openings), so take any of them.
             for label, node in {label: node for node, label in enumerate(labels)}.items():
@@ -317,17 +284,15 @@ def _distinct(control: Control) -> list[str]:
     Such places are *fixed*. If all other places of a map are among the fixed ones, each is one of
     its homes.
     """
-    atoms = control.symbolic_atoms
-
-    def found(name: str, arity: int) -> list[tuple[int, ...]]:
-        return [read_atom(atom.symbol)[1] for atom in atoms.by_signature(name, arity)]
-
-    segments, places = (sorted(x for (x,) in found(name, 1)) for name in ("segment", "visited"))
-    different = set(found("distinct", 3))
+    segments, places = (
+        sorted(x for (x,) in _atoms(control, name, 1)) for name in ("segment", "visited")
+    )
+    different = set(_atoms(control, "distinct", 3))
     rivals = sorted((g, h) for g, h, d in different if d == 1 and (g, h, -1) in different)
-    elsewhere = sorted((c, p) for c, p in found("elsewhere", 2))
+    elsewhere = sorted((c, p) for c, p in _atoms(control, "elsewhere", 2))
     fixed = pairwise_distinct(places, elsewhere)
-    homes = homes_of(places, fixed, elsewhere, [(g, c, b) for g, c, b in found("travel_on", 3)])
+    travels = [(g, c, b) for g, c, b in _atoms(control, "travel_on", 3)]
+    homes = homes_of(places, fixed, elsewhere, travels)
     return [
         *(f"pinned({segment})." for segment in pairwise_distinct(segments, rivals)),
         *(f"fixed({place})." for place in fixed),
@@ -402,28 +367,10 @@ def _may_follow(pairs: list[tuple[int, int]], columns: list[int]) -> NDArray[np.
     return follows
 
 
-@dataclass(frozen=True, slots=True)
-class PathAnswer:
-    """The places and paths in an answer of paths.lp.
-
-    Attributes:
-        at: For each group of dstates connected by turns: its place in the map, and the rotation
-            from the frame of this place to the frame of the group, in quarters clockwise.
-        part: For each segment, its path, and its direction on the path (1 or -1).
-        order: For each path, its places in order.
-    """
-
-    at: dict[int, tuple[int, int]]
-    part: dict[int, tuple[int, int]]
-    order: dict[int, list[int]]
-
-
 class PathReader:
     """Reads maps from answers of paths.lp, for fixed labels.
 
-    It asks clingo whether single atoms are in an answer, beginning with the atoms of the last
-    answer. That takes a third of the time of reading all atoms. Values that follow from the labels
-    are computed once.
+    Values that follow from the labels are computed once.
 
     Attributes:
         control: The control whose answers are the places and paths.
@@ -432,120 +379,49 @@ class PathReader:
     def __init__(
         self, control: Control, trace: Trace, theory: Theory, chart: Chart, labels: Sequence[int]
     ) -> None:
-        self.control = control
-        stands, runs = (
-            {a: (b, c) for a, b, c in _literals(control, name)} for name in ("stands", "runs")
-        )
+        self.control, self._framed = control, theory.star == "frame"
+        stands = {label: (c, slot) for label, c, slot in _atoms(control, "stands", 3)}
+        runs = {label: (g, direction) for label, g, direction in _atoms(control, "runs", 3)}
         where = [labels[node] for node in chart.node_of]
-        first = first_index_of(where)  # for each label, the first step at its dstate
         self._labels = tuple(numbered(where))
         self._links = links_of(self._labels, trace)
-        self._dstates = [(view_at(trace, t), *stands[label]) for label, t in first.items()]
-        # For each segment, the dstates on it, and whether they face its direction (1) or not (-1).
-        on_paths = [(i, *runs[label]) for i, label in enumerate(first) if label in runs]
-        self._runs = gathered((segment, (i, direction)) for i, segment, direction in on_paths)
-        self._passes = {
-            (segment, self._dstates[i][1]): None
-            for segment, members in self._runs.items()
-            for i, _ in members
-        }
-        self._at, self._part = _Options(control, "at"), _Options(control, "course")
-        self._total, self._framed = theory.path_order == "total", theory.star == "frame"
-        # The literals of atoms of `before`; 0 if an atom is never true.
-        self._before: dict[_Ahead, int] = {}
-        # For each path, its places in order in the answer that was read last.
-        self._order: dict[int, list[int]] = {}
+        # For each dstate: its view, its place before any two are one, the slot that it faces there,
+        # and its segment with the direction that it faces, or None.
+        self._dstates = [
+            (view_at(trace, t), *stands[label], runs.get(label))
+            for label, t in first_index_of(where).items()
+        ]
 
-    def read(self, model: Model) -> PathAnswer:
-        """Read everything that `map_of` needs from an answer. Then clingo may change the answer."""
-        at, part = self._at.made_in(model), self._part.made_in(model)
-        on: dict[int, dict[int, None]] = {}  # for each path, the places on it
-        for segment, component in self._passes:
-            on.setdefault(part[segment][0], {})[at[component][0]] = None
-        return PathAnswer(
-            at, part, {path: self._ordered(model, path, places) for path, places in on.items()}
-        )
-
-    def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
-        """Sort the places of a path. Their order in the last answer saves questions to clingo."""
-        order = list(
-            dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places])
-        )
-        if self._total:
-            # Insertion sort compares few pairs if the places are nearly in order.
-            for i, place in enumerate(order):
-                to = i
-                while to and not self._is_before(model, (path, order[to - 1], place)):
-                    to -= 1
-                order.insert(to, order.pop(i))
-        else:
-            order = places_in_order(
-                places,
-                (pair for pair in permutations(places, 2) if self._is_before(model, (path, *pair))),
-            )
-        self._order[path] = order
-        return order
-
-    def _is_before(self, model: Model, ahead: _Ahead) -> bool:
-        """Return whether an answer has the first of two places of a path before the second."""
-        literal = self._before.get(ahead)
-        if literal is None:
-            atom = model.context.symbolic_atoms[Function("before", number_symbols(*ahead))]
-            literal = self._before[ahead] = atom.literal if atom else 0
-        return literal != 0 and model.is_true(literal)
-
-    def map_of(self, answer: PathAnswer) -> SSHMap:
+    def map_of(self, answer: _Answer) -> SSHMap:
         """Make the map that an answer describes."""
-        # For each path, its number in the map, and the direction that its first dstate faces.
-        faced: dict[int, tuple[int, int]] = {}
-        course: dict[int, tuple[int, int]] = {}
-        for segment, members in self._runs.items():
-            h, ahead = answer.part[segment]
-            path, first = faced.setdefault(h, (len(faced), ahead * members[0][1]))
-            course |= {i: (path, ahead * first * direction) for i, direction in members}
-        # For each place, its number in the map, and the slot that its first dstate faces.
-        arrived: dict[int, tuple[int, int]] = {}
+        at = {c: (place, turned) for c, place, turned in answer["at"]}
+        course = {g: (path, direction) for g, path, direction in answer.get("course", ())}
+        ahead: dict[int, int] = {}  # for each place, the slot that its first dstate faces
         dstates: list[DState] = []
-        for i, (view, component, slot) in enumerate(self._dstates):
-            p, turned = answer.at[component]
-            place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
-            path_of, direction = course.get(i, (None, None))
-            heading = (slot + turned - facing) % 4 if self._framed else None
-            dstates.append(DState(i, view, place, path_of, direction, heading))
+        on: dict[int, dict[int, None]] = {}  # for each path, its places
+        for i, (view, c, slot, run) in enumerate(self._dstates):
+            place, turned = at[c]
+            facing = slot + turned
+            heading = (facing - ahead.setdefault(place, facing)) % 4 if self._framed else None
+            path = direction = None
+            if run is not None:
+                path, direction = course[run[0]]
+                direction *= run[1]
+                on.setdefault(path, {})[place] = None
+            dstates.append(DState(i, view, place, path, direction, heading))
+        before = gathered((h, (p, q)) for h, p, q in answer.get("before", ()))
         paths = tuple(
-            MapPath(path, tuple(arrived[p][0] for p in answer.order[h][::first]))
-            for h, (path, first) in faced.items()
+            MapPath(h, tuple(places_in_order(places, before.get(h, ()))))
+            for h, places in on.items()
         )
-        return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(arrived))), paths)
+        return SSHMap(self._labels, tuple(dstates), self._links, tuple(ahead), paths).renumbered()
 
 
-class _Options:
-    """Reads the atoms of a predicate that chooses, for each first argument, the other two.
-
-    In each answer there is exactly one atom for each first argument.
-    """
-
-    def __init__(self, control: Control, name: str) -> None:
-        # For each first argument, the literals of its atoms, and their other arguments.
-        literals = _literals(control, name).items()
-        self._among = gathered((a, (literal, (b, c))) for (a, b, c), literal in literals)
-
-    def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
-        """Return a dict from the first argument to the other two that an answer chooses for it."""
-        made = {}
-        # Ask first about the atoms that the last answer had.
-        for a, among in self._among.items():
-            if len(among) > 1 and not model.is_true(among[0][0]):
-                taken = next(i for i, (literal, _) in enumerate(among) if model.is_true(literal))
-                among.insert(0, among.pop(taken))
-            made[a] = among[0][1]
-        return made
+def read_answer(model: Model) -> _Answer:
+    """Read the atoms of an answer. Then clingo may change the answer."""
+    return gathered(map(read_atom, model.symbols(shown=True)))
 
 
-def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
-    """Return a dict from the three arguments of each atom of a predicate to its literal."""
-    found = {}
-    for atom in control.symbolic_atoms.by_signature(name, 3):
-        a, b, c = read_atom(atom.symbol)[1]
-        found[a, b, c] = atom.literal
-    return found
+def _atoms(control: Control, name: str, arity: int) -> list[tuple[int, ...]]:
+    """List the arguments of all atoms of a predicate."""
+    return [read_atom(x.symbol)[1] for x in control.symbolic_atoms.by_signature(name, arity)]

@@ -13,8 +13,8 @@ So labels are found first: the dstate of each step.
 are at one place, and how their frames are turned (`visit_labels.py`). Both search with the causal
 axioms. If no places and paths fit the labels (`fitting.py`), clingo gets the axioms of order and
 sides for some paths that the labels contradict (sides_frameless.lp, sides_framed.lp). Mostly a
-dozen paths are enough. If no single path is contradicted, clingo gets a rule against each *clash*,
-a minimal set of links that no places and paths fit.
+dozen paths are enough. If no single path is contradicted, clingo gets a rule against a *clash*, a
+minimal set of links that no places and paths fit.
 
 *Claim.* Each map of the topological theory is an answer of the search for labels, with the number
 of dstates as its cost.
@@ -183,9 +183,9 @@ class LabelsFirst:
         """Give clingo rules that exclude these labels, as no places and paths fit them."""
         assert self._fitting is not None
         if self._labels.take_back(labels) and not self._labels.give_sides(
-            labels, *self._fitting.contrary(labels)
+            labels, self._fitting.contrary(labels)
         ):
-            self._labels.forbid(labels, self._fitting.clashes(labels))
+            self._labels.forbid(labels, self._fitting.clash(labels))
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         equalities = in_fixed_order(equalities)

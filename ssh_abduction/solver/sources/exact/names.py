@@ -224,22 +224,19 @@ class NamedLabels:
             self._known = None
         return list(labels) != given
 
-    def give_sides(
-        self, labels: Sequence[int], contrary: Sequence[int], twice: Sequence[int]
-    ) -> bool:
+    def give_sides(self, labels: Sequence[int], contrary: Sequence[int]) -> bool:
         """Give clingo the axioms of paths that labels contradict. Return whether any are new."""
         return self.program.give_sides(contrary)
 
-    def forbid(self, labels: Sequence[int], clashes: Iterable[Sequence[Member]]) -> None:
-        """Exclude all labels with the links of some clash, and with these labels of its steps."""
-        for clash in clashes:
-            placed = {step for member in clash if not member.link for step in member.steps}
-            self.program.add_links_at(placed)
-            body = [
-                *("goes({},{},{})".format(*member.link) for member in clash if member.link),
-                *(f"is({step},{labels[step]})" for step in sorted(placed)),
-            ]
-            self._asker.control.tell(f":- {', '.join(body)}.")
+    def forbid(self, labels: Sequence[int], clash: Sequence[Member]) -> None:
+        """Exclude all labels with the links of a clash, and with these labels of its steps."""
+        placed = {step for member in clash if not member.link for step in member.steps}
+        self.program.add_links_at(placed)
+        body = [
+            *("goes({},{},{})".format(*member.link) for member in clash if member.link),
+            *(f"is({step},{labels[step]})" for step in sorted(placed)),
+        ]
+        self._asker.control.tell(f":- {', '.join(body)}.")
 
     def forbid_together(self, equalities: Collection[Equality]) -> None:
         """Exclude labels in which both steps of each of these equalities are at one dstate.

@@ -261,42 +261,33 @@ class VisitLabels:
             self._found.remove(refused)
         return True
 
-    def give_sides(
-        self, labels: Sequence[int], contrary: Sequence[int], twice: Sequence[int]
-    ) -> bool:
+    def give_sides(self, labels: Sequence[int], contrary: Sequence[int]) -> bool:
         """Give clingo the axioms of a path that labels contradict. Return whether they are new."""
         return (
             self.task.speedups.sides
             and len(self.program.fits) <= MANY_PAIRS
-            and self.program.give_sides(contrary, twice, labels)
+            and self.program.give_sides(labels, contrary)
         )
 
-    def forbid(self, labels: Sequence[int], found: Iterable[Iterable[Member]]) -> None:
-        """Exclude all labels that agree with the given ones on the steps of some clash.
+    def forbid(self, labels: Sequence[int], clash: Iterable[Member]) -> None:
+        """Exclude all labels that agree with the given ones on the steps of a clash.
 
         To agree means that two nodes of the clash share a dstate exactly if they have one label.
         """
         program, node_of = self.program, self.chart.node_of
-        clashes = [
-            list(dict.fromkeys(node_of[step] for member in clash for step in member.steps))
-            for clash in found
-        ]
-        clashing = {self.chart.facing[node][0] for clash in clashes for node in clash}
-        if unknown := clashing - program.visits:
+        nodes = list(dict.fromkeys(node_of[step] for member in clash for step in member.steps))
+        if unknown := {self.chart.facing[node][0] for node in nodes} - program.visits:
             self._give_more(unknown)
-        rules = []
-        for clash in clashes:
-            first = {labels[node]: node for node in clash}
-            different = [
-                pair
-                for a, b in combinations(first.values(), 2)
-                if (pair := program.pair(a, b)) in program.fits
-            ]
-            together = program.spanning(labels, clash)
-            # If some do not fit, clingo cannot find such labels anyway.
-            if program.fits.issuperset(together):
-                rules.append(forbidden_pairs(together, different))
-        program.add_rules("\n".join(rules))
+        first = {labels[node]: node for node in nodes}
+        different = [
+            pair
+            for a, b in combinations(first.values(), 2)
+            if (pair := program.pair(a, b)) in program.fits
+        ]
+        together = program.spanning(labels, nodes)
+        # If some do not fit, clingo cannot find such labels anyway.
+        if program.fits.issuperset(together):
+            program.add_rules(forbidden_pairs(together, different))
 
     def forbid_together(self, equalities: Collection[Equality]) -> None:
         """Exclude labels in which all of these equalities of steps hold.
@@ -364,8 +355,8 @@ class VisitProgram:
         self._pairs_said: set[Pair] = set()
         self._places_said: set[tuple[int, int]] = set()
         self._closed = 0  # how often rules of transitivity were given
-        # The grounded program parts of sides_framed.lp, with their arguments.
-        self._said: dict[tuple[str, tuple[int, ...]], None] = {}
+        # The paths for which sides_framed.lp is grounded, each by a visit and a slot.
+        self._paths: dict[tuple[int, int], None] = {}
 
     def give(
         self, chart: FramedChart, visits: set[int], order: Iterable[int], fits: frozenset[Pair]
@@ -417,12 +408,8 @@ class VisitProgram:
         first = (Function("first", number_symbols(place)) for place, *_ in nodes)
         atoms = control.symbolic_atoms
         self.least += sum(atom.is_fact for one in first if (atom := atoms[one]))
-        if self._said:  # the axioms of paths also hold for the new visits
-            paths = [
-                (part, number_symbols(*arguments, self.batch))
-                for part, arguments in self._said
-                if part == "path"
-            ]
+        if self._paths:  # the axioms of paths also hold for the new visits
+            paths = [("path", number_symbols(*path, self.batch)) for path in self._paths]
             control.ground([("paths", number_symbols(self.batch)), *paths])
 
     def _joined(self) -> set[Pair]:
@@ -498,45 +485,27 @@ class VisitProgram:
         (i, s), (j, t) = sorted((self.chart.facing[a], self.chart.facing[b]))
         return i, j, (t - s) % 4
 
-    def give_sides(
-        self, contrary: Iterable[int], twice: Iterable[int], labels: Sequence[int]
-    ) -> bool:
-        """Add the axioms of a path that labels contradict, and return whether there was one.
+    def give_sides(self, labels: Sequence[int], contrary: Iterable[int]) -> bool:
+        """Add the axioms of a path that labels contradict, and return whether there was a new one.
 
-        `contrary` has a dstate of each path that contradicts the axioms. `twice` has the dstates
-        where two paths cross that meet again.
+        `contrary` has a dstate of each path that contradicts the axioms.
         """
         # For each dstate that has a node in clingo: the visit and the slot of such a node.
         standing = {labels[node]: self.chart.facing[node] for node in self.place_of}
-        if any(self._say_once("path", *standing[dstate]) for dstate in contrary):
-            return True
-        for visit in (standing[dstate][0] for dstate in twice):
-            said = [
-                self._say_once("path", visit, 0),
-                self._say_once("path", visit, 1),
-                self._say_once("crossing", visit, self.batch),
-            ]
-            if any(said):
-                return True
-        return False
-
-    def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides_framed.lp for these arguments once. Return whether it was new."""
-        if (part, arguments) in self._said:
+        paths = (standing[dstate] for dstate in contrary)
+        path = next((path for path in paths if path not in self._paths), None)
+        if path is None:
             return False
         control, batches = self._asker.control, range(self.batch + 1)
         with self._asker.grounding_timed():
-            if not self._said:
+            if not self._paths:
                 control.load(encodings.path("sides_framed"))
                 control.add("sides", [], "\n".join(sides(self._theory)))
                 control.ground(
                     [("sides", []), *(("paths", number_symbols(batch)) for batch in batches)]
                 )
-            self._said[part, arguments] = None
-            if part == "path":
-                control.ground([(part, number_symbols(*arguments, batch)) for batch in batches])
-            else:
-                control.ground([(part, number_symbols(*arguments))])
+            self._paths[path] = None
+            control.ground([("path", number_symbols(*path, batch)) for batch in batches])
         return True
 
 
