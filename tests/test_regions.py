@@ -330,6 +330,6 @@ def test_causal_map_has_no_regions() -> None:
 def test_time_for_regions_is_shared_among_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     trace = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
     assert all(m.regions for m in solve(trace))
-    monkeypatch.setattr("ssh_abduction.solver.derived_regions.UNITS", UNITS // 20)
+    monkeypatch.setattr("ssh_abduction.solver.derived_regions.UNITS", UNITS // 40)
     have = [m.regions is not None for m in solve(trace)]
     assert 0 < sum(have) < len(have) == 4

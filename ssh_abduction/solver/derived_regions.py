@@ -31,8 +31,8 @@ from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 # Deriving the regions of a map of n dstates takes about STARTING + n² units of 3.5 microseconds. A
-# search spends at most FIRST units on its first map, and UNITS on all its other maps.
-STARTING, FIRST, UNITS = 1000, 100_000, 30_000
+# search spends at most UNITS on all its maps.
+STARTING, UNITS = 1000, 130_000
 
 _Key: TypeAlias = tuple[tuple[object, ...], ...]
 
@@ -98,10 +98,9 @@ class Deriving:
         )
         if key not in self._known:
             units = STARTING + len(ssh_map.dstates) ** 2
-            is_first = not self._known
-            if units > (FIRST if is_first else self._left) or not ssh_map.places:
+            if units > self._left or not ssh_map.places:
                 return ssh_map
-            self._left -= 0 if is_first else units
+            self._left -= units
             self._known[key] = derived(ssh_map, self._trace, self._axioms)
         return replace(ssh_map, regions=self._known[key])
 

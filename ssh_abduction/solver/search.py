@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
-from itertools import groupby, zip_longest
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, get_args
 
 from ssh_abduction.data.checks import one_of
@@ -69,11 +70,9 @@ ONE_MORE_SHARE = 0.1
 OVERTIME, OVERTIME_SHARE = 0.5, 0.05
 # After Ctrl-C, or at the memory limit, it may take this many seconds.
 INTERRUPTED = 0.6
-# If a stopped search has no map, it looks for a clash in stretches of this many steps, for at most
-# CLASHING seconds. A short stretch takes a few hundredths of a second.
-STRETCHES, CLASHING = (2, 3, 4, 6, 8, 12), 0.5
-# After these, it looks in stretches of whole visits to places, of up to VISITS visits.
-VISITS = 12
+# If a stopped search has no map, it looks for a clash in stretches of up to VISITS visits to
+# places, for at most CLASHING seconds. A short stretch takes a few hundredths of a second.
+VISITS, CLASHING = 12, 0.5
 
 COUNTED = (
     "weigh: maps are counted instead of weighed, as no displacements are used whose misfit could "
@@ -603,20 +602,16 @@ def _begins_visit(trace: Trace, step: int) -> bool:
     return step == 0 or trace.actions[step - 1].kind != "turn"
 
 
-def _stretches(trace: Trace, ends: Sequence[int]) -> Iterator[range]:
-    """List stretches of steps that may clash, the shortest first. Each ends at one of `ends`."""
-    for length in STRETCHES:
-        yield from (range(max(t + 1 - length, 0), t + 1) for t in ends if length < len(trace))
-    begins = [
-        [i for i in range(t, -1, -1) if _begins_visit(trace, i)][1 : VISITS + 1] for t in ends
-    ]
+def _stretches(trace: Trace, ends: Sequence[int]) -> list[range]:
+    """List stretches of visits that may clash, the shortest first. Each ends at one of `ends`."""
+    begins = [t for t in range(len(trace)) if _begins_visit(trace, t)]
+    found = dict.fromkeys(
+        range(begins[max(bisect_right(begins, t) - visits, 0)], t + 1)
+        for visits in range(1, VISITS + 1)
+        for t in ends
+    )
     # The whole trace is no stretch: its search would look for the same clash again, without end.
-    for starts in zip_longest(*begins):
-        yield from (
-            range(i, t + 1)
-            for i, t in zip(starts, ends, strict=True)
-            if i is not None and t + 1 - i < len(trace)
-        )
+    return [stretch for stretch in found if len(stretch) < len(trace)]
 
 
 def late_clash(
