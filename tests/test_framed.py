@@ -16,6 +16,7 @@ from strategies import STARS, step_pairs
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.claims import check_bound
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.step import QUARTERS, Action
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Start, Status
@@ -36,8 +37,7 @@ from ssh_abduction.solver.sources.exact.prefixes import Prefixes
 from ssh_abduction.solver.sources.exact.visit_labels import (
     VisitLabels,
     VisitProgram,
-    turn_facts,
-    visit_facts,
+    batch_facts,
 )
 from ssh_abduction.solver.sources.symbolic.merging import merged
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
@@ -437,12 +437,11 @@ def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
             control.load(encodings.path("sides_framed"))
             given = [(node, visit, slot) for node, _, visit, slot in nodes]
             leaves = [(visit, *how) for visit, how in chart.leaves.items()]
-            control.add("visits", [], visit_facts(0, given, leaves, pairs))
-            control.add(
-                "visits",
-                [],
-                turn_facts(0, chart, range(len(chart.stars)), chart.turns(trace)),
-            )
+            news = {"node": given, "leaves": leaves, "fits": pairs}
+            control.add("visits", [], batch_facts(0, news))
+            visits = [(visit,) for visit in range(len(chart.stars))]
+            turns = gathered((kind, tuple(slots)) for kind, *slots in chart.turns(trace))
+            control.add("visits", [], batch_facts(0, {"visit": visits, **turns}))
             control.add("visits", [], "\n".join(facts.sides(theory)))
             control.add("visits", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
             street = ("path", number_symbols(*chart.facing[labels.index(dstate)], 0))
@@ -583,9 +582,9 @@ def test_search_with_a_known_cost_lists_maps_of_the_whole_trace() -> None:
     again = Search(
         trace, Theory.topological(), max_maps=None, _start=Start(after=first.parts, minimal=known)
     )
-    assert not again.prefix
+    assert not again.parts.engine.size
     assert set(again) == set(solve(trace, max_maps=None).maps)
-    assert again.prefix == len(trace)
+    assert again.parts.engine.size == len(trace)
 
 
 def framed_engine(trace: Trace, theory: Theory) -> LabelsFirst:

@@ -198,10 +198,17 @@ class FramedChart(Chart):
             for visit, (node, action, _) in enumerate(self.travels)
         }
 
-    def turns(self, trace: Trace) -> list[tuple[int, str, int]]:
-        """Return the distinct turns of the trace in order, as (node, direction, node)."""
-        steps = zip(pairwise(self.node_of), trace.actions, strict=False)
-        return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
+    def turns(self, trace: Trace) -> list[tuple[str, int, int, int]]:
+        """List the distinct turns of the trace: (kind, visit, slot before, slot after).
+
+        The kind is "about" for a turn around, and "turns" for a turn right or left.
+        """
+        found = dict[tuple[str, int, int, int], None]()
+        for (s, x), action in zip(pairwise(self.node_of), trace.actions, strict=False):
+            if action.turn:
+                kind = "about" if action.turn == "around" else "turns"
+                found[kind, *self.facing[s], self.facing[x][1]] = None
+        return list(found)
 
     def visits_with(self, pairs: int) -> int:
         """Return the greatest n such that `fits` lists at most `pairs` for the first n visits."""

@@ -33,6 +33,7 @@ from collections.abc import (
     Generator,
     Iterable,
     Iterator,
+    Mapping,
     Sequence,
     Set,
 )
@@ -43,7 +44,7 @@ from typing import TypeAlias
 import clingo
 from clingo import Function, Symbol
 
-from ssh_abduction.data.groups import numbered
+from ssh_abduction.data.groups import gathered, numbered
 from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import number_symbols, sides
 from ssh_abduction.solver.sources.exact.engine import Task
@@ -348,10 +349,10 @@ class VisitProgram:
         self.visits: set[int] = set()
         self.place_of: dict[int, int] = {}
         self.fits: frozenset[Pair] = frozenset()
-        # The visits that end, the turns as (node, direction, node), and the pairs of visits that
-        # the user says are at one place, with and without a known rotation.
+        # The visits that end, the turns, and the pairs of visits that the user says are at one
+        # place, with and without a known rotation.
         self._ends: set[int] = set()
-        self._turns: set[tuple[int, str, int]] = set()
+        self._turns: set[tuple[str, int, int, int]] = set()
         self._pairs_said: set[Pair] = set()
         self._places_said: set[tuple[int, int]] = set()
         self._closed = 0  # how often rules of transitivity were given
@@ -389,7 +390,7 @@ class VisitProgram:
         turns = [
             turn
             for turn in chart.turns(self._trace)
-            if turn not in self._turns and chart.facing[turn[0]][0] in visits
+            if turn not in self._turns and turn[1] in visits
         ]
         self._turns.update(turns)
         # More of the trace may separate visits that fitted before.
@@ -400,9 +401,17 @@ class VisitProgram:
         self._pairs_said.update(joined)
         self._places_said.update(together)
         part = f"visits_{self.batch}"
-        facts = visit_facts(self.batch, nodes, leaves, new, unfit, joined, together)
-        control.add(part, [], facts)
-        control.add(part, [], turn_facts(self.batch, chart, added, turns))
+        news: dict[str, Iterable[tuple[int, ...]]] = {
+            "visit": ((visit,) for visit in added),
+            "node": nodes,
+            "leaves": leaves,
+            "fits": new,
+            "unfit": unfit,
+            "joined": joined,
+            "together": together,
+            **gathered((kind, tuple(slots)) for kind, *slots in turns),
+        }
+        control.add(part, [], batch_facts(self.batch, news))
         control.ground([(part, []), ("more", number_symbols(self.batch))])
         control.assign_external(Function("listed", number_symbols(self.batch)), True)
         first = (Function("first", number_symbols(place)) for place, *_ in nodes)
@@ -579,35 +588,12 @@ def _in_order(*visits: tuple[int, int]) -> Three:
     return i, j, k, (b - a) % 4, (c - b) % 4
 
 
-def visit_facts(
-    batch: int,
-    nodes: Iterable[tuple[int, int, int]],
-    leaves: Iterable[tuple[int, int, int]],
-    fits: Iterable[tuple[int, int, int]],
-    unfit: Iterable[tuple[int, int, int]] = (),
-    joined: Iterable[tuple[int, int, int]] = (),
-    together: Iterable[tuple[int, int]] = (),
-) -> str:
-    """Return the facts for one batch.
-
-    Each node (the steps of a visit that face one slot) has its number, visit and slot. `leaves` has
-    each visit that ends, with the slot that it leaves through, and the action. Triples (I, J, R)
-    stand for pairs of visits: `fits` may be at one place, `unfit` of earlier batches are now known
-    not to be, and `joined` are at one place, as the user says. So are the pairs (I, J) of
-    `together`, with any rotation.
-    """
-    new: dict[str, Iterable[tuple[int, ...]]] = {
-        "node": nodes,
-        "leaves": leaves,
-        "fits": fits,
-        "unfit": unfit,
-        "joined": joined,
-        "together": together,
-    }
+def batch_facts(batch: int, news: Mapping[str, Iterable[tuple[int, ...]]]) -> str:
+    """Return the facts for one batch: for each predicate of visits.lp, its other arguments."""
     return "\n".join(
-        f"{name}({batch},{','.join(map(str, args))})."
-        for name, rows in new.items()
-        for args in rows
+        f"{name}({batch},{','.join(map(str, arguments))})."
+        for name, rows in news.items()
+        for arguments in rows
     )
 
 
@@ -633,14 +619,3 @@ def forbidden_pairs(
         *(f"not same({i},{j},{r})" for i, j, r in different),
     ]
     return f":- {', '.join(['#true', *body] if listed is None else [f'listed({listed})', *body])}."
-
-
-def turn_facts(
-    batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]
-) -> str:
-    """Return the facts about a batch: its new visits, and its turns (node, direction, node)."""
-    facts = [f"visit({batch},{visit})." for visit in visits]
-    for s, turn, x in turns:
-        (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]
-        facts.append(f"{'about' if turn == 'around' else 'turns'}({batch},{visit},{slot},{faced}).")
-    return "\n".join(facts)
