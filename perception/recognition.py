@@ -142,15 +142,6 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         held = self._neighbours()
         return np.asarray(held._fit_X), np.asarray(self.classes_)[np.asarray(held._y)]
 
-    def learnt_again(self) -> PlaceRecogniser:
-        """Make a new recogniser from the remembered images and labels. It gives the same answers.
-
-        This checks the remembered tables. scikit-learn's compiled search trusts its tables,
-        so a table that was damaged in a file could crash the process. Damage raises
-        PerceptionError, ValueError, or other errors of numpy.
-        """
-        return PlaceRecogniser(self.n_neighbors).fit(*self.remembered())
-
     def _neighbours(self) -> Any:
         check_is_fitted(self)
         return self.neighbours_
@@ -356,7 +347,10 @@ class ImageLikelihood:
         """
         features = self._features(images)
         for some in np.array_split(features, max(1, math.ceil(len(features) / AT_ONCE))):
-            known, novel = self._of_features(some)
+            distances = _nearest(self.recogniser).distances(some)
+            known = self._log_density(distances**2, self.within)
+            from_centre = np.sum((some - self.centre) ** 2, axis=1)
+            novel = self._log_density(from_centre, self.spread)
             nowhere = logsumexp(np.column_stack([known, novel]), axis=1) - np.log(
                 known.shape[1] + 1
             )
@@ -405,13 +399,6 @@ class ImageLikelihood:
                 "which reads them as nothing seen"
             )
         return features
-
-    def _of_features(
-        self, features: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Log densities of features at each place, (n, c), and at an unknown one, (n,)."""
-        known = self._log_density(_nearest(self.recogniser).distances(features) ** 2, self.within)
-        return known, self._log_density(np.sum((features - self.centre) ** 2, axis=1), self.spread)
 
     def _log_density(self, squares: NDArray[np.float64], mean: float) -> NDArray[np.float64]:
         """Log density of an isotropic Gaussian, at squared distances. `mean` is its variance."""

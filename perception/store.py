@@ -129,10 +129,12 @@ def _check_parts(held: object, path: str | os.PathLike[str]) -> None:
 def _learnt_again(model: Any) -> Any:
     """Copy a model, with place recognisers that learnt their images again.
 
-    Learning again checks the tables of images.
+    Learning again checks the tables of images. scikit-learn's compiled search trusts its tables, so
+    a table that was damaged in a file could crash the process. Damage raises PerceptionError,
+    ValueError, or other errors of numpy.
     """
     if isinstance(model, PlaceRecogniser):
-        return model.learnt_again()
+        return PlaceRecogniser(model.n_neighbors).fit(*model.remembered())
     if isinstance(model, Pipeline):
         return Pipeline([(name, _learnt_again(step)) for name, step in model.steps])
     return model

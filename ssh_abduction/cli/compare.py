@@ -450,16 +450,7 @@ def _share(share: float | None) -> str:
     return UNKNOWN if share is None else f"{share:.3f}"
 
 
-RUNG_HEAD = (
-    "",
-    "minimal maps",
-    "dstates",
-    "places",
-    "paths",
-    "the true one",
-    "accuracy",
-    "seconds",
-)
+RUNG_HEAD = ("", "minimal maps", *THINGS, "the true one", "accuracy", "seconds")
 
 
 @verb(
@@ -513,13 +504,10 @@ def run_ladder(options: argparse.Namespace) -> int:
 def _rung_row(rung: Rung) -> list[object]:
     """Make the row of a rung in the table."""
     data, cost = rung.to_dict(), rung.solution.cost
-    counts: Iterator[object] = (
-        getattr(cost, name) if cost else UNKNOWN for name in ("dstates", "places", "paths")
-    )
+    counts = [getattr(cost, name) if cost else UNKNOWN for name in THINGS]
     more = "" if rung.solution.complete else "+"
     listed = f"{data['count']}{more}" if data["status"] == "optimal" else f"{data['status']}"
     truth = (
         UNKNOWN if rung.evaluation is None else "none" if rung.rank is None else f"map {rung.rank}"
     )
-    accuracy = UNKNOWN if data["accuracy"] is None else f"{data['accuracy']:.3f}"
-    return [rung.name, listed, *counts, truth, accuracy, f"{data['seconds']:.2f}"]
+    return [rung.name, listed, *counts, truth, _share(data["accuracy"]), f"{data['seconds']:.2f}"]

@@ -72,7 +72,9 @@ def answer_lines(
             first = "step" if steps == 1 else f"{steps} steps"
             yield f"\nbest map of the first {first}\n{describe(partial_map)}"
         return
-    count, backbone, held = found_in(solution), solution.shared, len(solution.maps)
+    backbone, held = solution.shared, len(solution.maps)
+    # The search may have found more maps than the solution holds.
+    count = max(sum(level.count for level in solution.levels), held)
     yield f"\n{'map 1' if count > 1 else 'map'}\n{describe(solution.maps[0])}"
     if backbone and (count > 1 or not solution.complete):
         yield f"\n{summary_of(solution, count, backbone)}"
@@ -117,11 +119,6 @@ def front_as_text(front: Front, most: int) -> str:
         fewest = counted(first, "faults")
         lines.append(f"no map with the asserted pairs of steps has fewer than {fewest}")
     return "\n".join(lines)
-
-
-def found_in(solution: Solution) -> int:
-    """Return the number of maps that the search of a solution found. It may hold fewer."""
-    return max(sum(level.count for level in solution.levels), len(solution.maps))
 
 
 def headline(solution: Solution, explanation: Explanation | None) -> str:
