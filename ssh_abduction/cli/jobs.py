@@ -246,15 +246,10 @@ def answers_on_cluster(
             ) from None
         most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
         absence = Absence(lambda: len(client.ncores()), question.limit, address)
-        killed: list[File] = []
-        for answer in _on_workers(question, client, most, absence, [*enumerate(paths)], killed):
+        for answer in _on_workers(question, client, most, absence, paths, stop):
             yield answer
             if stop.is_set():
                 return
-        # A process here makes some map of a file whose workers were all killed.
-        for task in killed:
-            lost = workers.Lost(task[0], late=False)
-            yield from hurried_answer(question, (*task, None), lost, stop.is_set)
 
 
 class Absence:
@@ -304,14 +299,13 @@ def _on_workers(
     client: Client,
     most: int,
     absence: Absence,
-    tasks: list[File],
-    killed: list[File],
+    paths: Sequence[str],
+    stop: StopFlag,
 ) -> Iterator[Any]:
     """Yield the answers for some files from the workers of a cluster, at most `most` at a time.
 
-    Files are read here, so that workers need not share the disk. Files whose worker was killed are
-    appended to `killed`. This uses Dask directly, because joblib's backend for Dask hangs when a
-    worker is killed.
+    Files are read here, so that workers need not share the disk. This uses Dask directly, because
+    joblib's backend for Dask hangs when a worker is killed.
     """
     from distributed import as_completed
 
@@ -334,9 +328,9 @@ def _on_workers(
                 return
             future = next(ready)
             task = sent.pop(future)
-            yield from _result(question, future, task, killed)
+            yield from _result(question, future, task, stop)
 
-    for number, path in tasks:
+    for number, path in enumerate(paths):
         try:
             if client.status != "running":
                 raise SolverError(LOST)
@@ -356,15 +350,19 @@ def _on_workers(
 
 
 def _result(
-    question: FileQuestion, future: Future[Any], task: File, killed: list[File]
+    question: FileQuestion, future: Future[Any], task: File, stop: StopFlag
 ) -> Iterator[Any]:
-    """Yield the answer of a task that is done. If its worker was killed, append it to `killed`."""
+    """Yield the answer of a task that is done.
+
+    If its workers were killed, a process here makes some map.
+    """
     from distributed import KilledWorker
 
     try:
         yield future.result()
     except KilledWorker:
-        killed.append(task)
+        lost = workers.Lost(task[0], late=False)
+        yield from hurried_answer(question, (*task, None), lost, stop.is_set)
     except CancelledError:
         yield question.failed(*task, SolverError(LOST))
     except Exception as error:  # an error of the cluster: `answer` catches all others
