@@ -151,12 +151,6 @@ WEIGHED = (
         most=10.0,
     ),
     SourceTurn(
-        "scatter",
-        "logs of robots, no wrong displacements",
-        "It adds 5 to 22 % of the cost to the bound of logs, and cannot prove a map.",
-        share=0.5,
-    ),
-    SourceTurn(
         "wrong displacements",
         "theories with `jumped`, more than 60 steps",
         "A local search over which displacements are wrong. No source proves such maps.",

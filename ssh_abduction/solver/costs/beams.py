@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import StageTimeError
-from ssh_abduction.solver.costs.scatter import is_for
+from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.solution.weighed import EQUAL
@@ -70,7 +70,7 @@ class Beams:
         most = 1.0
         if theory.jumped:
             most = turn("beams with wrong displacements").until
-        elif is_for(self._parts.task.problem):
+        elif spreads_of(self._parts.task.trace).any():
             most = turn("beams of logs").until
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         several = bool(theory.several_drives or theory.lifts)

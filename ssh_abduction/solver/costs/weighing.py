@@ -19,8 +19,7 @@ cheaper maps are found, each with a probability proportional to exp(-cost).
 *Places* are minimised only after dstates, so clingo proves no lower bound on them. Evidence gives
 one: the size of a set of steps that are pairwise at different places.
 
-*Better bounds* come from joins that all cheap maps have (`forced.py`). If the robot may be off the
-poses of its dstates, as in logs, `scatter.py` gives one, too.
+*A better bound* comes from joins that all cheap maps have (`forced.py`).
 """
 
 from __future__ import annotations
@@ -42,7 +41,6 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.board import Judging, Known, projected
-from ssh_abduction.solver.costs import scatter
 from ssh_abduction.solver.costs.beams import Beams
 from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of, misfit_of
 from ssh_abduction.solver.costs.estimating import (
@@ -169,7 +167,6 @@ class Weighing:
             Source(
                 turn("forced joins"), lambda: has_map() and Forcing.holds_for(problem), self._force
             ),
-            Source(turn("scatter"), lambda: has_map() and scatter.is_for(problem), self._scatter),
             Source(
                 turn("wrong displacements"),
                 lambda: is_long and has_map() and bool(self._parts.task.theory.jumped),
@@ -204,11 +201,6 @@ class Weighing:
             returns = forcing.returns
             self._forced = [(one.first, one.second) for one in returns if one.of == "dstate"]
             self._base = max(self._base, self._misfit.of_returns(returns) / 2)
-
-    def _scatter(self) -> None:
-        """Raise the bound by the scatter of visits about their places."""
-        problem, most = self._parts.task.problem, self.candidates[0].nats
-        self.bound = max(self.bound, scatter.least_cost(problem, self._misfit.visit, most))
 
     def _search_jumps(self) -> None:
         """Look for cheaper maps with other wrong displacements."""
