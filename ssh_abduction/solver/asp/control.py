@@ -17,7 +17,7 @@ from ssh_abduction.runtime.clock import MICRO, count_work, counts_work, now
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch, peak_memory
 from ssh_abduction.solver.values import Grounding
-from ssh_abduction.solver.work import ANSWER, ASKED, ATOM, CONFLICT
+from ssh_abduction.solver.work import ANSWER, ASKED, ATOM, CONFLICT, CONFLICT_OF_SQUARE
 from ssh_abduction.theory import encodings
 
 # After grounding, clasp prepares the program and cannot be stopped. This takes about these
@@ -147,6 +147,11 @@ class Control(clingo.Control):
     def add(self, *program: Any) -> None:
         with self._alone():
             super().add(*program)
+
+    @property
+    def conflict(self) -> float:
+        """The work of a conflict of clasp, in units: more if the program is large."""
+        return CONFLICT + CONFLICT_OF_SQUARE * len(self.symbolic_atoms) ** 2
 
     def tell(self, rules: str) -> None:
         """Ground further rules, in a program part of their own."""
@@ -279,7 +284,7 @@ class Asker:
         configuration: Any = control.configuration.solve
         configuration.opt_mode, configuration.models = mode, models
         configuration.project = "no" if mode.partition(",")[0] == "opt" else "project"
-        allowed = self.watch.conflicts_left()
+        allowed = self.watch.conflicts_left(control.conflict)
         most = min((n for n in (conflicts, allowed) if n >= 0), default=-1)
         configuration.solve_limit = f"{most},-1"
         # Nothing can stop clasp while it prepares the program. So check first that time is left.
@@ -329,7 +334,7 @@ class Asker:
             if counts_work():
                 with suppress(RuntimeError, KeyError):  # clingo did not begin
                     solved = control.statistics["solving"]["solvers"]
-                    count_work(round(MICRO * CONFLICT * solved["conflicts"]))
+                    count_work(round(MICRO * control.conflict * solved["conflicts"]))
 
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
         """Wait for an answer or the end; False if `until` ended the wait. May raise LimitError."""

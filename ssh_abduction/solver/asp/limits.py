@@ -11,7 +11,6 @@ from typing import Literal, TypeAlias
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
 from ssh_abduction.runtime.clock import counting, counts_work, now, work_done
-from ssh_abduction.solver.work import CONFLICT
 
 # A search that has found no map of the whole trace ends when this share of the time limit is left.
 # The rest of the time is for making a map without a search.
@@ -240,8 +239,10 @@ class Watch:
             return self.left()
         return math.inf if self._cap is None else self._cap - self.seconds()
 
-    def conflicts_left(self) -> int:
+    def conflicts_left(self, weight: float) -> int:
         """Return after how many conflicts of clasp a limit is reached; -1 if work is not counted.
+
+        `weight` is the work of a conflict, in units.
 
         Seconds are checked while clasp runs. Work is counted when it has ended, so that it always
         ends at the same conflict.
@@ -251,9 +252,9 @@ class Watch:
         left = self.left()
         if self._limit and left < math.inf and self.lacks_map():
             left -= RESERVE * self._limit
-        conflicts = min(left, self.stage_ends - self.elapsed()) / CONFLICT
+        conflicts = min(left, self.stage_ends - self.elapsed()) / weight
         least = -1 if conflicts > MOST_CONFLICTS else max(int(conflicts) + 1, 1)
-        around = self._around.conflicts_left() if self._around is not None else -1
+        around = self._around.conflicts_left(weight) if self._around is not None else -1
         return min((n for n in (least, around) if n >= 0), default=-1)
 
 
