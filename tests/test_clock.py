@@ -21,7 +21,7 @@ from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.geometry import ranking
 from ssh_abduction.solver.geometry.fit import fit
 from ssh_abduction.solver.sources.symbolic.merging import Merging
-from ssh_abduction.solver.sources.symbolic.sketch import Sketch
+from ssh_abduction.solver.sources.symbolic.sketch import Sketch, sketches_of
 from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.theory.evidence import Planar
 from ssh_abduction.theory.settle import Problem, settle
@@ -166,7 +166,7 @@ def test_each_sketch_gets_a_share_of_the_time() -> None:
         patch.object(candidates.Candidates, "beam", lambda *_: None),
     ):
         assert solve(trace, time_limit=1e-6).status is Status.UNKNOWN
-    assert len(tried) == len(Sketch.all_of(trace.steps[0], settle(trace).theory))
+    assert len(tried) == len(sketches_of(trace.steps[0], settle(trace).theory))
 
 
 def test_certificate_is_written_without_comparing_each_pair() -> None:

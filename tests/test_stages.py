@@ -20,7 +20,7 @@ from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
-from ssh_abduction.solver.sources.symbolic.sketch import Sketch
+from ssh_abduction.solver.sources.symbolic.sketch import sketches_of
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import ALL, SPEEDUPS
@@ -90,7 +90,7 @@ def test_sketch_with_frames_is_smaller(theory: Theory) -> None:
     trace = maze(3, 3, steps=400, seed=0).trace
     first, *rest = trace.steps
     sizes = []
-    for sketch in Sketch.all_of(first, settle(trace, theory).theory):
+    for sketch in sketches_of(first, settle(trace, theory).theory):
         assert all(
             sketch.extend(action, step) for action, step in zip(trace.actions, rest, strict=True)
         )

@@ -14,7 +14,7 @@ from enum import Enum
 from functools import partial
 
 from ssh_abduction.data.groups import numbered
-from ssh_abduction.data.trace import Step, Trace
+from ssh_abduction.data.trace import Step, Trace, View
 from ssh_abduction.theory.evidence import Evidence, pairs_of
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.theory import Theory
@@ -51,7 +51,7 @@ class Replay:
     outcome: Outcome
 
 
-def observation(step: Step, theory: Theory) -> tuple[object, object]:
+def observation(step: Step, theory: Theory) -> tuple[View | None, object]:
     """Return the values of a step that the axioms read: its view, and its star or None.
 
     A star is the openings seen at a step. Two steps at one dstate have equal observations, by

@@ -49,11 +49,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Self
 
 from ssh_abduction.data.gateways import (
     Sight,
+    Turned,
     allowed_headings,
     are_opposite,
     frames_that_fit,
@@ -68,17 +70,24 @@ from ssh_abduction.theory.theory import Theory
 
 # A dstate, and a star that is seen there.
 _Seen = tuple[int, Star]
+# What was seen and done at a place: for each dstate and star, the first step; and the turns, each
+# with the dstate and star before and after it.
+_Shown = tuple[dict[_Seen, int], frozenset[tuple[_Seen, _Seen, Action]]]
 
 
 def sketches_of(first: Step, theory: Theory) -> list[Sketch]:
-    """Begin a sketch (a map without a search) of each kind, those with small maps first."""
+    """Begin a sketch (a map without a search) of each kind, those with small maps first.
+
+    The kinds differ in `homing` and, if the theory leaves it open, in `framed`.
+    """
     if _is_gated(theory):
         return [GatewaySketch(first, theory, homing) for homing in (True, False)]
-    return Sketch.all_of(first, theory)
+    framed = [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
+    return [Sketch(first, theory, homing, frames) for frames in framed for homing in (True, False)]
 
 
 def sketch_beyond(ssh_map: SSHMap, trace: Trace, theory: Theory, homing: bool = True) -> Sketch:
-    """Make a sketch that begins with a map of a trace, see `Sketch.beyond`."""
+    """Make a sketch that begins with a map of a trace, which has to satisfy all axioms."""
     kind = GatewaySketch if _is_gated(theory) else Sketch
     return kind.beyond(ssh_map, trace, theory, homing)
 
@@ -104,8 +113,7 @@ class KnownDState:
         reverse: The dstates that a turn around links with this one.
     """
 
-    view: View | None
-    seen: tuple[object, object]
+    seen: tuple[View | None, object]
     place: int
     heading: int
     path: int | None = None
@@ -115,6 +123,9 @@ class KnownDState:
 
 class Sketch:
     """A map of the steps so far, made without a search, which grows with each step.
+
+    Each action without a link leads to the first of some known dstates that fits the step after it,
+    or else to a new dstate.
 
     Args:
         first: The first step of the trace, with its view and star.
@@ -145,20 +156,11 @@ class Sketch:
         self._slots: dict[tuple[int, int], tuple[int, int]] = {}
         self._excused: tuple[tuple[int, int], ...] = ()  # pairs of paths
         self._map: SSHMap | None = None
-        self.labels.append(self._new_place(first))
+        there = self._new_place(first)
         if theory.all_on_paths and theory.level == "topological":
-            self._find_course(0)
-
-    @classmethod
-    def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
-        """Begin a sketch of each kind, those with small maps first.
-
-        The kinds differ in `homing` and, if the theory leaves it open, in `framed`.
-        """
-        framed = (
-            [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
-        )
-        return [cls(first, theory, homing, frames) for frames in framed for homing in (True, False)]
+            self._find_course(there)
+        self._must_show(there, first)
+        self.labels.append(there)
 
     @classmethod
     def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory, homing: bool = True) -> Self:
@@ -173,17 +175,14 @@ class Sketch:
         # The star of a dstate is that of its first step.
         seen = dict(zip(reversed(ssh_map.dstate_at), reversed(trace.steps), strict=True))
         for s in ssh_map.dstates:
-            place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
+            place, heading = s.place or 0, s.heading or 0
             shown = observation(replace(seen[s.id], view=s.view), theory)
-            sketch._states.append(KnownDState(s.view, shown, place, heading, s.path, direction))
+            sketch._states.append(KnownDState(shown, place, heading))
             stars.setdefault(place, sketch._star(seen[s.id], heading))
-            if s.path is not None:
-                sketch._along[place, s.path, direction] = s.id
             if sketch._framed:
                 sketch._facing[place, heading] = s.id
-            if sketch._framed and s.path is not None:
-                sketch._slots[place, heading] = s.path, direction
-                sketch._slots[place, (heading + 2) % 4] = s.path, -direction
+            if s.path is not None:
+                sketch._put_on(s.id, s.path, s.direction or 1)
         sketch._stars = [stars[place] for place in sorted(stars)]
         turns = {action.name: action.turn for action in trace.actions}
         for here, action, there in ssh_map.links:
@@ -224,7 +223,7 @@ class Sketch:
     def _untried(self, here: int, action: Action, step: Step) -> int:
         """Decide where an action without a link leads, and return the dstate there."""
         if self._theory.level == "causal":
-            return self._new(step, 0, 0)
+            return self._chosen((), step, 0, 0)
         if action.leaves_paths:
             there = self._new_place(step)
         elif action.kind == "travel":
@@ -235,69 +234,85 @@ class Sketch:
             self._find_course(there)
         return there
 
+    def _chosen(self, known: Iterable[int], step: Step, place: int, heading: int) -> int:
+        """Return the first known dstate that fits a step, or else a new one at a place."""
+        there = next((x for x in known if self._may_be_at(x, step)), None)
+        there = self._new(step, place, heading) if there is None else there
+        if there is None:
+            raise Contradiction
+        return there
+
     def _turn(self, here: int, action: Action, step: Step) -> int:
         """Decide where a turn without a link leads, and return the dstate there."""
         s = self._states[here]
-        around = action.turn == "around"
         heading = (s.heading + QUARTERS[action.turn]) % 4
-        there = self._turned_to(here, heading, action, step)
-        if there is None:
-            there = self._new(step, s.place, heading)
-        if around:
-            self._turned_around(here, there)
+        known = self._turned_to(here, heading, action, step)
+        there = self._chosen(known, step, s.place, heading)
+        if action.turn == "around":
+            # The two dstates get opposite directions of one path.
+            s.reverse.append(there)
+            self._states[there].reverse.append(here)
+            for x in (s, self._states[there]):
+                if x.path is not None:
+                    for y in x.reverse:
+                        self._set_course(y, x.path, -x.direction)
         return there
 
-    def _turned_to(self, here: int, heading: int, action: Action, step: Step) -> int | None:
-        """Return the known dstate that a turn leads to by the axioms; None if there is none."""
+    def _turned_to(self, here: int, heading: int, action: Action, step: Step) -> Iterable[int]:
+        """List the known dstates that a turn may lead to by the axioms."""
         s = self._states[here]
         if self._framed:
-            return self._facing.get((s.place, heading))
-        if action.turn != "around":
-            return None
-        if s.path is not None:
-            return self._along.get((s.place, s.path, -s.direction))
-        return next((x for x in s.reverse if self._may_be_at(x, step)), None)
-
-    def _turned_around(self, here: int, there: int) -> None:
-        """Link two dstates by a turn around. They get opposite directions of one path."""
-        self._states[here].reverse.append(there)
-        self._states[there].reverse.append(here)
-        for s in (self._states[here], self._states[there]):
-            if s.path is not None:
-                for x in s.reverse:
-                    self._set_course(x, s.path, -s.direction)
+            known = self._facing.get((s.place, heading))
+        elif action.turn != "around":
+            return ()
+        elif s.path is None:
+            return s.reverse
+        else:
+            known = self._along.get((s.place, s.path, -s.direction))
+        return () if known is None else (known,)
 
     def _travel(self, here: int, step: Step) -> int:
         """Decide where a travel without a link leads, and return the dstate there."""
         path, direction = self._find_course(here)
-        place, order = self._states[here].place, self._orders[path]
-        position = order.index(place)
-        if self._homing and 0 <= position + direction < len(order):
-            there = self._known_ahead(order[position + direction], path, direction, step)
-            if there is not None:
-                return there
-            if self._theory.next_place:
+        known, position, may_be_new = self._ahead(self._states[here].place, path, direction)
+        there = None if known is None else self._at_known(known, path, direction, step)
+        if there is None:
+            if not may_be_new:
                 raise Contradiction
-        there = self._new_place(step)
-        order.insert(position + (direction == 1), self._states[there].place)
+            there = self._new_place(step)
+            self._orders[path].insert(position, self._states[there].place)
         self._set_course(there, path, direction)
         return there
 
-    def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
+    def _ahead(self, place: int, path: int, direction: int) -> tuple[int | None, int, bool]:
+        """Return where a travel from a place along a path may lead.
+
+        These are a known place, or None; the position that a new place gets in the order of the
+        path; and whether a new place is allowed.
+        """
+        order = self._orders[path]
+        position = order.index(place)
+        is_known = self._homing and 0 <= position + direction < len(order)
+        known = order[position + direction] if is_known else None
+        may_be_new = known is None or not self._theory.next_place
+        return known, position + (direction == 1), may_be_new
+
+    def _at_known(self, place: int, path: int, direction: int, step: Step) -> int | None:
         """Return the dstate where a travel to a known place ends; None if the step rules it out."""
-        there = self._along.get((place, path, direction))
+        known = self._along.get((place, path, direction))
+        if known is not None:
+            return known if self._may_be_at(known, step) else None
         heading = 0
-        if there is None and self._framed:
+        if self._framed:
             heading = next(k for k in range(4) if self._slots.get((place, k)) == (path, direction))
-            there = self._facing.get((place, heading))
-        if there is None:
-            if self._star(step, heading) != self._stars[place]:
-                return None
-            there = self._new(step, place, heading)
-        elif not self._may_be_at(there, step):
-            return None
-        self._set_course(there, path, direction)
-        return there
+        with suppress(Contradiction):
+            return self._chosen(self._off_paths(place, heading), step, place, heading)
+        return None
+
+    def _off_paths(self, place: int, heading: int) -> Iterable[int]:
+        """List the known dstates of a place without a path that may have a heading."""
+        known = self._facing.get((place, heading))
+        return () if known is None else (known,)
 
     def _find_course(self, here: int) -> tuple[int, int]:
         """Return the path and direction of a dstate, and choose them if they are unknown.
@@ -324,28 +339,38 @@ class Sketch:
         s = self._states[here]
         if (s.path, s.direction) == (path, direction):
             return
-        if s.path is not None or self._along.setdefault((s.place, path, direction), here) != here:
+        if s.path is not None or self._along.get((s.place, path, direction), here) != here:
             raise Contradiction
+        self._put_on(here, path, direction)
+        for x in s.reverse:
+            self._set_course(x, path, -direction)
+
+    def _put_on(self, here: int, path: int, direction: int) -> None:
+        """Give a dstate a course."""
+        s = self._states[here]
         s.path, s.direction = path, direction
+        self._along[s.place, path, direction] = here
         if self._framed:
             self._slots[s.place, s.heading] = path, direction
             self._slots[s.place, (s.heading + 2) % 4] = path, -direction
-        for x in s.reverse:
-            self._set_course(x, path, -direction)
 
     def _new_place(self, step: Step) -> int:
         """Add a place with a dstate for a step, and return the dstate."""
         self._stars.append(self._star(step, 0))
-        return self._new(step, len(self._stars) - 1, 0)
+        return self._chosen((), step, len(self._stars) - 1, 0)
 
-    def _new(self, step: Step, place: int, heading: int) -> int:
-        """Add a dstate for a step at a place, and return the dstate."""
+    def _new(self, step: Step, place: int, heading: int) -> int | None:
+        """Add a dstate for a step at a place, and return it; None if the step does not fit there.
+
+        With frames, it does not fit if the place has another dstate with this heading.
+        """
+        there = len(self._states)
         if self._star(step, heading) != self._stars[place]:
-            raise Contradiction
-        self._states.append(KnownDState(step.view, observation(step, self._theory), place, heading))
-        if self._framed:
-            self._facing[place, heading] = len(self._states) - 1
-        return len(self._states) - 1
+            return None
+        if self._framed and self._facing.setdefault((place, heading), there) != there:
+            return None
+        self._states.append(KnownDState(observation(step, self._theory), place, heading))
+        return there
 
     def _star(self, step: Step, heading: int) -> object:
         """Return the star (openings) of a place, as a step with this heading sees it.
@@ -362,8 +387,8 @@ class Sketch:
         if not self._may_be_at(there, step):
             raise Contradiction
         s = self._states[there]
-        if s.view is None:
-            s.view, s.seen = step.view, observation(step, self._theory)
+        if s.seen[0] is None:
+            s.seen = observation(step, self._theory)
 
     def _may_be_at(self, there: int, step: Step) -> bool:
         """Whether a step fits the observation of a dstate. An unknown view fits every view."""
@@ -375,7 +400,7 @@ class Sketch:
         links = tuple(sorted((s, action, x) for (s, action), x in self._links.items()))
         if self._theory.level == "causal":
             return SSHMap(
-                labels, tuple(DState(i, s.view) for i, s in enumerate(self._states)), links
+                labels, tuple(DState(i, s.seen[0]) for i, s in enumerate(self._states)), links
             )
         # For each path, its number in the map, and the direction that is faced first.
         first: dict[int, tuple[int, int]] = {}
@@ -385,7 +410,7 @@ class Sketch:
         dstates = tuple(
             DState(
                 id=i,
-                view=s.view,
+                view=s.seen[0],
                 place=s.place,
                 path=None if s.path is None else first[s.path][0],
                 direction=None if s.path is None else s.direction * first[s.path][1],
@@ -408,30 +433,6 @@ class Sketch:
         )
 
 
-@dataclass(slots=True)
-class _PlaceSights:
-    """What was seen and done at a place.
-
-    Attributes:
-        sights: For each dstate and star seen there, the first step.
-        turns: For two such pairs of a dstate and a star: the turns from the first to the second.
-    """
-
-    sights: dict[_Seen, int] = field(default_factory=dict)
-    turns: dict[tuple[_Seen, _Seen], set[Action]] = field(default_factory=dict)
-
-    def with_sight(self, seen: _Seen, step: int, move: tuple[_Seen, Action] | None) -> _PlaceSights:
-        """Return a copy to which a step at this place is added, with its dstate and star.
-
-        `move` has the dstate and star before the turn to this step, and the turn; None without.
-        """
-        turns = self.turns
-        if move:
-            before, action = move
-            turns = {**turns, (before, seen): turns.get((before, seen), set()) | {action}}
-        return _PlaceSights({**self.sights, seen: self.sights.get(seen, step)}, turns)
-
-
 class GatewaySketch(Sketch):
     """A sketch (a map made without a search) for stars with any number of gateways.
 
@@ -440,70 +441,87 @@ class GatewaySketch(Sketch):
     """
 
     def __init__(self, first: Step, theory: Theory, homing: bool = True) -> None:
-        self._shown: dict[int, _PlaceSights] = defaultdict(_PlaceSights)  # by place
+        self._shown: dict[int, _Shown] = defaultdict(lambda: ({}, frozenset()))  # by place
         self._last: _Seen | None = None  # what the last step saw
         self._turn_made: Action | None = None  # the turn after it, if it was one
         self._star_seen = first.gateways or Star(())  # what the present step sees
         self._axioms = frozenset(name for name in theory.axioms if name.startswith("gateway"))
         super().__init__(first, theory, homing)
-        self._must_show(0, first)
 
     @classmethod
     def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory, homing: bool = True) -> Self:
-        """Make a sketch that begins with a map of a trace, see `Sketch.beyond`."""
         sketch = super().beyond(ssh_map, trace, theory, homing)
-        sketch._shown, sketch._last = defaultdict(_PlaceSights), None
-        for t, (label, step) in enumerate(zip(ssh_map.dstate_at, trace.steps, strict=True)):
-            place = sketch._states[label].place
-            sketch._star_seen = step.gateways or Star(())
-            sketch._shown[place] = sketch._grown(place, label, t)
-            sketch._last = label, sketch._star_seen
-            sketch._turn_made = _turn_of(step.action)
+        sketch._shown.clear()
+        sketch._last, sketch.labels, action = None, [], None
+        for label, step in zip(ssh_map.dstate_at, trace.steps, strict=True):
+            sketch._see(action, step)
+            sketch._note(label)
+            sketch.labels.append(label)
+            action = step.action
         return sketch
 
     def extend(self, action: Action, step: Step) -> bool:
-        self._turn_made, self._star_seen = _turn_of(action), step.gateways or Star(())
+        self._see(action, step)
         return super().extend(action, step)
+
+    def _see(self, action: Action | None, step: Step) -> None:
+        """Take over the star of the present step, and the action before it if it is a turn."""
+        self._turn_made = action if action is not None and action.kind == "turn" else None
+        self._star_seen = step.gateways or Star(())
 
     def _must_show(self, there: int, step: Step) -> None:
         super()._must_show(there, step)
-        if not self._may_show(there):
-            raise Contradiction
-        place = self._states[there].place
-        self._shown[place] = self._grown(place, there, len(self.labels))
+        self._note(there)
+
+    def _note(self, there: int) -> None:
+        """Add the present step, at a dstate, to what was seen and done at its place."""
+        self._shown[self._states[there].place] = self._grown(there)
         self._last = there, self._star_seen
 
-    def _may_show(self, there: int) -> bool:
-        """Whether the present step fits a dstate, and the earlier steps at its place."""
-        place = self._states[there].place
-        grown = self._grown(place, there, len(self.labels))
-        known = self._shown[place]
-        if len(grown.sights) == len(known.sights) and grown.turns == known.turns:
-            return True
-        if not known.sights and not self._onward(there):
-            return True
-        return frames_that_fit(*self._sights(grown), self._axioms, as_shown=False) is not None
-
-    def _grown(self, place: int, there: int, t: int) -> _PlaceSights:
-        """Return the sights of a place with step t added, the present step, at dstate `there`."""
-        move = None
+    def _grown(self, there: int) -> _Shown:
+        """Return what was seen and done at the place of a dstate, and the present step there."""
+        place, seen = self._states[there].place, (there, self._star_seen)
+        sights, turns = self._shown[place]
         if self._turn_made and self._last and self._states[self._last[0]].place == place:
-            move = self._last, self._turn_made
-        return self._shown[place].with_sight((there, self._star_seen), t, move)
+            turns |= {(self._last, seen, self._turn_made)}
+        return {**sights, seen: sights.get(seen, len(self.labels))}, turns
 
-    def _sights(
-        self, place: _PlaceSights
-    ) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
+    def _may_be_at(self, there: int, step: Step) -> bool:
+        """Whether the present step fits a dstate, and the earlier steps at its place."""
+        if not super()._may_be_at(there, step):
+            return False
+        known, grown = self._shown[self._states[there].place], self._grown(there)
+        if known == grown or not (known[0] or self._onward(there)):
+            return True
+        return self._fitted(grown) is not None
+
+    def _new(self, step: Step, place: int, heading: int) -> int | None:
+        there = super()._new(step, place, heading)
+        if there is not None and not self._may_be_at(there, step):
+            self._states.pop()
+            return None
+        return there
+
+    def _fitted(self, shown: _Shown) -> list[tuple[Sight, Turned]] | None:
+        """Fit frames to what was seen and done at a place, as `frames_that_fit` does."""
+        sights, turns = self._sights(shown)
+        fitted = frames_that_fit(sights, turns, self._axioms, as_shown=False)
+        return None if fitted is None else list(zip(sights, fitted, strict=True))
+
+    def _sights(self, shown: _Shown) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
         """Return the sights of a place, and the turns between them, for `frames_that_fit`."""
         made: dict[_Seen, Sight] = {}
-        shown: set[int] = set()
-        for (s, star), t in place.sights.items():
+        ids: set[int] = set()
+        for (s, star), t in shown[0].items():
             known = self._states[s]
             direction = None if known.path is None else known.direction
-            dstate = DState(s, known.view, known.place, known.path, direction)
-            made[s, star] = Sight(dstate, star, t, s not in shown, not shown, self._onward(s))
-            shown.add(s)
-        return list(made.values()), {(made[a], made[b]): x for (a, b), x in place.turns.items()}
+            dstate = DState(s, known.seen[0], known.place, known.path, direction)
+            made[s, star] = Sight(dstate, star, t, s not in ids, not ids, self._onward(s))
+            ids.add(s)
+        turns: dict[tuple[Sight, Sight], set[Action]] = defaultdict(set)
+        for before, after, action in shown[1]:
+            turns[made[before], made[after]].add(action)
+        return list(made.values()), turns
 
     def _onward(self, s: int) -> tuple[int, ...]:
         """Return the directions in which the path of a dstate goes on: 0 (ahead), 180 (behind)."""
@@ -514,115 +532,62 @@ class GatewaySketch(Sketch):
         position = order.index(known.place)
         return (0,) * (position + 1 < len(order)) + (180,) * (position > 0)
 
-    def _turned_to(self, here: int, heading: int, action: Action, step: Step) -> int | None:
+    def _known_at(self, place: int) -> list[int]:
+        """List the known dstates of a place, in the order of their first steps."""
+        return list(dict.fromkeys(x for x, _ in self._shown[place][0]))
+
+    def _turned_to(self, here: int, heading: int, action: Action, step: Step) -> Iterable[int]:
         s = self._states[here]
-        known = dict.fromkeys(x for x, _ in self._shown[s.place].sights)
-        if action.turn == "around" and s.path is not None:
-            reverse = self._along.get((s.place, s.path, -s.direction))
-            known = {reverse: None} if reverse is not None else known
-        if not self._homing and self._may_be_new(s.place, step):
-            return None
-        return self._first_of(known, step)
+        there = None if self._homing else self._new(step, s.place, heading)
+        if there is not None:
+            return (there,)
+        is_reverse = action.turn == "around" and s.path is not None
+        reverse = super()._turned_to(here, heading, action, step) if is_reverse else ()
+        return reverse or self._known_at(s.place)
 
-    def _may_be_new(self, place: int, step: Step) -> bool:
-        """Whether a step may be at a new dstate of a known place."""
-        there = self._new(step, place, 0)
-        fits = self._may_show(there)
-        self._states.pop()
-        return fits
-
-    def _first_of(self, known: Iterable[int], step: Step) -> int | None:
-        """Return the first known dstate that fits a step; None if none does."""
-        return next((x for x in known if self._may_be_at(x, step) and self._may_show(x)), None)
+    def _off_paths(self, place: int, heading: int) -> Iterable[int]:
+        return [x for x in self._known_at(place) if self._states[x].path is None]
 
     def _course_through(self, here: int) -> tuple[int, int] | None:
-        if not self._homing and self._may_begin_path(here):
-            return None
-        sights, turns = self._sights(self._shown_with(here))
-        read = frames_that_fit(sights, turns, self._axioms, as_shown=False) or []
-        own = [
-            turned for sight, turned in zip(sights, read, strict=False) if sight.dstate.id == here
-        ]
-        for sight, turned in zip(sights, read, strict=False):
+        s = self._states[here]
+        is_shown = here in self._known_at(s.place)
+        shown = self._shown[s.place] if is_shown else self._grown(here)
+        if not self._homing:
+            # Prefer a new path, if one may leave the place in the heading of the dstate.
+            self._orders.append([s.place])
+            s.path, s.direction = len(self._orders) - 1, 1
+            fitted = self._fitted(shown)
+            s.path = None
+            self._orders.pop()
+            if fitted is not None:
+                return None
+        read = self._fitted(shown) or []
+        own = [turned for sight, turned in read if sight.dstate.id == here]
+        for sight, turned in read:
             path, direction = sight.dstate.path, sight.dstate.direction
             if path is not None and any(are_opposite(turned, x) for x in own):
                 return path, -(direction or 1)
         return None
 
-    def _shown_with(self, here: int) -> _PlaceSights:
-        """Return the sights of the place of a dstate, which may be that of the present step."""
-        known = self._shown[self._states[here].place]
-        is_shown = any(x == here for x, _ in known.sights)
-        return known if is_shown else self._grown(self._states[here].place, here, len(self.labels))
-
-    def _may_begin_path(self, here: int) -> bool:
-        """Whether a new path may leave a place in the heading of a dstate."""
-        s = self._states[here]
-        self._orders.append([s.place])
-        s.path, s.direction = len(self._orders) - 1, 1
-        fitted = frames_that_fit(
-            *self._sights(self._shown_with(here)), self._axioms, as_shown=False
-        )
-        s.path = None
-        self._orders.pop()
-        return fitted is not None
-
-    def _travel(self, here: int, step: Step) -> int:
+    def _ahead(self, place: int, path: int, direction: int) -> tuple[int | None, int, bool]:
         leads_on = any(leads(frame, 0) for frame in self._star_seen.frames)
         if "gateway_end" not in self._axioms or leads_on:
-            return super()._travel(here, step)
-        path, direction = self._find_course(here)
-        place, order = self._states[here].place, self._orders[path]
+            return super()._ahead(place, path, direction)
+        order = self._orders[path]
+        end = len(order) if direction == 1 else 0
         last = order[-1 if direction == 1 else 0]
         is_next = abs(order.index(last) - order.index(place)) == 1
-        goes_on = self._may_go_on(last, path, direction)
-        if last != place and (not goes_on or (self._homing and is_next)):
-            there = self._known_ahead(last, path, direction, step)
-            if there is not None:
-                return there
-        if not goes_on:
-            raise Contradiction
-        there = self._new_place(step)
-        order.insert(len(order) if direction == 1 else 0, self._states[there].place)
-        self._set_course(there, path, direction)
-        return there
-
-    def _may_go_on(self, last: int, path: int, direction: int) -> bool:
-        """Whether a path may lead on from its last place, by the gateways seen there."""
-        order = self._orders[path]
-        order.insert(len(order) if direction == 1 else 0, len(self._stars))
-        fitted = frames_that_fit(*self._sights(self._shown[last]), self._axioms, as_shown=False)
-        del order[-1 if direction == 1 else 0]
-        return fitted is not None
-
-    def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
-        there = self._along.get((place, path, direction))
-        known = (
-            [there]
-            if there is not None
-            else dict.fromkeys(
-                x for x, _ in self._shown[place].sights if self._states[x].path is None
-            )
-        )
-        found = self._first_of(known, step)
-        if found is None and there is None and self._may_be_new(place, step):
-            found = self._new(step, place, 0)
-        if found is not None:
-            self._set_course(found, path, direction)
-        return found
+        # The path may lead on from its last place if the gateways seen there fit a further place.
+        order.insert(end, len(self._stars))
+        goes_on = self._fitted(self._shown[last]) is not None
+        del order[end]
+        is_known = last != place and (not goes_on or (self._homing and is_next))
+        return last if is_known else None, end, goes_on
 
     def _made(self, labels: tuple[int, ...]) -> SSHMap:
         ssh_map = super()._made(labels)
-        sights: list[Sight] = []
-        turns: dict[tuple[Sight, Sight], set[Action]] = {}
-        for place in self._shown.values():
-            seen, made = self._sights(place)
-            sights.extend(seen)
-            turns.update(made)
-        found = allowed_headings(sights, turns, self._axioms)
+        found: dict[int, int] = {}
+        for shown in self._shown.values():
+            found |= allowed_headings(*self._sights(shown), self._axioms)
         dstates = tuple(replace(s, heading=found.get(s.id)) for s in ssh_map.dstates)
         return replace(ssh_map, dstates=dstates)
-
-
-def _turn_of(action: Action | None) -> Action | None:
-    return action if action is not None and action.kind == "turn" else None
