@@ -718,6 +718,26 @@ def test_limit_of_maps_says_whether_more_maps_cost_as_little(most: int | None) -
     assert solution.stopped == ("maps limit" if most == 1 else None)
 
 
+def test_unlisted_maps_of_least_cost_make_the_answer_incomplete(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A limit may end the list of paths of the best map, or that of the maps of least cost."""
+    go, left = (10, 0, 0), (0, 0, math.pi / 2)
+    trace = Trace.from_steps(
+        "abcdabc", ["travel", "left"] * 3, displacements=[go, left, go, left, go, left]
+    )
+    whole = solve(trace, work_limit=20)
+    assert whole.complete
+    with monkeypatch.context() as patched:
+        patched.setattr(Search, "_solve_mended", lambda *_, **__: ((), False))
+        unlisted = solve(trace, work_limit=20)
+    assert (unlisted.complete, unlisted.stopped) == (False, "work limit")
+    monkeypatch.setattr(weighing, "RIVALS", 1)
+    cut = solve(trace, work_limit=20)
+    assert (cut.complete, cut.stopped) == (False, "maps limit")
+    assert cut.maps == unlisted.maps == whole.maps
+
+
 @pytest.mark.slow
 def test_maps_of_equal_cost_are_all_minimal(tmp_path: Path) -> None:
     """Two drives share a corner of a square, but nothing says which. Paths cost nothing."""

@@ -267,18 +267,28 @@ class Weighing:
         """
         parts, theory = self._parts, self._parts.task.theory
         complete = True
-        listed: set[SSHMap] = set()  # Candidates with the same dstates and places give equal maps.
+        listed: set[SSHMap] = set()
+        seen: set[Hashable] = set()
         for candidate in self.minimal():
+            # Candidates with the same dstates, places and displacements differ only in paths.
+            alike = dstates_and_places(candidate.map), jumped(candidate.map)
+            if alike in seen:
+                continue
+            seen.add(alike)
             maps, proven = self._with_other_paths(candidate.map)
             complete &= proven
             new = [ssh_map for ssh_map in maps if ssh_map not in listed]
             listed.update(new)
             yield from ((ssh_map, parts.known.cost) for ssh_map in new)
-        parts.rivals.listed = complete
+        parts.rivals.listed = complete = complete and len(self.minimal()) < RIVALS
         most = self.candidates[0].nats + parts.limits.within if self.candidates else 0.0
         for rank, candidate in enumerate(self.candidates[len(self.minimal()) :]):
             if candidate.nats <= most:
                 yield candidate.map, (*Cost.of(candidate.map).preferred_by(theory), rank)
+        if len(self.minimal()) == RIVALS:
+            raise LimitError("maps limit")
+        if not complete:
+            raise LimitError(parts.limit_reached)
 
     def _with_other_paths(self, ssh_map: SSHMap) -> tuple[tuple[SSHMap, ...], bool]:
         """List all maps that differ from a map only in their paths, and have as many paths.
