@@ -92,7 +92,7 @@ def test_card_of_an_unknown_answer_shows_the_map_of_a_prefix() -> None:
     search = Search(ACES)
     search.parts.known.partial = solve(ACES[:10])[0]
     text = shown(search.solution())[1]
-    assert text.startswith("unknown: no map of 23 steps yet")
+    assert text.startswith("unknown: no map of all 23 steps yet")
     assert "the best map of the first 10 steps:" in text
     unknown = Search(ACES).solution()
     for stopped, said in ((None, "unknown:"), ("time limit", "unknown (time limit):")):

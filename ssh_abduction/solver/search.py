@@ -603,13 +603,18 @@ def _begins_visit(trace: Trace, step: int) -> bool:
 
 
 def _stretches(trace: Trace, ends: Sequence[int]) -> list[range]:
-    """List stretches of visits that may clash, the shortest first. Each ends at one of `ends`."""
+    """List stretches that may clash, the shortest first. Each ends at one of `ends`.
+
+    Each has two steps, or whole visits but for later steps of the last visit.
+    """
     begins = [t for t in range(len(trace)) if _begins_visit(trace, t)]
-    found = dict.fromkeys(
-        range(begins[max(bisect_right(begins, t) - visits, 0)], t + 1)
-        for visits in range(1, VISITS + 1)
+    pairs = (range(max(t - 1, 0), t + 1) for t in ends)
+    visits = (
+        range(begins[max(bisect_right(begins, t) - number, 0)], t + 1)
+        for number in range(1, VISITS + 1)
         for t in ends
     )
+    found = dict.fromkeys((*pairs, *visits))
     # The whole trace is no stretch: its search would look for the same clash again, without end.
     return [stretch for stretch in found if len(stretch) < len(trace)]
 
