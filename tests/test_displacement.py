@@ -226,7 +226,7 @@ def test_least_squares_find_the_smallest_solution() -> None:
     rng = np.random.default_rng(0)
     some, values, weights = rng.normal(size=(12, 5)), rng.normal(size=12), rng.uniform(1, 2, 12)
     some[:, 4] = some[:, 3]  # of several solutions, the smallest
-    smallest = np.linalg.lstsq(some * weights[:, None], values, rcond=1e-12)[0]
+    smallest = np.linalg.lstsq(some * weights[:, None], values * weights, rcond=1e-12)[0]
     assert least_squares(csr_array(some), values, weights) == pytest.approx(smallest, abs=1e-6)
     nothing = csr_array((0, 5))  # as if all displacements may be wrong
     assert (least_squares(nothing, np.zeros(0), np.zeros(0)) == 0).all()

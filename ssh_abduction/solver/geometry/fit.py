@@ -29,11 +29,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.sparse.linalg import splu
 from scipy.special import gammaincc
 
+from ssh_abduction.data.groups import first_index_of
 from ssh_abduction.data.maps import Fit, Pose, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
@@ -103,9 +104,8 @@ class Poses:
         self._size = 2 * self._positions + self._headings + 2
         # A group is the headings that displacements connect. A part of the map is the positions
         # that they connect.
-        self._group = connected_components(
-            self._graph(self._from, self._to, self._headings), directed=False
-        )[1]
+        self._graph = _graph(self._from, self._to, self._headings)
+        self._group = connected_components(self._graph, directed=False)[1]
 
     @staticmethod
     def of_map(trace: Trace, ssh_map: SSHMap) -> Poses:
@@ -122,9 +122,9 @@ class Poses:
 
         Headings are mostly those of dstates.
         """
-        unknown = self._best()
-        at: Array = unknown[: 2 * self._positions].reshape(-1, 2)[self._place[: self._dstates]]
-        return float((self._residuals(unknown) ** 2).sum()), at
+        unknown, square = self._best()
+        at: Array = self._positions_in(unknown)[self._place[: self._dstates]]
+        return square, at
 
     def settled(
         self, start: Array | None, fixed: Sequence[int], wanted: Sequence[int]
@@ -135,9 +135,8 @@ class Poses:
         of unknowns: those whose values are known, and those whose covariance is wanted. The
         chi-square is returned first.
         """
-        unknown = self._best(start, NEARLY)
-        squares = float((self._residuals(unknown) ** 2).sum())
-        return squares, unknown, self._covariance(unknown, fixed, wanted)
+        unknown, square = self._best(start, NEARLY)
+        return square, unknown, self._covariance(unknown, fixed, wanted)
 
     def gaussian(self) -> tuple[list[int], Array, Array, Array]:
         """Find the poses of the dstates and their covariance, relative to a dstate of each part.
@@ -146,31 +145,27 @@ class Poses:
         the chi-square of each part. The vector has x and y of each place, in the order of the first
         dstates there, and then the heading of each dstate.
         """
-        place, facing = self._place[: self._dstates], 2 * self._positions
-        part = self._parts()[place].tolist()
-        first = [part.index(number) for number in dict.fromkeys(part)]
-        fixed = [k for s in first for k in (2 * place[s], 2 * place[s] + 1, facing + s)]
-        entries = [*range(2 * int(place.max()) + 2), *range(facing, facing + self._dstates)]
-        unknown, of = self._best(), self._parts()
+        part, _, fixed = self._origins()
+        facing = 2 * self._positions
+        entries = [*self._xy(), *range(facing, facing + self._dstates)]
+        unknown, of = self._best()[0], self._parts()
         errors = (self._residuals(unknown)[:-2] ** 2).reshape(-1, 3).sum(axis=1)
         squares = np.zeros(int(of.max()) + 1)
         np.add.at(squares, of[self._place[self._from]], errors)
         covariance = self._covariance(unknown, fixed, entries)
         return part, unknown[entries], covariance, squares
 
-    def _best(self, start: Array | None = None, still: float = STILL) -> Array:
-        """Find the unknowns with the least sum of squares.
+    def _best(self, start: Array | None = None, still: float = STILL) -> tuple[Array, float]:
+        """Find the unknowns with the least sum of squares, and this sum.
 
         `start` has unknowns to begin with; None to compute some. End if a round lowers the sum of
         squares by less than the share `still`.
         """
         unknown = self._begun() if start is None else start
-        if not len(self._moved):
-            return unknown
         off = self._residuals(unknown)
         # Levenberg-Marquardt: damp a step more until it lowers the sum of squares.
         damping = LEAST_DAMPING
-        for _ in range(ROUNDS):
+        for _ in range(ROUNDS if len(self._moved) else 0):
             jacobian = self._jacobian(unknown)
             normal, gradient = jacobian.T @ jacobian, jacobian.T @ off
             scale = normal.diagonal() + HELD_STILL
@@ -186,40 +181,33 @@ class Poses:
             unknown, off, damping = unknown + step, better, max(damping / 10, LEAST_DAMPING)
             if gain <= still * (1 + float(off @ off)):
                 break
-        return unknown
+        return unknown, float(off @ off)
 
     def fit(self) -> Fit:
         """Find the best poses, and compute how well they agree with the displacements."""
-        unknown = self._best()
-        squares = float((self._residuals(unknown) ** 2).sum())
+        unknown, square = self._best()
         freedom = self._freedom(unknown)
-        p = float(gammaincc(freedom / 2, squares / 2)) if freedom > 0 else 1.0
+        p = float(gammaincc(freedom / 2, square / 2)) if freedom > 0 else 1.0
         scale, bend = (float(x) for x in unknown[-2:] * self._sigma)
-        return Fit(squares, freedom, p, scale, bend, self._poses(unknown))
+        return Fit(square, freedom, p, scale, bend, self._poses(unknown))
 
     def _begun(self) -> Array:
         """Compute initial values of the unknowns, as one vector."""
         unknown = np.zeros(self._size)
-        at = unknown[: 2 * self._positions].reshape(-1, 2)
-        heading = unknown[2 * self._positions : -2]
         # Solve for the headings first: that is linear, except for whole turns. Once the headings
         # are known, solving for the positions is linear, too (Carlone et al. 2014).
         reckoned = self._reckoned()
         off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
         off -= math.tau * np.round(off / math.tau)
-        heading[:] = reckoned + least_squares(
-            self._differences(self._from, self._to, self._headings),
-            off / self._sigmas(2),
-            1 / self._sigmas(2),
+        heading = reckoned + least_squares(
+            _differences(self._from, self._to, self._headings), off, 1 / self._sigmas(2)
         )
-        weights, differences = 1 / self._sigmas(0), self._moves()
         if self._group.max() > 0:
-            heading += self._rotations(vectors_turned(self._moved[:, :2], heading[self._from]))[
-                self._group
-            ]
+            onward = vectors_turned(self._moved[:, :2], heading[self._from])
+            heading += self._rotations(onward)[self._group]
         onward = vectors_turned(self._moved[:, :2], heading[self._from])
-        for axis in range(2):
-            at[:, axis] = least_squares(differences, onward[:, axis] * weights, weights)
+        self._positions_in(unknown)[:] = least_squares(self._moves(), onward, 1 / self._sigmas(0))
+        unknown[2 * self._positions : -2] = heading
         return unknown
 
     def _reckoned(self) -> Array:
@@ -234,9 +222,8 @@ class Poses:
             self._from.tolist(), self._to.tolist(), self._moved[:, 2].tolist(), strict=True
         ):
             rotated[x, s], rotated[s, x] = -angle, angle
-        graph = self._graph(self._from, self._to, self._headings)
         for first in np.unique(self._group, return_index=True)[1].tolist():
-            order, before = breadth_first_order(graph, first, directed=False)
+            order, before = breadth_first_order(self._graph, first, directed=False)
             for x, s in zip(order[1:].tolist(), before[order[1:]].tolist(), strict=True):
                 heading[x] = heading[s] + rotated[s, x]
         return heading
@@ -271,8 +258,8 @@ class Poses:
         weights = 1 / self._sigmas(0)
         vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
         columns = np.arange(len(vectors)), self._group[self._from]
-        turns = matrix((vectors, columns), (len(vectors), int(self._group.max()) + 1))
-        moves = weighted(self._moves(), weights)
+        turns = csr_array((vectors, columns), shape=(len(vectors), int(self._group.max()) + 1))
+        moves = diags_array(weights) @ self._moves()
         mixed = (moves.T @ turns).toarray()
         square = moves.T @ moves
         held = 1e-9 * max(float(square.diagonal().max()), 1.0)
@@ -282,36 +269,25 @@ class Poses:
 
     def _moves(self) -> Any:
         """Make the matrix that maps the x (or y) of positions to the x (or y) of displacements."""
-        return self._differences(self._place[self._from], self._place[self._to], self._positions)
-
-    def _graph(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
-        """Make a graph of `size` nodes from the ends of its edges, as a sparse matrix."""
-        return coo_array((np.ones(len(first)), (first, second)), shape=(size, size)).tocsr()
+        return _differences(self._place[self._from], self._place[self._to], self._positions)
 
     def _sigmas(self, axis: int) -> Array:
         """Return approximate standard deviations of the displacements in x, y or turn (0, 1, 2)."""
         sigmas: Array = 1 / np.sqrt((self._whitening[:, :, axis] ** 2).sum(1))
         return sigmas
 
-    def _differences(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> Any:
-        """Make the matrix that maps a vector x to the differences x[second] - x[first]."""
-        rows = np.arange(len(first))
-        ones = np.ones(len(first))
-        entries = (
-            np.concatenate([ones, -ones]),
-            (np.concatenate([rows, rows]), np.concatenate([second, first])),
-        )
-        return matrix(entries, (len(first), size))
+    def _positions_in(self, unknown: Array) -> Array:
+        """Return a view of the positions in a vector of unknowns, in metres, (positions, 2)."""
+        return unknown[: 2 * self._positions].reshape(-1, 2)
 
     def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
         """Predict the displacements from the unknowns, in metres and radians, (n, 3).
 
         Also return the cosine and sine of the heading halfway through each displacement.
         """
-        at = unknown[: 2 * self._positions].reshape(-1, 2)
         heading = unknown[2 * self._positions : -2]
         scale, bend = unknown[-2:] * self._sigma
-        gone = at[self._place[self._to]] - at[self._place[self._from]]
+        gone = self._gone(unknown)
         facing = heading[self._from] - bend * self._way / 2
         cos, sin = np.cos(facing), np.sin(facing)
         ahead, left = cos * gone[:, 0] + sin * gone[:, 1], cos * gone[:, 1] - sin * gone[:, 0]
@@ -351,30 +327,17 @@ class Poses:
             (np.full(m, self._size - 2), by_scale),
             (np.full(m, self._size - 1), by_bend),
         ]
-        rows = np.arange(3 * m)
-        values = [
-            np.einsum("nij,nj->ni", self._whitening, derivative).ravel()
-            for _, derivative in columns
-        ]
+        values = np.einsum("nij,knj->kni", self._whitening, [by for _, by in columns])
+        rows = np.tile(np.arange(3 * m), len(columns))
+        of = np.repeat(np.concatenate([column for column, _ in columns]), 3)
         # Scale and drift have a prior each: a last row with a single 1.
-        priors = np.arange(2)
-        entries = (
-            np.concatenate([*values, np.ones(2)]),
-            (
-                np.concatenate([np.tile(rows, len(columns)), 3 * m + priors]),
-                np.concatenate(
-                    [*(np.repeat(column, 3) for column, _ in columns), self._size - 2 + priors]
-                ),
-            ),
-        )
-        return matrix(entries, (3 * m + 2, self._size))
+        rows, of = np.append(rows, [3 * m, 3 * m + 1]), np.append(of, self._size - np.array([2, 1]))
+        return csr_array((np.append(values, [1.0, 1.0]), (rows, of)), shape=(3 * m + 2, self._size))
 
     def _parts(self) -> NDArray[np.int_]:
         """For each position, find its part of the map. No displacement connects two parts."""
-        part: NDArray[np.int_] = connected_components(
-            self._graph(self._place[self._from], self._place[self._to], self._positions),
-            directed=False,
-        )[1]
+        graph = _graph(self._place[self._from], self._place[self._to], self._positions)
+        part: NDArray[np.int_] = connected_components(graph, directed=False)[1]
         return part
 
     def _freedom(self, unknown: Array) -> int:
@@ -385,7 +348,7 @@ class Poses:
         as many unknowns as it has equations. So it adds no freedom, unless such displacements have
         the little noise that they claim.
         """
-        said = np.unique(np.concatenate([self._from, self._to]))
+        said = np.union1d(self._from, self._to)
         used = np.unique(self._place[said])
         parts = len(np.unique(self._parts()[used]))
         exact = (1 / np.sqrt((self._whitening**2).sum(1)) < EXACT).ravel()
@@ -399,68 +362,57 @@ class Poses:
             # Turns at one place say nothing about positions. So most rows and columns are zero.
             rows = rows[rows.any(axis=1)][:, rows.any(axis=0)]
             settled = int(np.linalg.matrix_rank(rows)) if rows.size else 0
-        return int(
-            len(exact)
-            - exact.sum()
-            - (
-                2 * len(used)
-                + len(said)
-                - 2 * parts
-                - self._open_rotations(unknown, said)
-                - settled
-            )
-        )
+        open_ones = 2 * parts + self._open_rotations(unknown, said, parts)
+        determined = 2 * len(used) + len(said) - open_ones
+        return len(exact) - int(exact.sum()) - (determined - settled)
 
-    def _open_rotations(self, unknown: Array, said: NDArray[np.int_]) -> int:
+    def _open_rotations(self, unknown: Array, said: NDArray[np.int_], parts: int) -> int:
         """Count the independent rotations of groups of headings that displacements leave open."""
         groups = np.unique(self._group[said])
-        if len(groups) == len(np.unique(self._parts()[self._place[said]])):
-            return len(groups)
-        at = unknown[: 2 * self._positions].reshape(-1, 2)
-        form = self._misfit(at[self._place[self._to]] - at[self._place[self._from]]).real[groups][
-            :, groups
-        ]
+        if len(groups) == parts:
+            return parts
+        form = self._misfit(self._gone(unknown)).real[np.ix_(groups, groups)]
         return int((np.linalg.eigvalsh(form) < 1e-6 * max(float(form.diagonal().max()), 1.0)).sum())
+
+    def _gone(self, unknown: Array) -> Array:
+        """Return how far positions lie from each other along each displacement, (n, 2)."""
+        at = self._positions_in(unknown)
+        gone: Array = at[self._place[self._to]] - at[self._place[self._from]]
+        return gone
+
+    def _origins(self) -> tuple[list[int], list[int], list[int]]:
+        """Return for each dstate its part of the map, and the first dstate of this part.
+
+        Also list the unknowns of the poses of these first dstates.
+        """
+        part = self._parts()[self._place[: self._dstates]].tolist()
+        first = first_index_of(part)
+        xs = [2 * int(self._place[s]) for s in first.values()]
+        headings = [2 * self._positions + s for s in first.values()]
+        return part, [first[of] for of in part], [*xs, *(x + 1 for x in xs), *headings]
+
+    def _xy(self) -> range:
+        """Return the unknowns x and y of the positions of dstates. They come first."""
+        return range(2 * int(self._place[: self._dstates].max()) + 2)
 
     def _poses(self, unknown: Array) -> tuple[Pose, ...]:
         """Compute the pose and covariance of each dstate, relative to the first of its part."""
-        at = unknown[: 2 * self._positions].reshape(-1, 2)
-        heading = unknown[2 * self._positions : -2]
-        part = self._parts()
-        first = {int(part[self._place[s]]): s for s in range(self._headings - 1, -1, -1)}
-        poses: list[Pose] = []
-        spreads = self._spreads(unknown, list(first.values()))
-        for s in range(self._dstates):
-            origin = first[int(part[self._place[s]])]
-            dx, dy = at[self._place[s]] - at[self._place[origin]]
-            cos, sin = math.cos(heading[origin]), math.sin(heading[origin])
-            facing = math.remainder(float(heading[s] - heading[origin]), math.tau)
-            back = np.array([[cos, sin], [-sin, cos]])
-            (xx, xy), (_, yy) = back @ spreads[s] @ back.T
-            poses.append(
-                Pose(
-                    float(cos * dx + sin * dy),
-                    float(cos * dy - sin * dx),
-                    facing,
-                    (float(xx), float(xy), float(yy)),
-                )
+        _, origin, fixed = self._origins()
+        place, heading = self._place[: self._dstates], unknown[2 * self._positions : -2]
+        at, back = self._positions_in(unknown)[place], -heading[origin]
+        moved = vectors_turned(at - at[origin], back)
+        facing = heading[: self._dstates] + back
+        # Turn both the rows and the columns of the covariance of each position.
+        whole, xy = self._covariance(unknown, fixed, self._xy()), 2 * place[:, None] + [0, 1]
+        spreads = whole[xy[:, :, None], xy[:, None, :]]
+        for _ in range(2):
+            spreads = vectors_turned(spreads, back[:, None]).transpose(0, 2, 1)
+        return tuple(
+            Pose(float(x), float(y), math.remainder(float(angle), math.tau), covariance)
+            for (x, y), angle, covariance in zip(
+                moved, facing, map(tuple, spreads[:, [0, 0, 1], [0, 1, 1]].tolist()), strict=True
             )
-        return tuple(poses)
-
-    def _spreads(self, unknown: Array, origins: Sequence[int]) -> Array:
-        """Return the covariance of the position of each dstate, (dstates, 2, 2), in square metres.
-
-        The poses of `origins`, which are dstates, count as known.
-        """
-        at = 2 * self._place[list(origins)]
-        fixed = [*at.tolist(), *(at + 1).tolist(), *(2 * self._positions + s for s in origins)]
-        places = np.unique(self._place[: self._dstates])
-        wanted = np.stack([2 * places, 2 * places + 1], 1).ravel().tolist()
-        whole = self._covariance(unknown, fixed, wanted)
-        row = 2 * np.searchsorted(places, self._place[: self._dstates])
-        both = np.stack([row, row + 1], 1)
-        spreads: Array = whole[both[:, :, None], both[:, None, :]]
-        return spreads
+        )
 
     def _covariance(self, unknown: Array, fixed: Sequence[int], wanted: Sequence[int]) -> Array:
         """Compute the covariance of the wanted unknowns, given that the fixed ones are known."""
@@ -476,14 +428,15 @@ class Poses:
         return covariance
 
 
-def matrix(entries: tuple[Any, tuple[Any, Any]], shape: tuple[int, int]) -> Any:
-    """Make a `csr_array`. Values at one position are added up."""
-    return coo_array(entries, shape=shape).tocsr()
+def _graph(first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
+    """Make a graph of `size` nodes from the ends of its edges, as a sparse matrix."""
+    return csr_array((np.ones(len(first)), (first, second)), shape=(size, size))
 
 
-def weighted(some: Any, weights: Array) -> Any:
-    """Multiply each row of a matrix by its weight."""
-    return csr_array(some.multiply(weights[:, None]))
+def _differences(first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> Any:
+    """Make the matrix that maps a vector x to the differences x[second] - x[first]."""
+    identity = eye_array(size, format="csr")
+    return identity[second] - identity[first]
 
 
 def system_solved(square: Any, added: Array, right: Any) -> Any:
@@ -493,13 +446,16 @@ def system_solved(square: Any, added: Array, right: Any) -> Any:
 
 
 def least_squares(some: Any, values: Array, weights: Array) -> Array:
-    """Solve a system by weighted least squares. Of several solutions return nearly the smallest."""
-    system = weighted(some, weights)
-    normal = system.T @ system
+    """Solve a system by weighted least squares. Of several solutions return nearly the smallest.
+
+    `values` may have several columns. Each is solved for by itself.
+    """
+    squared = some.T @ diags_array(weights**2)
+    normal = squared @ some
     scale = normal.diagonal()
     # A little damping makes the matrix regular, even if there are no equations.
     damping = DAMPING * (scale + (scale.max() or 1.0))
-    found: Array = system_solved(normal, damping, system.T @ values)
+    found: Array = system_solved(normal, damping, squared @ values)
     return found
 
 

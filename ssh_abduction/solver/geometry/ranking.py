@@ -79,11 +79,7 @@ class Ranking:
             except LimitError:
                 return ssh_map
 
-        held: list[SSHMap] = []
-        for ssh_map in maps:
-            held.append(fitted(ssh_map, first=not held))
-            if len(held) == RANKED:
-                break
+        held = [fitted(ssh_map, first=not i) for i, ssh_map in enumerate(islice(maps, RANKED))]
         yield from sorted(held, key=lambda m: m.fit.chi2 if m.fit else math.inf)
         yield from map(fitted, maps)
 
@@ -103,16 +99,15 @@ def in_order(maps: Sequence[SSHMap], counts: Iterable[int]) -> tuple[SSHMap, ...
 def _order(ssh_map: SSHMap) -> tuple[object, ...]:
     """Return the key by which `in_order` sorts a map."""
     dstates = ssh_map.dstates
-    places, paths = (
-        [-1 if number is None else number for number in numbers]
-        for numbers in zip(*((s.place, s.path) for s in dstates), strict=True)
-    )
+    numbers = [
+        [-1 if n is None else n for n in of]
+        for of in zip(*((s.place, s.path) for s in dstates), strict=True)
+    ]
     faults = [(f.step, f.kind, str(f.seen), str(f.expected)) for f in ssh_map.faults]
     return (
         ssh_map.fit.chi2 if ssh_map.fit else math.inf,
         ssh_map.dstate_at,
-        places,
-        paths,
+        *numbers,
         [s.direction or 0 for s in dstates],
         faults,
     )
@@ -167,27 +162,25 @@ def units_warning(trace: Trace) -> str | None:
 
     This happens if displacements are in kilometres instead of metres.
     """
-    ways: list[float] = []
-    sigmas: list[float] = []
-    for action, step, t in zip(trace.actions, trace.steps[1:], range(1, len(trace)), strict=True):
-        covariance = trace.covariance(t)
-        if action.kind != "travel" or step.displacement is None or covariance is None:
+    found: list[tuple[float, float]] = []  # the way and its noise
+    for t, action in enumerate(trace.actions, 1):
+        displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
+        if action.kind != "travel" or displacement is None or covariance is None:
             continue
-        dx, dy, _ = step.displacement
+        dx, dy, _ = displacement
         way = math.hypot(dx, dy)
         x, y = (dx / way, dy / way) if way else (1.0, 0.0)
-        sigma = math.sqrt(
-            x * x * covariance[0][0] + 2 * x * y * covariance[0][1] + y * y * covariance[1][1]
-        )
+        (xx, xy, _), (_, yy, _), _ = covariance
+        sigma = math.sqrt(x * x * xx + 2 * x * y * xy + y * y * yy)
         if way > STANDING * sigma:
             return None
-        ways.append(way)
-        sigmas.append(sigma)
-    if not ways:
+        found.append((way, sigma))
+    if not found:
         return None
+    way, sigma = map(max, zip(*found, strict=True))
     return (
         "the odometry cannot tell a travel from standing still: the longest travel is "
-        f"{max(ways):.3g} m, and its noise about {max(sigmas):.2g} m; "
+        f"{way:.3g} m, and its noise about {sigma:.2g} m; "
         "give metres and not kilometres, or correct the noise of the odometry"
     )
 
