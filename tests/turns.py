@@ -28,5 +28,5 @@ def guessed(search: Search) -> Weighing:
     """Run the guesses of a search, and return what they know about costs."""
     weighing = search._weighing
     assert weighing is not None
-    search._run(weighing.guesses(lambda: False), weighing)
+    search._run(weighing.beams.sources(lambda: False), weighing)
     return weighing

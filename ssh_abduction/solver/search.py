@@ -327,7 +327,7 @@ class Search:
             parts.candidates.sketch(turn("sketch").work(watch))
             weighing.keep_best()
         # 2. Maps of little cost, by guesses.
-        yield from weighing.guesses(clashes)
+        yield from weighing.beams.sources(clashes)
         # 3. The least number of dstates.
         is_enough = weighing.best is not None and not self.theory.has_faults
         fewest = turn("fewest dstates, map known" if is_enough else "fewest dstates")
@@ -335,7 +335,6 @@ class Search:
         # 4. The proof. One map more than wanted shows that not all are listed.
         most = self.limits.most and self.limits.most + 1
         weighing.of_labels = lambda trace, theory, s: self._solve_mended(trace, theory, most, s)
-        weighing.begin_proof()
         yield from weighing.proofs()
 
     def _run(self, sources: Iterable[Source], weighing: Weighing | None = None) -> None:

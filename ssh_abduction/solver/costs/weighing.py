@@ -34,7 +34,7 @@ from typing import TypeAlias
 from scipy.special import gammaincc
 
 from ssh_abduction.data.drives import drives_of, starts_of
-from ssh_abduction.data.groups import first_index_of
+from ssh_abduction.data.groups import first_index_of, firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
@@ -102,6 +102,7 @@ class Weighing:
     """The search for the maps of least cost of one trace.
 
     Attributes:
+        beams: The guesses of the search.
         candidates: The maps found that cost little more than the best one, the best one first.
         bound: A proven lower bound on the cost of every map, in nats.
         of_labels: Lists the minimal maps of a theory within some time; None before the proof.
@@ -110,7 +111,7 @@ class Weighing:
     """
 
     def __init__(self, parts: Parts) -> None:
-        """Prepare the search, whose sources are `guesses` and `proofs`."""
+        """Prepare the search, whose sources are those of `beams`, and `proofs`."""
         self._parts = parts
         self._misfit = Misfit(parts.task.problem)
         # The price in nats of one unit of each count, that of the count minimised first in front.
@@ -119,20 +120,23 @@ class Weighing:
         has_faults = parts.task.theory.has_faults
         first = {"tenths": dstate / 10} if has_faults else {"dstates": dstate}
         self._prices = {**first, "places": place, "paths": path}
-        self._least: dict[str, int] = {}
+        # Every map has this many places, and pays this many nats besides its prices.
+        self._places = 0
         self._base = 0.0
         self._within = max(WITHIN, parts.limits.within)
         self.candidates: list[Candidate] = []
         self.bound = 0.0
         self.proven = False
         self.of_labels: OfLabels | None = None
-        self._beams = Beams(parts, self.add, lambda: bool(self.candidates or parts.known.best))
+        self.beams = Beams(parts, self.add, lambda: bool(self.candidates or parts.known.best))
         self._task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         self._forced: list[tuple[int, int]] = []  # pairs of steps at one dstate in all cheap maps
         # For each way to lay drives, or parts between gaps, on each other: the cheapest map.
         self._of_laying: dict[Hashable, Candidate] = {}
         problem = parts.task.problem
         self._starts = sorted({*starts_of(problem.trace), *gaps_of(problem)})
+        # Faults need the readable encodings, which take too much memory for a long trace.
+        self._is_long = has_faults and len(problem.trace) > READABLE
         self._improved = 0.0  # the seconds on the clock when the best map was found
 
     @property
@@ -142,49 +146,48 @@ class Weighing:
 
     def minimal(self) -> list[Candidate]:
         """Return the maps of least cost."""
-        least = self.candidates[0].nats + EQUAL if self.candidates else 0.0
-        return [candidate for candidate in self.candidates if candidate.nats <= least]
+        return [candidate for candidate in self.candidates if candidate.nats <= self._nats + EQUAL]
 
-    def guesses(self, clashes: Callable[[], bool]) -> list[Source]:
-        """List the sources that guess maps of little cost, in the order of the schedule.
+    @property
+    def _nats(self) -> float:
+        """The cost of the best map in nats; infinite before the first one."""
+        return self.candidates[0].nats if self.candidates else math.inf
 
-        `clashes` returns whether a short proof shows that the trace has no map.
-        """
-        return self._beams.sources(clashes)
+    @property
+    def _most(self) -> float:
+        """The cost in nats from which on maps are not worth finding."""
+        return self._nats + max(self._within, EQUAL)
+
+    def _raise_bound(self, nats: float) -> None:
+        """Raise the bound, unless it is higher. The best map costs as much as the bound or more."""
+        self.bound = max(self.bound, min(nats, self._nats))
 
     def proofs(self) -> list[Source]:
         """List the sources that bound the cost of all maps, in the order of the schedule.
 
-        `begin_proof` comes before the first one.
+        Forget what was proven about counts, and bound the cost by what each map pays.
         """
-        problem, has_faults = self._parts.task.problem, self._parts.task.theory.has_faults
-        is_long = has_faults and len(problem.trace) > READABLE
-
-        def has_map() -> bool:
-            return bool(self.candidates)
-
-        return [
-            Source(
-                turn("forced joins"), lambda: has_map() and Forcing.holds_for(problem), self._force
-            ),
-            Source(
-                turn("wrong displacements"),
-                lambda: is_long and has_map() and bool(self._parts.task.theory.jumped),
-                self._search_jumps,
-            ),
-            Source(turn("Benders cuts"), lambda: True, self._refuse if is_long else self._cut),
-        ]
-
-    def begin_proof(self) -> None:
-        """Bound the cost of all maps by what each map pays. Forget what was proven about counts."""
-        parts = self._parts
+        parts, problem, theory = self._parts, self._task.problem, self._task.theory
         parts.known.status = Status.UNKNOWN
         self._improved = parts.watch.elapsed()
         if parts.known.best is not None:
             self.add(parts.known.best)
-        self._least = {"places": least_places(parts.task.problem)}
-        may_be_wrong = range(1, len(parts.task.trace)) if parts.task.theory.jumped else ()
-        self._base = self._misfit.of_returns([], may_be_wrong) / 2  # of every map
+        self._places = least_places(problem)
+        may_be_wrong = range(1, len(problem.trace)) if theory.jumped else ()
+        self._base = self._misfit.of_returns([], may_be_wrong) / 2
+        return [
+            Source(
+                turn("forced joins"),
+                lambda: bool(self.candidates) and Forcing.holds_for(problem),
+                self._force,
+            ),
+            Source(
+                turn("wrong displacements"),
+                lambda: self._is_long and bool(self.candidates and theory.jumped),
+                self._search_jumps,
+            ),
+            Source(turn("Benders cuts"), lambda: True, self._cut),
+        ]
 
     def _force(self) -> None:
         """Find joins that all cheap maps have. Raise the bound, and let clingo assert the joins."""
@@ -195,9 +198,9 @@ class Weighing:
             forcing.force(self._most)
             if forcing.low < best.nats - EQUAL:
                 for bound in forcing.bounds(best.nats, self.bound):
-                    self.bound = max(self.bound, min(bound, best.nats))
+                    self._raise_bound(bound)
         finally:
-            self.bound = max(self.bound, min(forcing.low, best.nats))
+            self._raise_bound(forcing.low)
             returns = forcing.returns
             self._forced = [(one.first, one.second) for one in returns if one.of == "dstate"]
             self._base = max(self._base, self._misfit.of_returns(returns) / 2)
@@ -209,13 +212,11 @@ class Weighing:
             best, map_without = self.candidates[0].map, parts.candidates.map_without
             search_jumps(parts.task.trace, map_without, best, self.add)
 
-    def _refuse(self) -> None:
-        """Give up the proof: the readable encodings would take too much memory."""
-        raise LimitError("no proof")
-
     def _cut(self) -> None:
         """List maps by their counts, and exclude those whose misfit is too expensive."""
         parts, task = self._parts, self._task
+        if self._is_long:
+            raise LimitError("no proof")
         if self._forced and row("visits").holds_for(task.theory):
             theory = task.theory.replace(same=(*task.theory.same, *self._forced))
             asserted = Task.of(task.problem.changed(theory=theory), task.watch)
@@ -230,13 +231,11 @@ class Weighing:
         finally:
             if self.candidates and "dstates" in self._prices:
                 # Clingo proved that each map left has at least this many dstates.
-                counts = {**self._least, "dstates": prefixes.engine.bound or 0}
-                proven = self._price(counts) + self._base
-                self.bound = max(self.bound, min(proven, self.candidates[0].nats))
+                self._raise_bound(self._at_least({"dstates": prefixes.engine.bound or 0}))
         if last is None and not self.candidates:
             parts.known.status = Status.UNSATISFIABLE
             return
-        self.bound = self.candidates[0].nats
+        self.bound = self._nats
         self.proven = True
         parts.known.status = Status.OPTIMAL
 
@@ -252,12 +251,13 @@ class Weighing:
         finally:
             if not self.proven:
                 first, dstates = next(iter(self._prices)), known.bound.dstates or 0
-                counts = {"dstates": dstates, "tenths": max(known.bound.tenths or 0, 10 * dstates)}
-                least = {**self._least, first: counts[first]}
-                self.bound = max(self.bound, self._price(least) + self._base)
+                tenths = max(known.bound.tenths or 0, 10 * dstates)
+                self._raise_bound(
+                    self._at_least({first: dstates if first == "dstates" else tenths})
+                )
             if self.candidates:
                 best = self.candidates[0].map
-                known.keep(Found.of(best, self._parts.task.theory), best.dstate_at)
+                known.keep(Found.of(best, self._task.theory), best.dstate_at)
 
     def maps(self) -> Generator[Priced, None, None]:
         """Yield the maps of least cost, then maps that cost up to `within` nats more.
@@ -265,23 +265,19 @@ class Weighing:
         All maps of least cost come with the counts of the best one, even if theirs differ. A map
         that costs more comes with its own counts and its rank, so that no other has its cost.
         """
-        parts, theory = self._parts, self._parts.task.theory
+        parts, theory = self._parts, self._task.theory
         complete = True
-        listed: set[SSHMap] = set()
-        seen: set[Hashable] = set()
-        for candidate in self.minimal():
-            # Candidates with the same dstates, places and displacements differ only in paths.
-            alike = dstates_and_places(candidate.map), jumped(candidate.map)
-            if alike in seen:
-                continue
-            seen.add(alike)
-            maps, proven = self._with_other_paths(candidate.map)
+        # Candidates with the same dstates, places and wrong displacements differ only in paths.
+        kinds = firsts(
+            ((dstates_and_places(candidate.map), jumped(candidate.map)), candidate.map)
+            for candidate in self.minimal()
+        )
+        for ssh_map in kinds.values():
+            maps, proven = self._with_other_paths(ssh_map)
             complete &= proven
-            new = [ssh_map for ssh_map in maps if ssh_map not in listed]
-            listed.update(new)
-            yield from ((ssh_map, parts.known.cost) for ssh_map in new)
+            yield from ((one, parts.known.cost) for one in maps)
         parts.rivals.listed = complete = complete and len(self.minimal()) < RIVALS
-        most = self.candidates[0].nats + parts.limits.within if self.candidates else 0.0
+        most = self._nats + parts.limits.within
         for rank, candidate in enumerate(self.candidates[len(self.minimal()) :]):
             if candidate.nats <= most:
                 yield candidate.map, (*Cost.of(candidate.map).preferred_by(theory), rank)
@@ -315,20 +311,17 @@ class Weighing:
 
     def add(self, ssh_map: SSHMap) -> float:
         """Return the cost of a map in nats. Keep the map if it costs little more than the best."""
-        ssh_map = projected(ssh_map, self._parts.task.theory)
+        ssh_map = projected(ssh_map, self._task.theory)
         nats = self._misfit.nats_of(ssh_map)
-        if self.candidates and nats < self.candidates[0].nats - EQUAL:
+        if nats < self._nats - EQUAL:
             self._improved = self._parts.watch.elapsed()
-        if self._starts:
-            self._keep_for_laying(Candidate(ssh_map, nats))
+        self._keep_for_laying(Candidate(ssh_map, nats))
         if all(known.map != ssh_map for known in self.candidates):
             self.candidates.append(Candidate(ssh_map, nats))
             self.candidates.sort(key=lambda candidate: candidate.nats)
             if len(self.candidates) > RIVALS:
-                beyond = self.candidates[RIVALS].nats - self.candidates[0].nats
-                self._within = min(self._within, beyond)
-            most = self.candidates[0].nats + max(self._within, EQUAL)
-            self.candidates = [c for c in self.candidates if c.nats < most][:RIVALS]
+                self._within = min(self._within, self.candidates[RIVALS].nats - self._nats)
+            self.candidates = [c for c in self.candidates if c.nats < self._most][:RIVALS]
         return nats
 
     def _keep_for_laying(self, candidate: Candidate) -> None:
@@ -357,8 +350,8 @@ class Weighing:
         if watch.left() == math.inf and watch.elapsed() > PATIENCE + MORE * self._improved:
             raise LimitError("no proof")
         least = self._cost_of_others(ssh_map)
-        self.bound = max(self.bound, min(least, self.candidates[0].nats if self.candidates else 0))
-        if self.candidates and least >= self._most:
+        self._raise_bound(least)
+        if least >= self._most:
             return None
         nats = self.add(ssh_map)
         _log.debug("a map of %.1f nats, and all others cost at least %.1f", nats, least)
@@ -373,43 +366,38 @@ class Weighing:
         believed = displacement.believed(task.trace, returns, wrong) if displacement else ()
         return frozenset((*returns, *believed)) or None
 
-    @property
-    def _most(self) -> float:
-        """The cost in nats from which on maps are not worth finding."""
-        return self.candidates[0].nats + max(self._within, EQUAL)
-
     def _cost_of_others(self, ssh_map: SSHMap) -> float:
         """Compute a lower bound on the cost of this map and of all maps after it in clingo's order.
 
         The order is lexicographic: the first count in which a later map differs is greater.
         """
-        counts, priorities = Cost.of(ssh_map), self._parts.task.theory.priorities
-        least = {name: self._least.get(name, 0) for name in self._prices}
-        found = []
-        for name in priorities:
-            if name in least:
+        counts = Cost.of(ssh_map)
+        found, known = list[float](), dict[str, int]()
+        for name in self._task.theory.priorities:
+            if name in self._prices:
                 number = getattr(counts, name)
-                found.append(self._price({**least, name: number + 1}))
-                least[name] = number
-        return min(*found, self._price(least)) + self._base
+                found.append(self._at_least({**known, name: number + 1}))
+                known[name] = number
+        return min(*found, self._at_least(known))
 
-    def _price(self, counts: Mapping[str, int]) -> float:
-        """Return the price of this many dstates, places and paths, in nats."""
-        return sum(price * counts.get(name, 0) for name, price in self._prices.items())
+    def _at_least(self, counts: Mapping[str, int]) -> float:
+        """Return a lower bound on the cost of maps that have at least these counts, in nats."""
+        counts = {"places": self._places, **counts}
+        return sum(price * counts.get(name, 0) for name, price in self._prices.items()) + self._base
 
     def weighed(self) -> Weighed | None:
         """Collect what is known about the costs of maps; None if no map is known."""
         if not self.candidates:
             return None
         rivals: dict[Course, Rival] = {}
-        most = self.candidates[0].nats + CHANCE * CERTAIN
+        most = self._nats + CHANCE * CERTAIN
         # Maps that lay drives otherwise are rivals, too, if they cost little more.
         layings = sorted(self._of_laying.values(), key=lambda candidate: candidate.nats)[:RIVALS]
         for candidate in (*self.candidates, *(c for c in layings if c.nats < most)):
             rival = rival_of(candidate.map, candidate.nats)
             rivals.setdefault((rival.dstates, rival.places), rival)
         found, excess = list(rivals.values()), self._excess()
-        problem = self._parts.task.problem
+        problem = self._task.problem
         is_likely = excess < math.inf and not may_join_more(problem, found)
         doubt = doubt_of(problem, self.candidates[0].map)
         if self.proven and not 1 < excess < math.inf:
@@ -418,8 +406,8 @@ class Weighing:
             bound=self.bound,
             within=self._within if self.proven else 0.0,
             rivals=(*found, *self._estimated(found[0], set(rivals))),
-            searched=is_likely and self._beams.found(self.candidates[0].nats),
-            broken=self._beams.broken,
+            searched=is_likely and self.beams.found(self._nats),
+            broken=self.beams.broken,
             excess=excess if excess < math.inf else 1.0,
             doubt=doubt,
             gaps=gaps_of(problem),
@@ -434,11 +422,11 @@ class Weighing:
         best = self.candidates[0].map
         returns = self._misfit.returns_of(best)
         square = self._misfit.of_map(best) - self._misfit.of_returns([], jumped(best))
-        square -= 2 * self._parts.task.problem.overlap.of_map(best)
+        square -= 2 * self._task.problem.overlap.of_map(best)
         freedom = sum(3 if found.of == "dstate" else 2 for found in returns)
         if not freedom or gammaincc(freedom / 2, max(square, 0.0) / 2) >= IMPROBABLE:
             return 1.0
-        is_off = spreads_of(self._parts.task.trace).any()
+        is_off = spreads_of(self._task.trace).any()
         return square / freedom if is_off and square <= EXCESS * freedom else math.inf
 
     def _estimated(self, best: Rival, known: Collection[Course]) -> Iterator[Rival]:
@@ -449,8 +437,8 @@ class Weighing:
         least = best.nats + self._within if self.proven else -math.inf
         left = max(self._parts.watch.left() + OVERTIME, LEAST_ESTIMATING)
         seconds = min(left, turn("estimated rivals").most)
-        of_best = self._parts.task.problem, self._misfit, self.candidates[0].map
-        for rival in rivals_of(*of_best, seconds):
+        problem, ssh_map = self._task.problem, self.candidates[0].map
+        for rival in rivals_of(problem, self._misfit, ssh_map, seconds):
             if rival.nats >= least and (rival.dstates, rival.places) not in known:
                 yield rival
 
