@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, TypeAlias
 from ssh_abduction.data.drives import Drive, drive_of_steps, drives_of
 from ssh_abduction.data.groups import gathered, indices_of, numbered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.solution.weighed import CHANCE, Rival, groups_of_drives
@@ -70,10 +69,17 @@ def rivals_of(
         nats: float = kept + misfit.nats_of_course(dstates, places or dstates, jumped(best))
         return nats + dstate * len(set(dstates)) + place * len(set(places))
 
-    if rival.places:
-        begins = _begins(rival.places, misfit.visit)
-    else:
-        begins = _first_arrivals(rival.dstates, problem.trace)
+    # For each step, the first step of its visit. Where the place changes, a visit begins, too. In a
+    # causal map, the steps to which one action leads from one dstate are one visit.
+    begins = [0]
+    first: dict[tuple[int, str], int] = {}
+    for t, action in enumerate(problem.trace.actions, 1):
+        if rival.places:
+            stays = rival.places[t - 1] == rival.places[t] and misfit.visit[t] != t
+            begins.append(begins[-1] if stays else t)
+        else:
+            before = rival.dstates[t - 1], action.name
+            begins.append(t if action.starts else first.setdefault(before, t))
     return estimated(rival, begins, free, cost_of, seconds)
 
 
@@ -82,8 +88,8 @@ def may_join_more(problem: Problem, rivals: Sequence[Rival]) -> bool:
 
     Without places, drives share no dstate if all their views or stars differ.
     """
-    at, drives = rivals[0].places or rivals[0].dstates, drives_of(problem.trace)
-    groups = min(groups_of_drives(rival.places or rival.dstates, drives) for rival in rivals)
+    at, drives = rivals[0].at, drives_of(problem.trace)
+    groups = min(groups_of_drives(rival.at, drives) for rival in rivals)
     of_drive = drive_of_steps(drives)
     of_group = groups_of_each(at, of_drive, range(len(drives)))
     group = [of_group[i] for i in of_drive]
@@ -131,12 +137,9 @@ def estimated(
     """
     watch = Watch().part(seconds)
     tried: set[Course] = {(best.dstates, best.places)}
-    steps = range(len(best.dstates))
-    apart = (
-        (_with_new_place(best, [drive.first <= t < drive.stop for t in steps]), CHANCE * CERTAIN)
-        for drive in drives
-    )
-    for course, most in chain(apart, ((moved, CERTAIN) for moved in _all_moved(best, begins))):
+    for moved, most in _moves(best, begins, drives):
+        dstates, places = (zip(of, moved, strict=False) for of in (best.dstates, best.places))
+        course = tuple(numbered(dstates)), tuple(numbered(places))
         if course in tried:
             continue
         tried.add(course)
@@ -150,47 +153,18 @@ def estimated(
             yield Rival(nats, *course, True, best.faults)
 
 
-def _all_moved(best: Rival, begins: Sequence[int]) -> Iterator[Course]:
-    """Yield the dstates and places of each map in which some visits to a place get a new place."""
-    at = best.places or best.dstates
-    visits = gathered((at[step], step) for step, begin in enumerate(begins) if begin == step)
+def _moves(
+    best: Rival, begins: Sequence[int], drives: Sequence[Drive]
+) -> Iterator[tuple[list[bool], float]]:
+    """Yield for each rival which steps get a new place, and the most nats that it may cost more."""
+    for drive in drives:
+        yield [drive.first <= t < drive.stop for t in range(len(begins))], CHANCE * CERTAIN
+    visits = gathered((best.at[step], step) for step, begin in enumerate(begins) if begin == step)
     for firsts in visits.values():
         singly = [{begin} for begin in firsts[1:]]
         from_then_on = [set(firsts[i:]) for i in range(1, len(firsts) - 1)]
         for moved in (*singly, *from_then_on):
-            yield _with_new_place(best, [begin in moved for begin in begins])
-
-
-def _with_new_place(best: Rival, moved: Sequence[bool]) -> Course:
-    """Return the dstates and places of a map after some steps get others, which are new."""
-    more = len(best.dstates)
-    dstates, places = (
-        [name + more * is_moved for name, is_moved in zip(of, moved, strict=False)]
-        for of in (best.dstates, best.places)
-    )
-    return tuple(numbered(dstates)), tuple(numbered(places))
-
-
-def _begins(places: Sequence[int], visit: Sequence[int]) -> list[int]:
-    """For each step, find the first step of its visit. A visit also begins where the place changes.
-
-    `places` has the place of each step. `visit` has the first step of each step's visit, as the
-    trace alone divides the steps into visits.
-    """
-    begins: list[int] = []
-    for step, place in enumerate(places):
-        is_first = not step or places[step - 1] != place or visit[step] == step
-        begins.append(step if is_first else begins[-1])
-    return begins
-
-
-def _first_arrivals(dstates: Sequence[int], trace: Trace) -> list[int]:
-    """For each step, find the first step to which the same action leads from the same dstate."""
-    first: dict[tuple[int, str], int] = {}
-    return [0] + [
-        step if action.starts else first.setdefault((dstates[step - 1], action.name), step)
-        for step, action in enumerate(trace.actions, 1)
-    ]
+            yield [begin in moved for begin in begins], CERTAIN
 
 
 def dstates_and_places(ssh_map: SSHMap) -> Course:

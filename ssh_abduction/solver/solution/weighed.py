@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any
 
 from ssh_abduction.data.drives import Drive, drive_of_steps, named_steps
+from ssh_abduction.data.groups import indices_of
 from ssh_abduction.data.map_parts import FAULTS
 from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.theory.overlap import groups_of
@@ -197,16 +199,9 @@ class Weighed:
         steps are at one dstate. If there is a `doubt`, no join has a probability, and none is
         listed.
         """
-        if self.doubt is not None:
-            return ()
-        at = self.rivals[0].at
-        last: dict[int, int] = {}
-        joins = list[tuple[int, int, float]]()
-        for step, name in zip(named_steps(self.drives, len(at)), at, strict=True):
-            if step - last.get(name, step) > 1:
-                joins.append((last[name], step, self.probability(last[name], step, "place")))
-            last[name] = step
-        return tuple(sorted(joins, key=lambda join: round(join[2], TOLD)))
+        pairs = self._pairs([self.rivals[0].at], "place")
+        joins = [pair for pair in pairs if pair[1] - pair[0] > 1]
+        return tuple(sorted(joins, key=lambda join: (round(join[2], TOLD), join[1])))
 
     @cached_property
     def missed(self) -> tuple[int, int, float] | None:
@@ -216,33 +211,27 @@ class Weighed:
         such steps at one place, or if there is a `doubt`.
         """
         best = self.rivals[0].at
-        apart = [told for told in self._pairs("place") if best[told[0]] != best[told[1]]]
-        return self._named(max(apart, key=lambda told: round(told[2], TOLD), default=None))
+        pairs = self._pairs([rival.places for rival in self.rivals], "place")
+        apart = [pair for pair in pairs if best[pair[0]] != best[pair[1]]]
+        return max(apart, key=lambda pair: round(pair[2], TOLD), default=None)
 
     @cached_property
     def unsure(self) -> tuple[int, int, float] | None:
         """The two steps whose probability of being one dstate is nearest to 0.5, as in `missed`."""
-        pairs = self._pairs("dstate")
-        least = min(pairs, key=lambda told: round(abs(told[2] - 0.5), TOLD), default=None)
-        return self._named(least)
+        pairs = self._pairs([rival.dstates for rival in self.rivals], "dstate")
+        return min(pairs, key=lambda pair: round(abs(pair[2] - 0.5), TOLD), default=None)
 
-    def _pairs(self, of: str) -> Iterator[tuple[int, int, float]]:
-        """Yield steps that some map has at one place or dstate, with the probability of that."""
-        pairs: set[tuple[int, int]] = set()
-        for rival in () if self.doubt is not None else self.rivals:
-            last: dict[int, int] = {}
-            for step, name in enumerate(rival.dstates if of == "dstate" else rival.places):
-                if name in last:
-                    pairs.add((last[name], step))
-                last[name] = step
-        yield from ((*pair, self.probability(*pair, of)) for pair in sorted(pairs))
+    def _pairs(self, maps: Iterable[Sequence[int]], of: str) -> list[tuple[int, int, float]]:
+        """List successive steps at one place or dstate of a map, and the probability of that.
 
-    def _named(self, told: tuple[int, int, float] | None) -> tuple[int, int, float] | None:
-        """Put the names of steps, such as "monday:12", in place of their numbers."""
-        if told is None:
-            return None
-        names = named_steps(self.drives, len(self.rivals[0].dstates))
-        return names[told[0]], names[told[1]], told[2]
+        `maps` has the places or dstates of the steps in each map. Steps are given by their names,
+        such as "monday:12". If there is a `doubt`, the list is empty.
+        """
+        if self.doubt is not None:
+            return []
+        steps = named_steps(self.drives, len(self.rivals[0].dstates))
+        found = {pair for at in maps for same in indices_of(at).values() for pair in pairwise(same)}
+        return [(steps[i], steps[j], self.probability(i, j, of)) for i, j in sorted(found)]
 
     @property
     def sentence(self) -> str:
