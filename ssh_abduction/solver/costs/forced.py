@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ssh_abduction.data.groups import gathered, indices_of
+from ssh_abduction.data.groups import firsts, gathered, indices_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import LONG_TURN, look_at_clock
 from ssh_abduction.solver.costs.misfit import Misfit
@@ -204,15 +204,17 @@ class _Joined:
     """Classes of visits that are at one place in every cheap map.
 
     Attributes:
+        apart: The flag [R, A, B] says that classes A and B are apart, as in `Visits`.
         fails: Whether no map has these classes.
+        counts: The least numbers of dstates and places, unless `fails`.
     """
 
     def __init__(self, visits: Visits, of: Ints) -> None:
-        self._apart = apart_classes(visits.apart, of)
-        self._turns = len(self._apart)
+        self.apart = apart_classes(visits.apart, of)
+        self._turns = len(self.apart)
         self._links = np.unique(np.column_stack([of[:-1], visits.links, of[1:]]), axis=0)
         self._close()
-        self.fails = bool(self._apart[0].diagonal().any())
+        self.fails = bool(self.apart[0].diagonal().any())
         if self.fails:
             return
         # The links into each class: from which class and direction, by (class, action, direction).
@@ -226,31 +228,23 @@ class _Joined:
         )
         a, x = nodes.T
         self._node = {(a, x): node for node, (a, x) in enumerate(nodes.tolist())}
-        apart = self._apart[(x - x[:, None]) % self._turns, a[:, None], a]
+        apart = self.apart[(x - x[:, None]) % self._turns, a[:, None], a]
         self._dstates = _Cliques(apart | (a[:, None] == a) & (x[:, None] != x))
         self._has_frames = visits.away is None
-        apart = self._apart if visits.away is None else apart_classes(visits.away[None], of)
+        apart = self.apart if visits.away is None else apart_classes(visits.away[None], of)
         self._places = _Cliques(np.logical_and.reduce(apart))
-
-    @property
-    def counts(self) -> tuple[int, int]:
-        """The least numbers of dstates and places."""
-        return self._dstates.size, self._places.size
+        self.counts = self._dstates.size, self._places.size
 
     def _close(self) -> None:
         """Flag two classes as apart if one action leads from them to classes that are apart."""
         every = self._links.T
         actions = [every[:, every[2] == action] for action in np.unique(every[2])]
         before = -1
-        while before < (before := int(np.count_nonzero(self._apart))):
+        while before < (before := int(np.count_nonzero(self.apart))):
             for a, out, _, arrives, b in actions:
-                then = self._apart[(arrives - arrives[:, None]) % self._turns, b[:, None], b]
+                then = self.apart[(arrives - arrives[:, None]) % self._turns, b[:, None], b]
                 e, f = np.nonzero(then)
-                self._apart[(out[f] - out[e]) % self._turns, a[e], a[f]] = True
-
-    def may_join(self, a: int, b: int) -> bool:
-        """Whether two classes may be at one place as in the map."""
-        return not self._apart[0, a, b]
+                self.apart[(out[f] - out[e]) % self._turns, a[e], a[f]] = True
 
     def counts_lacking(self, a: int, b: int) -> tuple[int, int] | None:
         """Return the least numbers of dstates and places without a join; None if none lacks it."""
@@ -264,9 +258,9 @@ class _Joined:
             if (u := node.get((c, x))) is not None
             if (v := node.get((d, (x + r) % self._turns))) is not None
         ]
-        places = [(c, d) for c, d in {(c, d) for _, c, d in added} if self._apart[:, c, d].all()]
+        places = [(c, d) for c, d in {(c, d) for _, c, d in added} if self.apart[:, c, d].all()]
         for r, c, d in added:
-            self._apart[r, c, d] = self._apart[-r % self._turns, d, c] = False
+            self.apart[r, c, d] = self.apart[-r % self._turns, d, c] = False
         if fails:
             return None
         return self._dstates.size_with(nodes), self._places.size_with(
@@ -278,9 +272,9 @@ class _Joined:
         added, waiting = [], [(0, a, b)]
         while waiting:
             r, a, b = waiting.pop()
-            if self._apart[r, a, b]:
+            if self.apart[r, a, b]:
                 continue
-            self._apart[r, a, b] = self._apart[-r % self._turns, b, a] = True
+            self.apart[r, a, b] = self.apart[-r % self._turns, b, a] = True
             added.append((r, a, b))
             for action, arrives in self._ways.get(a, ()):
                 for c, out in self._into[a, action, arrives]:
@@ -344,7 +338,7 @@ class Forcing:
                 middle = (low + high) / 2
                 self._laying = self._least_laying(middle)
                 # The copy of the visits keeps these joins from becoming `joins`.
-                if self._forced(replace(self.visits), self.joins, middle, {}, branches):
+                if self._forced(replace(self.visits), self.joins, middle, branches):
                     low = middle
                     yield low
                 else:
@@ -353,12 +347,7 @@ class Forcing:
     def force(self, most: float) -> None:
         """Find joins that every map of a cost below `most` has, until no more are found."""
         self._laying = self._least_laying(most)
-        self._forced(self.visits, self.joins, most, {}, 1)
-
-    def _units(self) -> Ints:
-        """Return the group of drives of each visit. Closures tie the drives of a group."""
-        first = np.unique(self.visits.visit, return_index=True)[1]
-        return np.array(self._overlap.unit_of_step)[first]
+        self._forced(self.visits, self.joins, most, 1)
 
     def _least_laying(self, most: float) -> float:
         """Return what every map of a cost below `most` pays for drives that share places.
@@ -366,7 +355,8 @@ class Forcing:
         If a map in which a drive shares no place with the others costs `most` or more, the drive
         shares one in each cheap map. Drives that closures tie count as one drive.
         """
-        units, laid = self._units(), 0
+        first, laid = np.unique(self.visits.visit, return_index=True)[1], 0
+        units = np.array(self._overlap.unit_of_step)[first]  # the group of drives of each visit
         base = self._misfit.of_returns(self.returns) / 2
         for one in {*units} if len({*units}) > 1 else ():
             look_at_clock()
@@ -379,42 +369,32 @@ class Forcing:
         """Return the price of at least this many dstates and places."""
         return max(counts[0], self._dstates) * self._prices[0] + counts[1] * self._prices[1]
 
-    def _forced(
-        self,
-        visits: Visits,
-        joins: Ints,
-        most: float,
-        known: dict[tuple[int, int], float],
-        branches: int,
-    ) -> bool:
+    def _forced(self, visits: Visits, joins: Ints, most: float, branches: int) -> bool:
         """Add joins that every map of a cost below `most` has. Return whether there is no such map.
 
-        `joins` has the joins found so far. `known` maps a join to a lower bound on the cost of maps
-        without it. New bounds are added to it. Up to `branches` joins at a time are assumed to be
+        `joins` has the joins found so far. Up to `branches` joins at a time are assumed to be
         lacking.
         """
         while True:
-            joins, low, worth = self._grown(visits, joins, most, known)
+            joins, low, worth = self._grown(visits, joins, most)
             if visits is self.visits:
                 self.joins, self.low = joins, low
             if low >= most:
                 return True
-            for (i, j), _ in worth[: BRANCHES if branches else 0]:
-                lacking = visits.lacking(i, j)
-                if self._forced(lacking, joins, most, dict(known), branches - 1):
+            for i, j in worth[: BRANCHES if branches else 0]:
+                if self._forced(visits.lacking(i, j), joins, most, branches - 1):
                     joins = visits.joined(joins, [(i, j)])
                     break
             else:
                 return False
 
     def _grown(
-        self, visits: Visits, joins: Ints, most: float, known: dict[tuple[int, int], float]
-    ) -> tuple[Ints, float, list[tuple[tuple[int, int], float]]]:
+        self, visits: Visits, joins: Ints, most: float
+    ) -> tuple[Ints, float, list[tuple[int, int]]]:
         """Add joins that every map of a cost below `most` has, as far as bounds alone show them.
 
         Returns the class of each visit, a lower bound on the cost of maps with these joins, and the
-        other joins of the best map. Each of these comes with a lower bound on the cost of maps
-        without it, the highest first. `known` has such bounds by join. New bounds are added.
+        other joins of the best map, the one first without which maps cost most.
         """
         while True:
             look_at_clock(LONG_TURN)
@@ -427,25 +407,19 @@ class Forcing:
             low = self._price(classes.counts) + misfit
             if low >= most:
                 return joins, low, []
-            # Of each two classes that may join, keep the pair of visits with the highest bound.
-            left = dict[tuple[int, int], tuple[int, int]]()
-            for i, j in self._pairs:
-                a, b = int(joins[i]), int(joins[j])
-                if a != b and classes.may_join(a, b):
-                    best = left.setdefault((min(a, b), max(a, b)), (i, j))
-                    if known.get((i, j), 0.0) > known.get(best, 0.0):
-                        left[min(a, b), max(a, b)] = (i, j)
-            worth = {pair: known.get(pair, 0.0) for pair in left.values()}
-            # Compute bounds only if no known bound forces a join, as computing them takes long.
-            if not any(price + misfit >= most for price in worth.values()):
-                for (a, b), pair in left.items():
-                    look_at_clock()
-                    counts = classes.counts_lacking(a, b)
-                    price = math.inf if counts is None else self._price(counts)
-                    worth[pair] = max(worth[pair], price)
-                known.update(worth)
-            forced = [pair for pair, price in worth.items() if price + misfit >= most]
+            # Of each two classes that may join, try one pair of visits.
+            left = firsts(
+                ((min(a, b), max(a, b)), pair)
+                for pair in self._pairs
+                for a, b in [joins[[*pair]].tolist()]
+                if a != b and not classes.apart[0, a, b]
+            )
+            worth = dict[tuple[int, int], float]()
+            for (a, b), pair in left.items():
+                look_at_clock()
+                counts = classes.counts_lacking(a, b)
+                worth[pair] = math.inf if counts is None else self._price(counts) + misfit
+            forced = [pair for pair, nats in worth.items() if nats >= most]
             if not forced:
-                ranked = sorted(worth.items(), key=lambda found: -found[1])
-                return joins, low, [(pair, price + misfit) for pair, price in ranked]
+                return joins, low, sorted(worth, key=lambda pair: -worth[pair])
             joins = visits.joined(joins, forced)
