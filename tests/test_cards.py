@@ -97,7 +97,7 @@ def test_card_of_an_unknown_answer_shows_the_map_of_a_prefix() -> None:
     unknown = Search(ACES).solution()
     for stopped, said in ((None, "unknown:"), ("time limit", "unknown (time limit):")):
         tree, text = shown(replace(unknown, stopped=stopped))
-        assert text.startswith(f"{said} no map of 23 steps yet")
+        assert text.startswith(f"{said} no map of all 23 steps yet")
         assert not list(tree.iter(f"{SVG}svg"))
 
 
