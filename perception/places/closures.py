@@ -44,7 +44,15 @@ from scipy.sparse.linalg import splu
 
 from perception.places.distinctive import Visit, patches_of
 from perception.places.local_map import MOST, LocalScene, Match, PackedPatch, Turned, match
-from perception.places.track import Array, Track, points_moved, points_turned
+from perception.places.track import (
+    Array,
+    Track,
+    at_end,
+    errors_of,
+    points_moved,
+    points_turned,
+    seen_from,
+)
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.odometry import Pose, moved
 
@@ -208,23 +216,6 @@ class _Gate:
         return bool(np.einsum("di,ij,dj->d", off, inverse, off).min() < GATE)
 
 
-def seen_from(first: Array, last: Array) -> Array:
-    """Compute the poses `last` in the frames of the poses `first`.
-
-    All poses are (..., 3): x, y in metres and rotation of the axes in radians.
-    """
-    cos, sin = np.cos(first[..., 2]), np.sin(first[..., 2])
-    x, y, turned = np.moveaxis(last - first, -1, 0)
-    return np.stack([cos * x + sin * y, cos * y - sin * x, turned], axis=-1)
-
-
-def errors_of(poses: Array, matches: Array) -> Array:
-    """Subtract poses found by matching from poses of the track: (..., 3) metres and radians."""
-    off = poses - matches
-    off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
-    return off
-
-
 def without_drift(middles: Array, way: Array, drift: float) -> Array:
     """Compute the middles of visits without a steady drift of the heading, in radians per metre.
 
@@ -250,15 +241,6 @@ def uncertainty(track: Track, first: int, last: int, end: Array) -> Array:
     # arm that begins there.
     first, last = min(first, last), max(first, last)
     return at_end(end, track.spreads[last] - track.spreads[first])
-
-
-def at_end(end: Array, covariance: Array) -> Array:
-    """Compute the covariance, (3, 3), of the end of an arm from that of its beginning.
-
-    The rotation at the beginning moves the end, which is at (x, y) metres from there.
-    """
-    arm = np.array([[1.0, 0.0, -end[1]], [0.0, 1.0, end[0]], [0.0, 0.0, 1.0]])
-    return np.asarray(arm @ covariance @ arm.T)
 
 
 def agreeing(

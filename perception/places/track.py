@@ -88,10 +88,16 @@ def rotation(angle: float) -> Array:
     return np.array([[cos, -sin], [sin, cos]])
 
 
-def covariance_turned(angle: float, covariance: Array) -> Array:
-    """Rotate the covariance, (3, 3), of x, y and a heading counterclockwise by an angle."""
+def pose_rotation(angle: float) -> Array:
+    """The matrix, (3, 3), that rotates x and y counterclockwise by an angle in radians."""
     turned = np.eye(3)
     turned[:2, :2] = rotation(angle)
+    return turned
+
+
+def covariance_turned(angle: float, covariance: Array) -> Array:
+    """Rotate the covariance, (3, 3), of x, y and a heading counterclockwise by an angle."""
+    turned = pose_rotation(angle)
     return np.asarray(turned @ covariance @ turned.T)
 
 
@@ -111,3 +117,29 @@ def odometer_covariance(onward: Pose) -> Array:
     along, across = OFFSET + WAY * way, OFFSET + WAY * way / 2
     heading = ANGLE + TURNING * abs(onward[2]) + DRIFT * way
     return np.diag([along**2, across**2, heading**2])
+
+
+def seen_from(first: Array, last: Array) -> Array:
+    """Compute the poses `last` in the frames of the poses `first`.
+
+    All poses are (..., 3): x, y in metres and rotation of the axes in radians.
+    """
+    cos, sin = np.cos(first[..., 2]), np.sin(first[..., 2])
+    x, y, turned = np.moveaxis(last - first, -1, 0)
+    return np.stack([cos * x + sin * y, cos * y - sin * x, turned], axis=-1)
+
+
+def errors_of(poses: Array, matches: Array) -> Array:
+    """Subtract poses found by matching from poses of the track: (..., 3) metres and radians."""
+    off = poses - matches
+    off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
+    return off
+
+
+def at_end(end: Array, covariance: Array) -> Array:
+    """Compute the covariance, (3, 3), of the end of an arm from that of its beginning.
+
+    The rotation at the beginning moves the end, which is at (x, y) metres from there.
+    """
+    arm = np.array([[1.0, 0.0, -end[1]], [0.0, 1.0, end[0]], [0.0, 0.0, 1.0]])
+    return np.asarray(arm @ covariance @ arm.T)

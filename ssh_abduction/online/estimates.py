@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from perception.places.track import at_end, errors_of, pose_rotation, seen_from
 from ssh_abduction.data.gateways import ways
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
@@ -98,8 +99,7 @@ class Moves:
 
     def __init__(self, ssh_map: SSHMap, trace: Trace | None) -> None:
         self._map = ssh_map
-        self._links: dict[Move, Links] = {}
-        self._links.update(transitions(ssh_map, trace).items())
+        self._links = transitions(ssh_map, trace)
         self._by_angle = _has_turns_of_its_own(ssh_map)
 
     def move(self, action: Action, turned: float | None = None) -> Move:
@@ -234,7 +234,7 @@ def _fit(one: Star, other: Star) -> bool:
     )
 
 
-def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
+def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[Move, Links]:
     """For the name of each action, find where the action leads.
 
     The trace that was mapped serves to estimate probabilities by counting (equation 3). The links
@@ -244,7 +244,7 @@ def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
     steps = zip(labels, trace.actions if trace else (), labels[1:], strict=False)
     counts = _counted(((x, a.name, y) for x, a, y in steps if not a.starts), ssh_map.links)
     entries = gathered((action, (x, y, n)) for (x, action, y), n in counts.items())
-    links: dict[str, Links] = {}
+    links: dict[Move, Links] = {}
     for action, listed in entries.items():
         sources, targets, tries = np.array(listed).T
         links[action] = _links_of(sources, targets, tries, len(ssh_map.dstates))
@@ -279,8 +279,8 @@ class Motion:
 
     def then(self, other: Motion) -> Motion:
         """Return this motion followed by another one."""
-        turned = _turned(self.displacement[2])
-        noise = _carried(self.noise, turned @ other.displacement)
+        turned = pose_rotation(self.displacement[2])
+        noise = at_end(turned @ other.displacement, self.noise)
         end = moved(self.displacement, other.displacement)
         return Motion(end, noise + turned @ other.noise @ turned.T)
 
@@ -290,7 +290,7 @@ class Motion:
         The robot is off its dstate at both ends. The pose of the map has an error like the motion.
         """
         off = np.diag([odometry.offset**2, odometry.offset**2, odometry.facing**2])
-        return 2 * self.noise + off + _carried(off, np.array(self.displacement))
+        return 2 * self.noise + off + at_end(np.array(self.displacement), off)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -332,12 +332,10 @@ class DeadReckoning:
         """Return the poses of a map; None if it has none."""
         if ssh_map.fit is None or len(ssh_map.fit.poses) != len(ssh_map.dstates):
             return None
-        frame = np.zeros(len(ssh_map.dstates), np.intp)
-        for number, piece in enumerate(ssh_map.pieces):
-            frame[list(piece)] = number
-        found = gathered(((frame[s.id], s.floor), s.id) for s in ssh_map.dstates)
-        for number, some in enumerate(found.values()):
-            frame[some] = number
+        piece_of = {s: number for number, piece in enumerate(ssh_map.pieces) for s in piece}
+        frames = [(piece_of.get(s.id, 0), s.floor) for s in ssh_map.dstates]
+        number_of = {frame: number for number, frame in enumerate(dict.fromkeys(frames))}
+        frame = np.array([number_of[frame] for frame in frames], np.intp)
         poses = np.array([(pose.x, pose.y, pose.heading) for pose in ssh_map.fit.poses])
         return cls(poses, frame, odometry)
 
@@ -349,16 +347,15 @@ class DeadReckoning:
         end, column x the start.
         """
         targets, starts = links.nonzero()
-        ways = self._ways(starts, targets)
+        ways = seen_from(self._poses[starts], self._poses[targets])
         error = motion.error(self._odometry)
-        near = _gaussian(_off(ways, motion), error)
+        onward = np.array(motion.displacement)
+        near = _gaussian(errors_of(ways, onward), error)
         # Turn the ways about their mean heading, so that their headings have a variance.
         mean = math.atan2(np.sin(ways[:, 2]).mean(), np.cos(ways[:, 2]).mean())
-        centre = (*ways[:, :2].mean(axis=0), mean)
-        off = _off(ways, Motion(centre, error))
-        broad = np.diag((off**2).mean(axis=0)) + error
-        off = _off(np.array([motion.displacement]), Motion(centre, error))
-        usual = near.sum() + _gaussian(off, broad)[0]
+        centre = np.array([*ways[:, :2].mean(axis=0), mean])
+        broad = np.diag((errors_of(ways, centre) ** 2).mean(axis=0)) + error
+        usual = near.sum() + _gaussian(errors_of(onward, centre)[None], broad)[0]
         weighed = links[targets, starts] * near * ((len(near) + 1) / usual)
         return sparse.csr_array((weighed, (targets, starts)), shape=links.shape)
 
@@ -377,7 +374,8 @@ class DeadReckoning:
         which = np.repeat(np.arange(len(near)), [len(some) for some in near])
         targets = np.array([target for some in near for target in some], np.intp)
         prior = (1 - unmapped) / len(self._poses)
-        known = prior * _gaussian(_off(self._ways(starts[which], targets), motion), error)
+        ways = seen_from(self._poses[starts[which]], self._poses[targets])
+        known = prior * _gaussian(errors_of(ways, np.array(motion.displacement)), error)
         none = unmapped * self._uniform[starts]
         total = np.bincount(which, known, len(starts)) + none
         share = np.divide(p, total, out=np.zeros_like(p), where=total > 0)
@@ -392,31 +390,6 @@ class DeadReckoning:
         dx, dy, _ = motion.displacement
         moves = np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy, np.zeros(len(starts))])
         return np.asarray(self._spots[starts] + moves)
-
-    def _ways(self, starts: NDArray[np.intp], targets: NDArray[np.intp]) -> Array:
-        """The displacements between n pairs of dstates, in the frame of the first one, (n, 3)."""
-        x, y, turned = (self._poses[targets] - self._poses[starts]).T
-        cos, sin = np.cos(self._poses[starts, 2]), np.sin(self._poses[starts, 2])
-        return np.column_stack([cos * x + sin * y, cos * y - sin * x, turned])
-
-
-def _turned(angle: float) -> Array:
-    """Return the matrix that turns a displacement, (3, 3)."""
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _carried(covariance: Array, arm: Array) -> Array:
-    """Return the covariance of a pose after the robot moved by `arm`, in the same frame, (3, 3)."""
-    lever = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
-    return np.asarray(lever @ covariance @ lever.T)
-
-
-def _off(ways: Array, motion: Motion) -> Array:
-    """Subtract a motion from n displacements, (n, 3)."""
-    off = ways - np.array(motion.displacement)
-    off[:, 2] = (off[:, 2] + math.pi) % math.tau - math.pi
-    return np.asarray(off, np.float64)
 
 
 def _gaussian(off: Array, covariance: Array) -> Array:

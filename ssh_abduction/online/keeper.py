@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from ssh_abduction.checker.checker import unchecked
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import DState, Fault, SSHMap
-from ssh_abduction.data.trace import Step, Trace
+from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.solver import (
     Cost,
     Effort,
@@ -72,6 +72,7 @@ class Keeper(ABC):
     """
 
     retry = RETRY  # after a search that was stopped, the trace grows by this factor
+    _lists_links = False  # whether a map with an untried link is extended in all possible ways
 
     def __init__(self, problem: Problem, options: StepOptions, before: Keeper | None) -> None:
         self._problem, self._options = problem, options
@@ -79,12 +80,32 @@ class Keeper(ABC):
         self.searches: int = before.searches if before else 0  # by clingo, so far
         self._next_search = 0  # no search before the trace has this many steps
         self._spent = 0.0  # seconds that all steps took
+        self.maps: list[ExtendedMap] = []  # the maps known, the minimal ones first
+        # Whether it is proven that the cheapest maps are minimal, that all minimal maps are listed,
+        # and that no map satisfies the axioms.
+        self.is_proven = self.is_complete = self.is_impossible = False
+        self._least: tuple[int, ...] = ()  # what a minimal map costs, while proven
+        # Whether the claim in `mapper.py` holds for the theory, so that maps are replayed.
+        self._replays = row("prefixes").holds_for(problem.theory.replace(misread=0, slipped=0))
 
     def take(self, problem: Problem) -> None:
-        """Add the last step: keep the maps that predict it, and drop those that it contradicts."""
-        self._problem = problem
-        if self._follow():
-            self._next_search = 0
+        """Add the last step: keep the maps that predict it, and drop those that it contradicts.
+
+        Further minimal maps may exist if a minimal map has no link for the last action.
+        """
+        self._problem, was_proven = problem, self.is_proven
+        if self.is_impossible and self._replays:
+            return
+        action, step = problem.trace.steps[-2].action, problem.trace.steps[-1]
+        assert action
+        if not self._lists_links and any(m.is_unknown(action.name) for m in self.minimal):
+            self.is_complete = False
+        self._follow(action, step)
+        if not self._replays:  # the answer for fewer steps says nothing about more steps
+            self.maps, self.is_impossible, self._next_search = [], False, 0
+        if not self.minimal:
+            self.is_proven = self.is_complete = False
+            self._next_search = 0 if was_proven else self._next_search
 
     def answer(self, began: float) -> Solution:
         """Search the steps so far if that is due, and return what is known.
@@ -98,14 +119,29 @@ class Keeper(ABC):
             self._next_search = max(steps + PAUSE, int(self.retry * steps)) if was_stopped else 0
         return self._solution(began)
 
-    @abstractmethod
-    def _follow(self) -> bool:
-        """Follow all maps along the last step. Return whether the maps are proven no longer."""
+    @property
+    def minimal(self) -> list[ExtendedMap]:
+        """The maps that are proven minimal; empty without a proof."""
+        return [m for m in self.maps if m.cost == self._least] if self.is_proven else []
 
     @property
-    @abstractmethod
     def _is_settled(self) -> bool:
         """Whether another search would find nothing new."""
+        is_complete = self.is_complete or len(self.minimal) == self._options.max_maps
+        return self.is_impossible or (self.is_proven and is_complete)
+
+    @property
+    def _status(self) -> Status:
+        """How much is proven about the maps."""
+        if self.is_impossible:
+            return Status.UNSATISFIABLE
+        if self.is_proven:
+            return Status.OPTIMAL
+        return Status.FEASIBLE if self.maps else Status.UNKNOWN
+
+    @abstractmethod
+    def _follow(self, action: Action, step: Step) -> None:
+        """Follow all maps along the last step, and the action before it."""
 
     @abstractmethod
     def _ask(self) -> Stop | None:
@@ -135,14 +171,7 @@ class MapKeeper(Keeper):
         self, problem: Problem, options: StepOptions, before: MapKeeper | None = None
     ) -> None:
         super().__init__(problem, options, before)
-        # The minimal maps. If maps are not replayed, the maps that clingo found last, which may not
-        # be proven minimal.
-        self._maps: list[ExtendedMap] = []
-        self._status = Status.UNKNOWN  # UNKNOWN until clingo has proven which maps are minimal
-        self._complete = False  # whether these are all minimal maps
         self._cost: Cost | None = None  # the counts of a minimal map; None if they are unknown
-        # Whether the claim in `mapper.py` holds for the theory, so that maps are replayed.
-        self._replays = row("prefixes").holds_for(problem.theory)
         # Drafts (see the head of this module), the best first. They need not be consistent.
         self._drafts: list[Sketch] = []
         # The last search, which the next one continues; None before the first.
@@ -157,48 +186,26 @@ class MapKeeper(Keeper):
         """
         keeper = MapKeeper(problem, self._options, before=self)
         if self._problem.theory.displacement == "use":
-            known = [m.explained() for m in self._maps[:DRAFTS]]
+            known = [m.explained() for m in self.maps[:DRAFTS]]
             for ssh_map in (*known, *(draft.map() for draft in self._drafts)):
                 keeper._add_draft(ssh_map)
         return keeper
 
-    def _follow(self) -> bool:
+    def _follow(self, action: Action, step: Step) -> None:
         """Keep the maps that predict the last step. If none does, those without a link are drafts.
 
         A map without a link for the action may be extended to further minimal maps.
         """
         trace, pairs = self._problem.trace, self._problem.pairs
-        action = trace.steps[-2].action
-        assert action
-        if self._is_impossible:
-            return False
-        was_proven, seen = self._is_proven, observation(trace.steps[-1], self._problem.theory)
-        untried = [m for m in self._maps if m.is_unknown(action.name)]
-        longer = (m.predicting(action.name, seen) for m in self._maps if self._replays)
-        self._maps = [m for m in longer if m and m.is_allowed(trace, pairs, self._judging)]
-        self._complete = self._complete and not untried
-        self._drafts = [draft for draft in self._drafts if draft.extend(action, trace.steps[-1])]
-        if self._maps:
-            return False
-        self._status, self._complete = Status.UNKNOWN, False
-        for rival in untried[:DRAFTS]:
-            self._add_draft(rival.explained())
-        return was_proven or not self._drafts
-
-    @property
-    def _is_proven(self) -> bool:
-        """Whether the maps are proven minimal."""
-        return self._status is Status.OPTIMAL
-
-    @property
-    def _is_impossible(self) -> bool:
-        """Whether it is proven that these steps have no map, however the trace goes on."""
-        return self._status is Status.UNSATISFIABLE and self._replays
-
-    @property
-    def _is_settled(self) -> bool:
-        is_complete = self._complete or len(self._maps) == self._options.max_maps
-        return self._is_impossible or (self._is_proven and is_complete)
+        seen = observation(step, self._problem.theory)
+        untried = [m for m in self.maps if m.is_unknown(action.name)]
+        longer = (m.predicting(action.name, seen) for m in self.maps if self._replays)
+        self.maps = [m for m in longer if m and m.is_allowed(trace, pairs, self._judging)]
+        self._drafts = [draft for draft in self._drafts if draft.extend(action, step)]
+        if not self.maps:
+            for rival in untried[:DRAFTS]:
+                self._add_draft(rival.explained())
+            self._next_search = self._next_search if self._drafts else 0
 
     def _ask(self) -> Stop | None:
         """Search for minimal maps with clingo and keep them.
@@ -209,7 +216,7 @@ class MapKeeper(Keeper):
         """
         trace, theory, options = self._problem.trace, self._problem.theory, self._options
         before = self.search.parts if self.search else None
-        minimal = self._maps[0].explained() if self._is_proven else None
+        minimal = self.maps[0].explained() if self.is_proven else None
         search = Search(
             trace,
             theory,
@@ -224,9 +231,12 @@ class MapKeeper(Keeper):
         said = search.solution()
         self.search, self._found = search, said
         if said.status in (Status.OPTIMAL, Status.UNSATISFIABLE) or not self._replays:
-            if len(found) >= len(self._maps) or not self._is_proven:
-                self._maps = [ExtendedMap.of(m, trace, theory) for m in found]
-            self._status, self._complete, self._cost = said.status, said.complete, said.cost
+            if len(found) >= len(self.maps) or not self.is_proven:
+                self.maps = [ExtendedMap.of(m, trace, theory) for m in found]
+            self.is_proven = said.status is Status.OPTIMAL
+            self.is_impossible = said.status is Status.UNSATISFIABLE
+            self.is_complete, self._cost = said.complete, said.cost
+            self._least = self.maps[0].cost if self.maps else ()
             self._drafts = []
         elif found:
             self._add_draft(found[0])
@@ -237,7 +247,7 @@ class MapKeeper(Keeper):
         assert asked is not None
         problem, steps = self._problem, len(self._problem.trace)
         status, cost = self._status, self._cost
-        maps = tuple(m.explained() for m in self._maps)
+        maps = tuple(m.explained() for m in self.maps)
         if status is Status.UNKNOWN and (best := self._best_draft()):
             maps, status, cost = (best,), Status.FEASIBLE, Cost.of(best)
         self._judge(maps, began)
@@ -248,7 +258,7 @@ class MapKeeper(Keeper):
             maps=maps,
             cost=cost if maps else None,
             bound=asked.bound,
-            complete=self._complete,
+            complete=self.is_complete,
             theory=problem.theory,
             steps=steps,
             effort=Effort(
@@ -256,7 +266,7 @@ class MapKeeper(Keeper):
                 seconds=replace(searched, total=time.perf_counter() - began),
                 evidence=said_by(problem.evidence, problem.trace, problem.theory, refused),
             ),
-            stopped=None if self._complete else asked.stopped,
+            stopped=None if self.is_complete else asked.stopped,
             support=asked.support,
         )
 

@@ -27,7 +27,7 @@ the logical representation can be restored" (Kuipers & Beeson 2002). This module
   never tried: each map is extended by a link to each dstate that looks right. These extensions
   cost nothing, and all others cost more. If no minimal map predicts the step, the trace
   is solved again, within the time of a step.
-* **Rivals** (`RivalMaps`): besides the minimal maps, explanations that cost a little more,
+* **Rivals**: besides the minimal maps, explanations that cost a little more,
   each with its probability (`shares_of_rivals`).
 * **Where the robot is** (`Confidence`), by Markov localisation in the best map. It begins just
   before the first step that contradicted the map. The robot may be at no dstate of the map.
@@ -42,7 +42,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -50,13 +50,12 @@ import numpy as np
 
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault, SSHMap
-from ssh_abduction.data.trace import Trace
+from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.online.keeper import ExtendedMap, Keeper, Seen, StepOptions
 from ssh_abduction.online.localiser import Belief, Chances, Localiser
 from ssh_abduction.solver import (
     Bound,
     Effort,
-    Judging,
     Seconds,
     Solution,
     Status,
@@ -66,7 +65,6 @@ from ssh_abduction.solver import (
     solve,
 )
 from ssh_abduction.theory.settle import Problem
-from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
 
 # A map can be certain only if it has at least this probability among its rivals.
@@ -92,77 +90,170 @@ class Recovery(Keeper):
         self, problem: Problem, options: StepOptions, before: Recovery | None = None
     ) -> None:
         super().__init__(problem, options, before)
-        self._maps = RivalMaps(problem, options.max_maps, self._judging)
         self._confidence: Confidence = before._confidence if before else Confidence(problem.theory)
         self.standing: Standing | None = None  # before the first answer
+        self._bound = Bound()  # the best lower bound of the cost so far
+        self._found: Solution | None = None  # the last result of the solver
+        theory = problem.theory
+        # Under the two causal axioms alone, `ExtendedMap.ways_on` lists all possible links.
+        self._lists_links = (
+            theory.level == "causal"
+            and not problem.evidence
+            and not theory.rules
+            and not theory.without
+        )
 
     def restarted(self, problem: Problem) -> Recovery:
         """Make a Recovery for a theory that changed with the last step. It has no proofs yet."""
         return Recovery(problem, self._options, before=self)
 
-    def _follow(self) -> bool:
-        problem, lead = self._problem, self._maps.lead
-        if lead and self._confidence.known is None:
-            self._confidence.known = lead.explained()
-        lost_proof, broke = self._maps.follow(problem)
-        if broke:
-            self._confidence.broke.append((len(problem.trace) - 1, broke))
-        return lost_proof
+    @property
+    def lead(self) -> ExtendedMap | None:
+        """The best rival; None if there is none."""
+        return self.maps[0] if self.maps else None
+
+    def _follow(self, action: Action, step: Step) -> None:
+        """Extend the rivals by the last step, and note if the best one expected something else."""
+        theory, lead, confidence = self._problem.theory, self.lead, self._confidence
+        if lead and confidence.known is None:
+            confidence.known = lead.explained()
+        if not self._replays:
+            self._bound = Bound()
+            return
+        seen = observation(step, theory)
+        t = len(self._problem.trace) - 1
+        new = [way for m in self.maps for way in m.ways_on(action.name, step, seen, theory)]
+        # Evidence tests only the new step, as it has already tested the earlier ones.
+        if self._problem.evidence:
+            trace = self._problem.trace
+            pairs = self._problem.changed(trace, theory.of_steps(0, t + 1)).pairs
+            new = [rival for rival in new if rival.is_allowed(trace, pairs, self._judging)]
+        self.maps = self._ranked(new)
+        there = lead.contradiction(action.name, seen) if lead else None
+        if lead and there is not None and all(r.cost > lead.cost for r in self.maps):
+            confidence.broke.append((t, _sentence(theory, t, there, lead.shows[there], seen)))
 
     def answer(self, began: float) -> Solution:
         """Also say how sure the maps are."""
         solution = super().answer(began)
-        self.standing = self._confidence.standing(self._maps, self._problem.trace, solution.maps)
+        self.standing = self._confidence.standing(self, self._problem.trace, solution.maps)
         return solution
 
-    @property
-    def _is_settled(self) -> bool:
-        return self._maps.is_settled
-
     def _ask(self) -> Stop | None:
-        trace, options = self._problem.trace, self._options
-        found = solve(
+        """Solve all steps, add the maps to the rivals, and record what is proven."""
+        trace, theory, options = self._problem.trace, self._problem.theory, self._options
+        self._found = found = solve(
             trace,
-            self._problem.theory.of_steps(0, len(trace)),
+            theory.of_steps(0, len(trace)),
             time_limit=options.time_limit,
             work_limit=options.work_limit,
             max_maps=options.max_maps,
             speedups=options.speedups,
         )
-        self._maps.absorb(found)
+        if (found.bound.tenths or 0) >= (self._bound.tenths or 0):
+            self._bound = found.bound
+        if found.status is Status.UNSATISFIABLE:
+            self.is_impossible, self.maps = True, []
+            return found.stopped
+        rivals = [ExtendedMap.of(ssh_map, trace, theory) for ssh_map in found.maps]
+        if found.status is Status.OPTIMAL and rivals:
+            self.is_proven, self.is_complete, self._least = True, found.complete, rivals[0].cost
+        # Keep the other rivals. But if all minimal maps are listed, no other rival can be as cheap.
+        known = {(rival.labels, rival.faults) for rival in rivals}
+        others = [
+            rival
+            for rival in self.maps
+            if (rival.labels, rival.faults) not in known
+            and not (self.is_complete and rival.cost <= self._least)
+        ]
+        self.maps = self._ranked([*rivals, *others])
         return found.stopped
 
     def _solution(self, began: float) -> Solution:
-        maps, theory = self._maps, self._problem.theory
-        maps.drop_inconsistent()
-        lead, solved = maps.lead, maps.solved
-        assert solved is not None
+        theory, found = self._problem.theory, self._found
+        self._drop_inconsistent()
+        lead, status = self.lead, self._status
+        assert found is not None
         # Without a proof the best rival is the answer.
-        listed = tuple(rival.explained() for rival in maps.minimal)
-        if lead and not listed:
-            listed = (lead.explained(),)
+        listed = tuple(rival.explained() for rival in self.minimal or self.maps[:1])
         self._judge(listed, began)
-        status = self._status()
         return Solution(
             status=status,
             maps=listed,
             cost=cost_as_counted(listed[0], lead.cost, theory) if lead else None,
-            bound=maps.bound,
-            complete=maps.is_complete or status is Status.UNSATISFIABLE,
+            bound=self._bound,
+            complete=self.is_complete or self.is_impossible,
             theory=theory,
             steps=len(self._problem.trace),
-            effort=Effort(solved.steps, Seconds(time.perf_counter() - began, 0.0, 0.0)),
-            stopped=None if maps.is_complete or maps.is_impossible else solved.stopped,
+            effort=Effort(found.steps, Seconds(time.perf_counter() - began, 0.0, 0.0)),
+            stopped=None if self.is_complete or self.is_impossible else found.stopped,
             partial=None if listed else self._confidence.known,
         )
 
-    def _status(self) -> Status:
-        """Return the status of the solution: how much is proven about its maps."""
-        if self._maps.is_proven:
-            return Status.OPTIMAL
-        if self._maps.rivals:
-            return Status.FEASIBLE
-        return Status.UNSATISFIABLE if self._maps.is_impossible else Status.UNKNOWN
+    def _drop_inconsistent(self) -> None:
+        """Drop the best rival until the checker accepts the best one that is left.
+
+        This is not needed if the maps are proven, or if the theory has only the causal axioms.
+        """
+        trace = self._problem.trace
+        theory = self._problem.theory.of_steps(0, len(trace))
+        while not (self.is_proven or self._lists_links) and self.maps:
+            if not check(trace, self.maps[0].explained(), theory):
+                break
+            del self.maps[0]
+
+    def undecided(self) -> tuple[list[ExtendedMap], list[float]]:
+        """List the rivals that later steps have to decide between, and their probabilities.
+
+        Among rivals with the same faults, only the cheapest ones by the theory count,
+        because no evidence ever refutes a superfluous dstate.
+        """
+        least: dict[frozenset[Fault], tuple[int, ...]] = {}
+        for rival in self.maps:
+            faults = frozenset(rival.faults)
+            least[faults] = min(least.get(faults, rival.cost), rival.cost)
+        rivals = [r for r in self.maps if r.cost == least[frozenset(r.faults)]]
+        return rivals, self._shares(rivals)
+
+    def _ranked(self, rivals: list[ExtendedMap]) -> list[ExtendedMap]:
+        """Sort rivals, the best first, and drop the improbable ones.
+
+        The cheapest rivals come first, and at most `max_maps` of them stay. Then come up to RIVALS
+        others that are probable enough, by probability.
+        """
+        if not rivals:
+            return []
+        least = min(rival.cost for rival in rivals)
+        shares = self._shares(rivals)
+        order = sorted(range(len(rivals)), key=lambda i: (rivals[i].cost != least, -shares[i]))
+        ranked = [
+            rivals[i]
+            for i in order
+            if rivals[i].cost == least or shares[i] >= LEAST_SHARE * max(shares)
+        ]
+        most = self._options.max_maps
+        ties = sum(rival.cost == least for rival in ranked)
+        if most and ties > most:
+            ranked = ranked[:most] + ranked[ties:]
+            self.is_complete, ties = False, most
+        return ranked[: ties + RIVALS]
+
+    def _shares(self, rivals: list[ExtendedMap]) -> list[float]:
+        """Compute the probability of each rival. They sum to 1."""
+        dstates = len(min(rivals, key=lambda rival: rival.cost).shows)
+        views = len({step.view for step in self._problem.trace})
+        return shares_of_rivals(rivals, self._problem.theory, RARE, dstates, views)
+
+
+def _sentence(theory: Theory, t: int, there: int, expected: Seen, seen: Seen) -> str:
+    """Describe step t, which contradicts the best map. It expected the dstate `there`."""
+    kinds = [kind for kind in ("misread", "slipped") if getattr(theory, kind)]
+    what = (
+        f"seen {seen[0]}, expected {expected[0]}"
+        if seen[0] != expected[0]
+        else "seen another star than expected"
+    )
+    return f"step {t}: {what} at dstate {there}: {', '.join(kinds)}, or the map is wrong"
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +327,7 @@ class Confidence:
         # Each step that contradicted the best map since it was certain, with a sentence.
         self.broke: list[tuple[int, str]] = []
 
-    def standing(self, maps: RivalMaps, trace: Trace, listed: Sequence[SSHMap]) -> Standing:
+    def standing(self, maps: Recovery, trace: Trace, listed: Sequence[SSHMap]) -> Standing:
         """Compute how sure the mapper is now, by the rivals and the maps listed, best first."""
         broke = tuple(sentence for _, sentence in self.broke)
         lead = maps.lead
@@ -303,7 +394,7 @@ class Confidence:
         return belief
 
 
-def _is_decided(maps: RivalMaps, rivals: Sequence[ExtendedMap], shares: Sequence[float]) -> bool:
+def _is_decided(maps: Recovery, rivals: Sequence[ExtendedMap], shares: Sequence[float]) -> bool:
     """Whether the future is decided, whatever the past.
 
     All minimal maps must be known and predict the same from here on. Rivals that predict this too
@@ -311,194 +402,13 @@ def _is_decided(maps: RivalMaps, rivals: Sequence[ExtendedMap], shares: Sequence
     """
     if not maps.is_complete:
         return False
-    future = maps.rivals[0].future()
+    future = maps.maps[0].future()
     if any(rival.future() != future for rival in maps.minimal[1:]):
         return False
     agreeing = sum(
         share for rival, share in zip(rivals, shares, strict=True) if rival.future() == future
     )
     return agreeing >= CERTAIN
-
-
-class RivalMaps:
-    """The rivals of the steps so far, with how much is proven about them.
-
-    The theory of `problem` allows faults, and no field is "auto". At most `max_maps` of the
-    cheapest rivals are kept; None keeps all.
-    """
-
-    def __init__(self, problem: Problem, max_maps: int | None, judging: Judging) -> None:
-        trace, theory = problem.trace, problem.theory
-        self.rivals: list[ExtendedMap] = []  # the cheapest first, then others by probability
-        self.solved: Solution | None = None  # the last result of the solver
-        self.bound = Bound()  # the best lower bound of the cost so far
-        # Whether it is proven that the cheapest rivals are minimal, that all minimal maps are
-        # listed, and that no map satisfies the axioms.
-        self.is_proven = self.is_complete = self.is_impossible = False
-        self._problem, self._theory = problem, theory
-        self._max_maps, self._judging = max_maps, judging
-        self._views = {step.view for step in trace.steps}
-        self._least: tuple[int, ...] = ()  # what a minimal map costs, while proven
-        self._replays = row("prefixes").holds_for(theory.replace(misread=0, slipped=0))
-        self._has_evidence = bool(problem.evidence)
-        # Under the two causal axioms alone, `ExtendedMap.ways_on` lists all possible links.
-        self._lists_links = (
-            theory.level == "causal"
-            and not self._has_evidence
-            and not theory.rules
-            and not theory.without
-        )
-
-    @property
-    def lead(self) -> ExtendedMap | None:
-        """The best rival; None if there is none."""
-        return self.rivals[0] if self.rivals else None
-
-    @property
-    def minimal(self) -> list[ExtendedMap]:
-        """The rivals that are proven minimal; empty without a proof."""
-        if not self.is_proven:
-            return []
-        return [rival for rival in self.rivals if rival.cost == self._least]
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether solving again would add nothing."""
-        return self.is_impossible or (
-            self.is_proven and (self.is_complete or len(self.minimal) == self._max_maps)
-        )
-
-    def follow(self, problem: Problem) -> tuple[bool, str | None]:
-        """Extend the rivals by the last step of `problem`, which has all steps and the theory.
-
-        Returns:
-            Whether the maps are not proven minimal any more, or further minimal maps may exist; and
-            a sentence about what the best map expected instead, None if it predicted the step.
-        """
-        self._problem, trace = problem, problem.trace
-        t = len(trace) - 1
-        self._views.add(trace.steps[t].view)
-        if self.is_impossible and self._replays:
-            return False, None
-        done = trace.steps[t - 1].action
-        assert done
-        seen = observation(trace.steps[t], self._theory)
-        lead = self.lead
-        contradicted = lead.contradiction(done.name, seen) if lead else None
-        has_unknown = any(rival.is_unknown(done.name) for rival in self.minimal)
-        self.rivals = self._gone_on(self.rivals, t)
-        if not self._replays:  # the answer for fewer steps says nothing about more steps
-            self.rivals, self.bound = [], Bound()
-            self.is_proven = self.is_complete = self.is_impossible = False
-            return True, None
-        lost_proof = False
-        if self.is_proven and self.is_complete and has_unknown and not self._lists_links:
-            self.is_complete, lost_proof = False, True
-        if self.is_proven and not self.minimal:
-            self.is_proven, self.is_complete, lost_proof = False, False, True
-        if lead and contradicted is not None and all(r.cost > lead.cost for r in self.rivals):
-            return lost_proof, self._sentence(t, lead, contradicted, seen)
-        return lost_proof, None
-
-    def absorb(self, found: Solution) -> None:
-        """Add the maps of a solution of all steps to the rivals, and record what is proven."""
-        self.solved = found
-        if (found.bound.tenths or 0) >= (self.bound.tenths or 0):
-            self.bound = found.bound
-        if found.status is Status.UNSATISFIABLE:
-            self.is_impossible, self.rivals = True, []
-            return
-        rivals = [
-            ExtendedMap.of(ssh_map, self._problem.trace, self._theory) for ssh_map in found.maps
-        ]
-        if found.status is Status.OPTIMAL and rivals:
-            self.is_proven, self.is_complete, self._least = True, found.complete, rivals[0].cost
-        # Keep the other rivals. But if all minimal maps are listed, no other rival can be as cheap.
-        known = {(rival.labels, rival.faults) for rival in rivals}
-        others = [
-            rival
-            for rival in self.rivals
-            if (rival.labels, rival.faults) not in known
-            and not (self.is_complete and rival.cost <= self._least)
-        ]
-        self.rivals = self._ranked([*rivals, *others])
-
-    def drop_inconsistent(self) -> None:
-        """Drop the best rival until the checker accepts the best one that is left.
-
-        This is not needed if the maps are proven, or if the theory has only the causal axioms.
-        """
-        if self.is_proven or self._lists_links:
-            return
-        theory = self._theory.of_steps(0, len(self._problem.trace))
-        while self.rivals and check(self._problem.trace, self.rivals[0].explained(), theory):
-            del self.rivals[0]
-
-    def undecided(self) -> tuple[list[ExtendedMap], list[float]]:
-        """List the rivals that later steps have to decide between, and their probabilities.
-
-        Among rivals with the same faults, only the cheapest ones by the theory count,
-        because no evidence ever refutes a superfluous dstate.
-        """
-        least: dict[frozenset[Fault], tuple[int, ...]] = {}
-        for rival in self.rivals:
-            faults = frozenset(rival.faults)
-            least[faults] = min(least.get(faults, rival.cost), rival.cost)
-        rivals = [r for r in self.rivals if r.cost == least[frozenset(r.faults)]]
-        return rivals, self._shares(rivals)
-
-    def _gone_on(self, rivals: Iterable[ExtendedMap], t: int) -> list[ExtendedMap]:
-        """Extend rivals of the steps before `t` by step `t`, and rank the results."""
-        done, step = self._problem.trace.steps[t - 1].action, self._problem.trace.steps[t]
-        assert done
-        seen = observation(step, self._theory)
-        new = [
-            way for rival in rivals for way in rival.ways_on(done.name, step, seen, self._theory)
-        ]
-        # Evidence tests only the new step, as it has already tested the earlier ones.
-        if self._has_evidence:
-            trace = self._problem.trace.prefix(t + 1)
-            pairs = self._problem.changed(trace, self._theory.of_steps(0, t + 1)).pairs
-            new = [rival for rival in new if rival.is_allowed(trace, pairs, self._judging)]
-        return self._ranked(new)
-
-    def _ranked(self, rivals: list[ExtendedMap]) -> list[ExtendedMap]:
-        """Sort rivals, the best first, and drop the improbable ones.
-
-        The cheapest rivals come first, and at most `max_maps` of them stay. Then come up to RIVALS
-        others that are probable enough, by probability.
-        """
-        if not rivals:
-            return []
-        least = min(rival.cost for rival in rivals)
-        shares = self._shares(rivals)
-        order = sorted(range(len(rivals)), key=lambda i: (rivals[i].cost != least, -shares[i]))
-        ranked = [
-            rivals[i]
-            for i in order
-            if rivals[i].cost == least or shares[i] >= LEAST_SHARE * max(shares)
-        ]
-        ties = sum(rival.cost == least for rival in ranked)
-        if self._max_maps and ties > self._max_maps:
-            ranked = ranked[: self._max_maps] + ranked[ties:]
-            self.is_complete, ties = False, self._max_maps
-        return ranked[: ties + RIVALS]
-
-    def _shares(self, rivals: list[ExtendedMap]) -> list[float]:
-        """Compute the probability of each rival. They sum to 1."""
-        dstates = len(min(rivals, key=lambda rival: rival.cost).shows)
-        return shares_of_rivals(rivals, self._theory, RARE, dstates, len(self._views))
-
-    def _sentence(self, t: int, lead: ExtendedMap, there: int, seen: Seen) -> str:
-        """Describe step t, which contradicts the best map: the map expected dstate `there`."""
-        kinds = [kind for kind in ("misread", "slipped") if getattr(self._theory, kind)]
-        expected = lead.shows[there]
-        what = (
-            f"seen {seen[0]}, expected {expected[0]}"
-            if seen[0] != expected[0]
-            else "seen another star than expected"
-        )
-        return f"step {t}: {what} at dstate {there}: {', '.join(kinds)}, or the map is wrong"
 
 
 def shares_of_rivals(

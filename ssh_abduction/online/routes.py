@@ -390,10 +390,8 @@ class MoveGraph:
         for source, action, target in sorted(ssh_map.links, reverse=True):
             if source != target:
                 self._add(source, target, action, known=True)
-        if by == "places" and ssh_map.paths:
+        if by == "places":
             self._add_implied()
-        elif by == "places":
-            self._add_returns()
 
     def nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
         """Return the dstates that a user names, and words for them, such as "place 3".
@@ -517,7 +515,8 @@ class MoveGraph:
 
         A path leads both ways, so the robot can go back where it travelled. At a place it can turn
         to each path through this place. Two places next to each other in the order of a path may
-        have a wall between them if no travel joins them.
+        have a wall between them if no travel joins them. In a map without paths, the robot can go
+        back on each travel, and turn to all directions that it faced at a place.
         """
         travel, around = self._only_action(onward=True), self._only_action(onward=False)
         facing: dict[Node, Node] = {}  # the first dstate of each course
@@ -527,40 +526,25 @@ class MoveGraph:
                 at.setdefault(s.place, set()).add(s.id)
                 if s.path is not None and s.direction is not None:
                     facing.setdefault((s.place, s.path, s.direction), s.id)
-        for path in self.map.paths:
-            for course in ((place, path.id, way) for place in path.order for way in (1, -1)):
-                at.setdefault(course[0], set()).add(facing.get(course, course))
+        paths = self.map.paths
+        courses: list[tuple[int, int | None, int | None]] = [
+            (place, p.id, way) for p in paths for place in p.order for way in (1, -1)
+        ]
+        for course in courses or [(place, None, None) for place in at]:
+            at.setdefault(course[0], set()).add(facing.get(course, course))
         for source, _, target in self.map.links:
-            (here, path_id, way), (there, other, _) = self.course(source), self.course(target)
-            if here != there and path_id is not None and path_id == other and way is not None:
-                assert here is not None
-                assert there is not None
-                start, end = (there, path_id, -way), (here, path_id, -way)
+            (here, path, way), (there, other, _) = self.course(source), self.course(target)
+            if here is None or there is None or here == there:
+                continue
+            if not paths:
+                for node in at[there]:
+                    self._imply(node, (here, None, None), travel)
+            elif path is not None and path == other and way is not None:
+                start, end = (there, path, -way), (here, path, -way)
                 self._imply(facing.get(start, start), facing.get(end, end), travel)
-        for courses_here in at.values():
-            for node in courses_here:
-                for aside in courses_here - {node}:
-                    self._imply(node, aside, around if self._is_around(node, aside) else None)
-
-    def _add_returns(self) -> None:
-        """Add the way back of each travel, and turns between all dstates of a place."""
-        at: dict[int, set[Node]] = {}  # the nodes of each place
-        for s in self.map.dstates:
-            if s.place is not None:
-                at.setdefault(s.place, {(s.place, None, None)}).add(s.id)
-        for here in at.values():
-            for node, aside in permutations(here, 2):
-                if isinstance(aside, int):
-                    self._imply(node, aside, None)
-        travels = []
-        for source, action, target in self.map.links:
-            back, there = self.course(source)[0], self.course(target)[0]
-            if back is not None and there is not None and back != there:
-                travels.append((action, there, back))
-        actions = {action for action, _, _ in travels}
-        for action, there, back in travels:
-            for node in at[there]:
-                self._imply(node, (back, None, None), action if len(actions) == 1 else None)
+        for nodes in at.values():
+            for node, aside in permutations(nodes, 2):
+                self._imply(node, aside, around if self._is_around(node, aside) else None)
 
     def _passes_closed(self, source: Node, target: Node) -> bool:
         """Whether a move leaves or enters a place by a gateway that was last seen closed."""
@@ -598,7 +582,7 @@ class MoveGraph:
         for source, action, target in self.map.links:
             s, x = dstates[source], dstates[target]
             moves = s.place != x.place if onward else s.direction != x.direction
-            if s.path is not None and s.path == x.path and moves:
+            if s.path == x.path and moves and (s.path is not None or not self.map.paths):
                 names.add(action)
         return names.pop() if len(names) == 1 else None
 
