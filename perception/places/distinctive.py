@@ -293,7 +293,7 @@ class _Detector:
 
     def _forget(self) -> None:
         """Forget scans that are too old for any further visit."""
-        oldest = self._recent.way(min(self._horizon, self._stays.oldest))
+        oldest = self._recent.way(min(self._horizon, self._stays.done))
         self._recent.drop_before(self._recent.at(oldest - AROUND))
 
     def _passes(self, chain: _Chain) -> Iterator[Visit]:
@@ -434,14 +434,9 @@ class Stays:
         self._found: list[tuple[float, Visit]] = []  # the metres driven up to each visit
         self._turns = [_TurningPoint(0.0, END, math.pi, 0)]
         self._asked = dict.fromkeys(STRIDES, 0)  # the next scan that may be a turn
-        self._done = 0  # all visits before this scan are complete
+        self.done = 0  # all visits before this scan are complete
         self._staying: Visit | None = None
         self._left = 0.0  # metres driven at the end of the stay
-
-    @property
-    def oldest(self) -> int:
-        """The first scan that may still become a visit."""
-        return self._done
 
     def add(self, visits: Sequence[Visit], horizon: int | None) -> Iterator[Visit]:
         """Add the next visits, in the order of their scans, and yield those that are final.
@@ -463,7 +458,7 @@ class Stays:
                 patch = self._maps.around(visit.scan, visit.middle, self._half)
                 self._staying = replace(visit, patch=PackedPatch.of(patch))
             self._left = self._recent.way(visit.end)
-        if self._staying and (horizon is None or self._recent.way(self._done) > self._left + STAY):
+        if self._staying and (horizon is None or self._recent.way(self.done) > self._left + STAY):
             yield self._staying
             self._staying = None
 
@@ -530,7 +525,7 @@ class Stays:
             recent.at(recent.way(min(self._asked.values())) - NEARBY),
             recent.at(recent.way(recent.end - 1) - AROUND),
         )
-        return max(self._done, self._before_turns(limit))
+        return max(self.done, self._before_turns(limit))
 
     def _before_turns(self, limit: int) -> int:
         """Find the last scan up to a limit that does not separate turns near each other."""
@@ -551,14 +546,14 @@ class Stays:
         for turn in sorted(self._turns, key=lambda turn: (turn.stride, -turn.angle, -turn.scan)):
             if turn.scan < limit and self._is_apart(turn):
                 self._add_turn(turn.scan)
-        done = [visit for _, visit in self._found if self._done <= visit.scan < limit]
+        done = [visit for _, visit in self._found if self.done <= visit.scan < limit]
         done.sort(key=lambda visit: visit.scan)
         completed = [self._with_gateways(visit) for visit in done]
         # Visits are remembered until turns near them are decided.
         least = self._recent.way(min(limit, self._recent.end - 1)) - NEARBY
         self._found = [(way, visit) for way, visit in self._found if way >= least]
         self._turns = [turn for turn in self._turns if turn.scan >= limit]
-        self._done = limit
+        self.done = limit
         return completed
 
     def _is_apart(self, turn: _TurningPoint) -> bool:

@@ -124,10 +124,15 @@ def open_space(distance: Array, far: float) -> Bools:
     """
     if distance.max() < WIDE * far:
         return np.zeros(distance.shape, np.bool_)
-    parts, count = ndimage.label(distance > far, EIGHT)
-    is_open = np.zeros(count + 1, np.bool_)
-    is_open[parts[distance >= WIDE * far]] = True
-    return np.asarray(is_open[parts])
+    return _parts_with(distance > far, distance >= WIDE * far)
+
+
+def _parts_with(mask: Bools, some: Bools) -> Bools:
+    """Find the connected parts of a mask in which some cells, which it includes, lie."""
+    parts, count = ndimage.label(mask, EIGHT)
+    is_found = np.zeros(count + 1, np.bool_)
+    is_found[parts[some]] = True
+    return np.asarray(is_found[parts])
 
 
 def with_shores(lines: Bools, inner: Bools) -> Bools:
@@ -151,10 +156,7 @@ def passable(patch: Patch, room: float) -> Bools:
         distance = ndimage.distance_transform_edt(~patch.occupied) * CELL
         fits = trail | (patch.free & (distance >= room))
     fits = ndimage.binary_opening(fits, EIGHT) | trail
-    parts, count = ndimage.label(fits, EIGHT)
-    is_reached = np.zeros(count + 1, np.bool_)
-    is_reached[parts[trail]] = True
-    reached = is_reached[parts]
+    reached = _parts_with(fits, trail)
     # Small holes within the reached space are furniture, unless they touch the border.
     holes, count = ndimage.label(~reached)
     sizes = np.bincount(holes.ravel(), minlength=count + 1) * CELL**2
@@ -253,23 +255,19 @@ def bends(graph: Graph, distance: Array, out: float) -> Iterator[Fork]:
     for edge in graph.edges:
         # A line begins where it leaves the disc of its junction. A dead end has no such disc.
         first, last = (graph.nodes[node].radius if degrees[node] > 1 else 0.0 for node in edge.ends)
-        yield from _bends_of(edge, first, last, distance, out)
-
-
-def _bends_of(edge: Edge, first: float, last: float, distance: Array, out: float) -> Iterator[Fork]:
-    """Find the bends of one line outside the discs of its ends, the sharpest first."""
-    cells = edge.cells
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(cells, axis=0).T))])
-    rows, columns = np.rint(cells).astype(int).T
-    radii = distance[rows, columns]
-    fits = np.minimum(along - first, along[-1] - last - along) >= radii + out
-    if not fits.any():
-        return
-    turns = np.where(fits, _turns(cells, along, radii, out), 0.0)
-    while turns.max() >= TURN:
-        k = int(turns.argmax())
-        yield Node(cells[k], float(radii[k])), [cells[k::-1], cells[k:]]
-        turns[np.abs(along - along[k]) < 2 * radii[k]] = 0.0
+        cells = edge.cells
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(cells, axis=0).T))])
+        rows, columns = np.rint(cells).astype(int).T
+        radii = distance[rows, columns]
+        fits = np.minimum(along - first, along[-1] - last - along) >= radii + out
+        if not fits.any():
+            continue
+        # The sharpest bend comes first.
+        turns = np.where(fits, _turns(cells, along, radii, out), 0.0)
+        while turns.max() >= TURN:
+            k = int(turns.argmax())
+            yield Node(cells[k], float(radii[k])), [cells[k::-1], cells[k:]]
+            turns[np.abs(along - along[k]) < 2 * radii[k]] = 0.0
 
 
 def _turns(cells: Array, along: Array, radii: Array, out: float) -> Array:

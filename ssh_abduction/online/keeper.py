@@ -100,12 +100,13 @@ class Keeper(ABC):
         assert action
         if not self._lists_links and any(m.is_unknown(action.name) for m in self.minimal):
             self.is_complete = False
-        self._follow(action, step)
+        self._keep(self._follow(action, step))
         if not self._replays:  # the answer for fewer steps says nothing about more steps
             self.maps, self.is_impossible, self._next_search = [], False, 0
         if not self.minimal:
             self.is_proven = self.is_complete = False
-            self._next_search = 0 if was_proven else self._next_search
+            if was_proven or not self._can_wait:
+                self._next_search = 0
 
     def answer(self, began: float) -> Solution:
         """Search the steps so far if that is due, and return what is known.
@@ -118,6 +119,25 @@ class Keeper(ABC):
             was_stopped = self._ask() in ("work limit", "time limit", "interrupted")
             self._next_search = max(steps + PAUSE, int(self.retry * steps)) if was_stopped else 0
         return self._solution(began)
+
+    def _keep(self, maps: list[ExtendedMap]) -> None:
+        """Keep maps, the cheapest first. At most `max_maps` of the cheapest ones stay."""
+        most, ties = self._options.max_maps, sum(m.cost == maps[0].cost for m in maps)
+        if most and ties > most:
+            maps, self.is_complete = maps[:most] + maps[ties:], False
+        self.maps = maps
+
+    def _prove(self, found: Solution, maps: Sequence[ExtendedMap]) -> None:
+        """Record what a search for the maps of all steps proves. These are its maps."""
+        if found.status is Status.UNSATISFIABLE:
+            self.is_impossible, self.is_complete = True, found.complete
+        elif found.status is Status.OPTIMAL and maps:
+            self.is_proven, self.is_complete, self._least = True, found.complete, maps[0].cost
+
+    @property
+    def _can_wait(self) -> bool:
+        """Whether the next search can wait though no map is proven."""
+        return True
 
     @property
     def minimal(self) -> list[ExtendedMap]:
@@ -140,7 +160,7 @@ class Keeper(ABC):
         return Status.FEASIBLE if self.maps else Status.UNKNOWN
 
     @abstractmethod
-    def _follow(self, action: Action, step: Step) -> None:
+    def _follow(self, action: Action, step: Step) -> list[ExtendedMap]:
         """Follow all maps along the last step, and the action before it."""
 
     @abstractmethod
@@ -191,7 +211,11 @@ class MapKeeper(Keeper):
                 keeper._add_draft(ssh_map)
         return keeper
 
-    def _follow(self, action: Action, step: Step) -> None:
+    @property
+    def _can_wait(self) -> bool:
+        return bool(self._drafts)
+
+    def _follow(self, action: Action, step: Step) -> list[ExtendedMap]:
         """Keep the maps that predict the last step. If none does, those without a link are drafts.
 
         A map without a link for the action may be extended to further minimal maps.
@@ -200,12 +224,11 @@ class MapKeeper(Keeper):
         seen = observation(step, self._problem.theory)
         untried = [m for m in self.maps if m.is_unknown(action.name)]
         longer = (m.predicting(action.name, seen) for m in self.maps if self._replays)
-        self.maps = [m for m in longer if m and m.is_allowed(trace, pairs, self._judging)]
+        maps = [m for m in longer if m and m.is_allowed(trace, pairs, self._judging)]
         self._drafts = [draft for draft in self._drafts if draft.extend(action, step)]
-        if not self.maps:
-            for rival in untried[:DRAFTS]:
-                self._add_draft(rival.explained())
-            self._next_search = self._next_search if self._drafts else 0
+        for rival in untried[:DRAFTS] if not maps else ():
+            self._add_draft(rival.explained())
+        return maps
 
     def _ask(self) -> Stop | None:
         """Search for minimal maps with clingo and keep them.
@@ -232,11 +255,9 @@ class MapKeeper(Keeper):
         self.search, self._found = search, said
         if said.status in (Status.OPTIMAL, Status.UNSATISFIABLE) or not self._replays:
             if len(found) >= len(self.maps) or not self.is_proven:
-                self.maps = [ExtendedMap.of(m, trace, theory) for m in found]
-            self.is_proven = said.status is Status.OPTIMAL
-            self.is_impossible = said.status is Status.UNSATISFIABLE
-            self.is_complete, self._cost = said.complete, said.cost
-            self._least = self.maps[0].cost if self.maps else ()
+                self._keep([ExtendedMap.of(m, trace, theory) for m in found])
+            self._prove(said, self.maps)
+            self._cost = said.cost
             self._drafts = []
         elif found:
             self._add_draft(found[0])

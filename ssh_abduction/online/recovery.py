@@ -58,7 +58,6 @@ from ssh_abduction.solver import (
     Effort,
     Seconds,
     Solution,
-    Status,
     Stop,
     cost_as_counted,
     observation,
@@ -112,14 +111,14 @@ class Recovery(Keeper):
         """The best rival; None if there is none."""
         return self.maps[0] if self.maps else None
 
-    def _follow(self, action: Action, step: Step) -> None:
+    def _follow(self, action: Action, step: Step) -> list[ExtendedMap]:
         """Extend the rivals by the last step, and note if the best one expected something else."""
         theory, lead, confidence = self._problem.theory, self.lead, self._confidence
         if lead and confidence.known is None:
             confidence.known = lead.explained()
         if not self._replays:
             self._bound = Bound()
-            return
+            return []
         seen = observation(step, theory)
         t = len(self._problem.trace) - 1
         new = [way for m in self.maps for way in m.ways_on(action.name, step, seen, theory)]
@@ -128,10 +127,11 @@ class Recovery(Keeper):
             trace = self._problem.trace
             pairs = self._problem.changed(trace, theory.of_steps(0, t + 1)).pairs
             new = [rival for rival in new if rival.is_allowed(trace, pairs, self._judging)]
-        self.maps = self._ranked(new)
+        ranked = self._ranked(new)
         there = lead.contradiction(action.name, seen) if lead else None
-        if lead and there is not None and all(r.cost > lead.cost for r in self.maps):
+        if lead and there is not None and all(r.cost > lead.cost for r in ranked):
             confidence.broke.append((t, _sentence(theory, t, there, lead.shows[there], seen)))
+        return ranked
 
     def answer(self, began: float) -> Solution:
         """Also say how sure the maps are."""
@@ -152,12 +152,8 @@ class Recovery(Keeper):
         )
         if (found.bound.tenths or 0) >= (self._bound.tenths or 0):
             self._bound = found.bound
-        if found.status is Status.UNSATISFIABLE:
-            self.is_impossible, self.maps = True, []
-            return found.stopped
         rivals = [ExtendedMap.of(ssh_map, trace, theory) for ssh_map in found.maps]
-        if found.status is Status.OPTIMAL and rivals:
-            self.is_proven, self.is_complete, self._least = True, found.complete, rivals[0].cost
+        self._prove(found, rivals)
         # Keep the other rivals. But if all minimal maps are listed, no other rival can be as cheap.
         known = {(rival.labels, rival.faults) for rival in rivals}
         others = [
@@ -166,7 +162,7 @@ class Recovery(Keeper):
             if (rival.labels, rival.faults) not in known
             and not (self.is_complete and rival.cost <= self._least)
         ]
-        self.maps = self._ranked([*rivals, *others])
+        self._keep([] if self.is_impossible else self._ranked([*rivals, *others]))
         return found.stopped
 
     def _solution(self, began: float) -> Solution:
@@ -218,8 +214,8 @@ class Recovery(Keeper):
     def _ranked(self, rivals: list[ExtendedMap]) -> list[ExtendedMap]:
         """Sort rivals, the best first, and drop the improbable ones.
 
-        The cheapest rivals come first, and at most `max_maps` of them stay. Then come up to RIVALS
-        others that are probable enough, by probability.
+        The cheapest rivals come first. Then come up to RIVALS others that are probable enough, by
+        probability.
         """
         if not rivals:
             return []
@@ -231,11 +227,7 @@ class Recovery(Keeper):
             for i in order
             if rivals[i].cost == least or shares[i] >= LEAST_SHARE * max(shares)
         ]
-        most = self._options.max_maps
         ties = sum(rival.cost == least for rival in ranked)
-        if most and ties > most:
-            ranked = ranked[:most] + ranked[ties:]
-            self.is_complete, ties = False, most
         return ranked[: ties + RIVALS]
 
     def _shares(self, rivals: list[ExtendedMap]) -> list[float]:

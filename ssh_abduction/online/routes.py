@@ -238,7 +238,9 @@ def route(
     there, goal_named = graph.nodes(goal, "to")
     if not goal_named.startswith("dstate"):
         there = graph.nodes_in({graph.course(node)[0] for node in there})
-    closed = _closed(graph, avoid)
+    avoided = [avoid] if isinstance(avoid, str | int) else avoid
+    given = a_list("avoid", avoided, MapError, what="dstates and places")
+    closed = {node for i, name in enumerate(given) for node in graph.nodes(name, f"avoid[{i}]")[0]}
     for nodes, name in ((here, "from"), (there, "to")):
         if nodes <= closed:
             raise MapError(
@@ -278,15 +280,6 @@ def action_in_words(move: Move) -> str:
     if move.path is None:
         return "(turn)"
     return f"(turn to path {move.course})"
-
-
-def _closed(graph: MoveGraph, avoid: Iterable[int | str]) -> set[Node]:
-    """Find the nodes that a route must not visit."""
-    given = [avoid] if isinstance(avoid, str | int) else avoid
-    closed: set[Node] = set()
-    for i, name in enumerate(a_list("avoid", given, MapError, what="dstates and places")):
-        closed |= graph.nodes(name, f"avoid[{i}]")[0]
-    return closed
 
 
 def _raise_no_route(
@@ -383,7 +376,10 @@ class MoveGraph:
         # moves as there are dstates and courses.
         courses = 2 * sum(len(path.order) for path in ssh_map.paths) + len(ssh_map.places)
         self._travel_cost = OPEN_TURN * (len(ssh_map.dstates) + courses)
-        self._shut = _closed_gateways(ssh_map)
+        # The place, slot and bearing of each gateway that was last seen closed.
+        changes = (fault for fault in ssh_map.faults if fault.kind == "changed")
+        last = {(fault.place, fault.gateway, fault.bearing): fault for fault in changes}
+        self._shut = [at for at, fault in last.items() if str(fault.seen).startswith("closed")]
         self._graph: nx.DiGraph[Any] = nx.DiGraph()
         self._graph.add_nodes_from(s.id for s in ssh_map.dstates)
         # Sort in reverse, so that the first action by name remains if several join two dstates.
@@ -589,13 +585,6 @@ class MoveGraph:
     def _place(self, node: Node) -> int:
         """Return the place of a node, or the `DState.site` of a dstate without a place."""
         return self.map.dstates[node].site if isinstance(node, int) else node[0]
-
-
-def _closed_gateways(ssh_map: SSHMap) -> list[tuple[int | None, int | None, int | None]]:
-    """List the place, slot and bearing of each gateway that was last seen closed."""
-    changes = (fault for fault in ssh_map.faults if fault.kind == "changed")
-    last = {(fault.place, fault.gateway, fault.bearing): fault for fault in changes}
-    return [at for at, fault in last.items() if str(fault.seen).startswith("closed")]
 
 
 @dataclass(frozen=True, slots=True)
