@@ -109,10 +109,6 @@ class Poses:
         places = [s.place if s.place is not None else -1 - s.id for s in ssh_map.dstates]
         return Poses(trace, ssh_map.dstate_at, places)
 
-    def misfit(self) -> float:
-        """Compute the least chi-square of the displacements."""
-        return self.placed()[0]
-
     def placed(self) -> tuple[float, Array]:
         """Compute the least chi-square, and the best position of each heading, in metres, (n, 2).
 
