@@ -200,6 +200,7 @@ def poses_of_scans(
     recent: deque[Surfaces] = deque(maxlen=RECENT)
     last: Followed | None = None
     before: Pose = (0.0, 0.0, 0.0)
+    mounts: set[Pose] = set()  # of the lasers whose scans came since the last break
     for i, scan in enumerate(scans):
         seen = surfaces_in(scan)
         if last is None:
@@ -207,11 +208,18 @@ def poses_of_scans(
         else:
             onward = displacement_between(last.scan.odometry, scan.odometry)
             step = ScanMotion(scan, seen, recent, last.pose, onward, before)
-            one = step.judged(doubt_of(i, onward))
+            doubt = doubt_of(i, onward)
+            if doubt is Doubt.NONE and scan.laser.mount not in mounts:
+                # The first scan of another laser may show none of the known walls.
+                one = Followed(scan, moved(last.pose, onward), odometer_covariance(onward))
+            else:
+                one = step.judged(doubt)
             one = one if in_sight(scan).any() else replace(one, share=math.nan)
             before = displacement_between(last.pose, one.pose)
         if one.broken:
             recent.clear()
+            mounts.clear()
+        mounts.add(scan.laser.mount)
         # Walls are remembered while the laser sees none.
         if len(seen) or not recent:
             recent.append(seen.moved(one.pose))
