@@ -23,7 +23,7 @@ import math
 from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -31,7 +31,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
-from perception.readers.bag_files import NANO, TRANSFORMS, Bag
+from perception.readers.bag_files import Bag
+from perception.readers.bag_frames import (
+    Frames,
+    RecordedTrack,
+    ancestors,
+    flat_pose,
+    frame_name,
+    mount_of,
+    parent_of,
+    same_frame,
+    stamp_of,
+    transforms_of,
+)
+from perception.readers.bag_geometry import Mount, angles_of, believed, ranges_of
+from perception.readers.echoes import LaserOptions
 from perception.readers.scans import (
     Array,
     Damage,
@@ -42,7 +56,8 @@ from perception.readers.scans import (
     laser_of,
 )
 from ssh_abduction.data.errors import brief
-from ssh_abduction.data.odometry import Pose, displacement_between, moved
+from ssh_abduction.data.odometry import Pose, moved
+from ssh_abduction.data.words import counted
 
 # Seconds beyond the ends of the odometry at which a scan still gets a pose.
 BESIDE = 1.0
@@ -58,22 +73,6 @@ ALTERNATING = 0.1
 ASTRAY = 0.1
 # Largest number of sources to distinguish.
 SOURCES = 4
-
-
-@dataclass
-class RecordedTrack:
-    """Poses over time, in the order of their messages."""
-
-    # Flat list of five numbers for each pose: stamp in the header (0 if it has none) and time of
-    # recording in seconds; x and y in metres; heading in radians.
-    numbers: array[float] = field(default_factory=lambda: array("d"))
-
-    def add(self, stamp: float, recorded: float, pose: Pose) -> None:
-        self.numbers.extend((stamp, recorded, *pose))
-
-    def table(self) -> Array:
-        """Return the numbers as a table, (n, 5): stamp, time of recording, x, y, heading."""
-        return np.frombuffer(self.numbers, dtype=np.float64).reshape(-1, 5)
 
 
 @dataclass(frozen=True)
@@ -244,11 +243,19 @@ def sources_of(poses: Array) -> list[NDArray[np.intp]]:
 
 SCANS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan")
 ODOMETRY = ("nav_msgs/msg/Odometry",)
-# Largest difference of the messages of a fixed transform, from rounding: metres and radians.
-FIXED = (0.01, 0.01)
+# Each EACH-th scan of a frame is kept to judge the tilt of its laser, at most SAMPLES.
+EACH, SAMPLES = 10, 100
+# Scans that repeat earlier ones are left out if they are this many, and this share of all. Scans
+# without times in front of a still robot come more often than LOOPS times.
+LEAST_REPEATED, REPEATED, LOOPS = 20, 0.2, 5
+# The odometry has a gap if the robot moved by more than UNSEEN metres or radians in a pause of more
+# than GAP seconds, and LONGER times the usual interval.
+GAP, LONGER, UNSEEN = 1.0, 10.0, 0.1
 
 
-def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> SurveyedLog:
+def read(
+    bag: Bag, scan_topics: Sequence[str], odom_topic: str | None, told: LaserOptions
+) -> SurveyedLog:
     """Survey a bag, so that its scans can be read when they are iterated over.
 
     Without topics of scans, the only topic with scans is read. Without one of odometry, the
@@ -258,7 +265,8 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
     notes = list(bag.notes)
     scans = _scan_topics(bag, scan_topics)
     odometers = _chosen(bag, ODOMETRY, odom_topic, "odom")
-    times, seen = _survey(bag, scans)
+    survey = _survey(bag, scans, told, notes)
+    times, seen = survey.times, survey.frames
     damaged: list[Damage] = []
     frames = transforms_of(bag, set(seen), damaged)
     frame = seen.most_common(1)[0][0]
@@ -268,13 +276,23 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
         odometer, odom, base = _odometer(bag, odometers, damaged, notes)
         called = odometers
     else:
-        odometer, odom, base = _odometer_of_transforms(bag, frames, frame)
+        odometer, odom, base = _odometer_of_transforms(bag, frames, frame, notes)
         called = f"the transforms from {odom} to {base}"
-    odometer = _of_one_source(odometer, called, notes)
+    odometer = _of_one_source(odometer.upright(called, notes), called, notes)
 
     # 2. Where each frame of scans is on the robot.
-    assumed: dict[str, str] = {}
-    mounts = {frame: mount_of(frames, odom, base, frame, notes, assumed) for frame in seen}
+    assumed = {"fov": text} if (text := survey.doubt) else {}
+    mounts = {
+        frame: believed(
+            mount_of(frames, odom, base, frame, notes, assumed),
+            survey.some[frame],
+            frame,
+            bag.source,
+            told.mount is not None,
+            notes,
+        )
+        for frame in seen
+    }
 
     # 3. Corrected poses: from the transforms above the frame of the odometry.
     tracks = (parent_of(frames, child).track for child in ancestors(frames, odom))
@@ -295,9 +313,30 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Survey
     if above:
         sources.append(f"Corrected poses come from the transforms above {odom}.")
     corrections = [TimedPoses.of(track, by_stamp) for track in above]
-    where = _ScanPoses(TimedPoses.of(odometer, by_stamp), corrections, mounts, by_stamp)
-    items = _scans(bag, set(scans), where, damaged)
+    poses = TimedPoses.of(odometer, by_stamp)
+    notes += _gaps(poses)
+    where = _ScanPoses(poses, corrections, mounts, by_stamp, told.fov)
+    items = _scans(bag, set(scans), where, damaged, survey.repeated)
     return SurveyedLog(bag.format, tuple(notes), items, assumed, tuple(sources))
+
+
+def _gaps(poses: TimedPoses) -> list[str]:
+    """Make a note if no odometry came for a while in which the robot moved; otherwise none."""
+    pauses = np.diff(poses.times)
+    if not len(pauses):
+        return []
+    moves = np.abs(np.diff(poses.poses, axis=0)).max(axis=1)
+    found = np.flatnonzero(
+        (pauses > max(GAP, LONGER * float(np.median(pauses)))) & (moves > UNSEEN)
+    )
+    if not len(found):
+        return []
+    longest = int(found[pauses[found].argmax()])
+    return [
+        f"The odometry has {counted(len(found), 'gaps')}: for {pauses[longest]:.1f} s from "
+        f"{poses.times[longest]:.1f} s on at most. Poses in between are interpolated, so they may "
+        "be wrong. Record the odometry without a break, or cut the log there."
+    ]
 
 
 def _scan_topics(bag: Bag, named: Sequence[str]) -> list[str]:
@@ -337,23 +376,64 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
     return next(iter(counts), None)
 
 
-def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, Array], Counter[str]]:
-    """For each topic, list the times of its scans, (n, 2), and count the scans of each frame.
+@dataclass
+class _Survey:
+    """What the first pass over the scans of a bag finds."""
 
-    The times are in seconds: from the header, and of the recording. Raises LogError.
-    """
+    # For each topic (n, 2): the times in the headers and of the recording, in seconds.
+    times: dict[str, Array]
+    frames: Counter[str]  # number of scans of each frame
+    some: dict[str, list[Any]]  # a few messages of each frame
+    # Topics and numbers of messages that repeat an earlier one.
+    repeated: set[tuple[str, int]]
+    doubt: str | None  # a note on the angles of most scans
+
+
+def _survey(bag: Bag, topics: Sequence[str], told: LaserOptions, notes: list[str]) -> _Survey:
+    """Read the scans of some topics, and note those that are repeated. Raises LogError."""
     times: dict[str, list[tuple[float, float]]] = {}
-    frames: Counter[str] = Counter()
-    for connection, _, recorded, message in bag.messages(set(topics)):
-        if not isinstance(message, Damage):
-            times.setdefault(connection.topic, []).append((stamp_of(message.header), recorded))
-            frames[frame_name(message.header.frame_id)] += 1
-    if not frames:
+    found = _Survey({}, Counter(), {}, set(), None)
+    doubts: Counter[str] = Counter()
+    known: Counter[int] = Counter()
+    for connection, number, recorded, message in bag.messages(set(topics)):
+        if isinstance(message, Damage):
+            continue
+        frame, stamp = frame_name(message.header.frame_id), stamp_of(message.header)
+        content = hash((frame, stamp, ranges_of(message).tobytes()))
+        if content in known:
+            found.repeated.add((connection.topic, number))
+        known[content] += 1
+        times.setdefault(connection.topic, []).append((stamp, recorded))
+        found.frames[frame] += 1
+        try:
+            doubts[angles_of(message, told.fov)[2] or ""] += 1
+        except Damaged as damage:
+            doubts[f"!{damage}"] += 1
+            continue
+        some = found.some.setdefault(frame, [])
+        if found.frames[frame] % EACH == 1 and len(some) < SAMPLES:
+            some.append(message)
+    if not found.frames:
         raise LogError(
             f"{bag.source}: expected scans in {' and '.join(topics)}, got none that can be read"
             "; record them again, or name another topic (--set scan_topic)"
         )
-    return {topic: np.array(both) for topic, both in times.items()}, frames
+    [(doubt, count)] = doubts.most_common(1)
+    if 2 * count > doubts.total():
+        if doubt.startswith("!"):
+            raise LogError(f"{bag.source}: {doubt[1:]}")
+        found.doubt = doubt or None
+    count, scans = len(found.repeated), found.frames.total()
+    if count < max(LEAST_REPEATED, REPEATED * scans) or known.most_common(1)[0][1] > LOOPS:
+        found.repeated.clear()
+    else:
+        notes.append(
+            f"{count} of {scans} scans repeat an earlier one, with its time "
+            "and ranges: they are left out. The bag was recorded twice, or while another was "
+            "played in a loop."
+        )
+    found.times = {topic: np.array(both) for topic, both in times.items()}
+    return found
 
 
 def _odometer(
@@ -377,7 +457,8 @@ def _odometer(
             continue
         frame, child = map(frame_name, (message.header.frame_id, message.child_frame_id))
         source = frame, child, getattr(connection.ext, "callerid", "") or ""
-        tracks.setdefault(source, RecordedTrack()).add(stamp_of(message.header), recorded, flat)
+        track = tracks.setdefault(source, RecordedTrack())
+        track.add(stamp_of(message.header), recorded, flat, pose.orientation)
     if not tracks:
         raise LogError(
             f"{bag.source}: expected odometry in {topic}, got none that can be read"
@@ -395,16 +476,27 @@ def _odometer(
             f"Several sources publish {topic}: {listed}. Those {named[best]} are read; record "
             "each source to a topic of its own."
         )
-    return tracks[best], best[0], best[1]
+    return tracks[best].righted(best[0], best[1], notes)
 
 
-def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[RecordedTrack, str, str]:
+def _odometer_of_transforms(
+    bag: Bag, frames: Frames, frame: str, notes: list[str]
+) -> tuple[RecordedTrack, str, str]:
     """Read what `_odometer` returns, but from transforms from `odom` to the robot."""
-    chain = [(child, parent_of(frames, child)) for child in ancestors(frames, frame)]
+    names = ancestors(frames, same_frame(frames, frame))
+    chain = [(child, parent_of(frames, child)) for child in names]
     moving = [(child, one) for child, one in chain if one.track is not None]
     found = next(
         ((child, one) for child, one in moving if "odom" in one.parent.rpartition("/")[2]), None
     ) or next(iter(moving), None)
+    # The frame odom may be the child of the robot's.
+    for child in (
+        [name for name in frames if "odom" in name.rpartition("/")[2]] if not found else ()
+    ):
+        if (track := parent_of(frames, child).track) is not None:
+            parent = parent_of(frames, child).parent
+            del frames[child]
+            return track.righted(parent, child, notes)
     if found is None:
         raise LogError(
             f"{bag.source}: expected odometry (messages Odometry, or transforms from odom to "
@@ -442,11 +534,10 @@ class _ScanPoses:
     # The transform from the parent of the odometry's frame to this frame, then that from the
     # grandparent to the parent, and so on; empty if the robot was not localised.
     corrections: list[TimedPoses]
-    # For each frame of scans, the pose of the laser in the frame of the robot, and whether it hangs
-    # upside down.
-    mounts: dict[str, tuple[Pose, bool]]
+    mounts: dict[str, Mount]  # for each frame of scans, where the laser is
     # Whether times come from the headers of messages; otherwise, they are times of recording.
     by_stamp: bool
+    fov: float | None  # the field of view in degrees, if the user says it
 
     def scan(self, message: Any, recorded: float, number: int) -> Scan:
         """Make the scan of a message. Raises Damaged."""
@@ -460,16 +551,23 @@ class _ScanPoses:
         pose = corrected = self.odometry.at(time)
         for correction in self.corrections:
             corrected = moved(correction.at(time), corrected)
-        ranges, laser = _measured(message, *self.mounts[frame_name(message.header.frame_id)])
+        mount = self.mounts[frame_name(message.header.frame_id)]
+        ranges, laser = _measured(message, mount, self.fov)
         return Scan(ranges, laser, pose, corrected if self.corrections else None, time, number)
 
 
 def _scans(
-    bag: Bag, topics: set[str], where: _ScanPoses, damaged: list[Damage]
+    bag: Bag,
+    topics: set[str],
+    where: _ScanPoses,
+    damaged: list[Damage],
+    repeated: set[tuple[str, int]],
 ) -> Iterator[Scan | Damage]:
     """Yield the scans of a bag, and `Damage` for what cannot be read."""
     yield from damaged
     for connection, number, recorded, message in bag.messages(topics):
+        if (connection.topic, number) in repeated:
+            continue
         try:
             is_damaged = isinstance(message, Damage)
             yield message if is_damaged else where.scan(message, recorded, number)
@@ -477,191 +575,16 @@ def _scans(
             yield Damage(number, f"{connection.topic}: {damage}")
 
 
-def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[Array, LaserScanner]:
+def _measured(message: Any, mount: Mount, fov: float | None) -> tuple[Array, LaserScanner]:
     """Read ranges and laser of a message. The beams of a flipped laser turn clockwise."""
-    first, step, nearest, reach = (
-        float(v)
-        for v in (message.angle_min, message.angle_increment, message.range_min, message.range_max)
-    )
-    if message.__msgtype__ == SCANS[0]:
-        ranges = np.array(message.ranges, dtype=np.float64)
-    else:  # A beam without an echo met nothing.
-        echoes = [beam.echoes[0] if len(beam.echoes) else np.inf for beam in message.ranges]
-        ranges = np.array(echoes, dtype=np.float64)
+    nearest, reach = float(message.range_min), float(message.range_max)
+    ranges = ranges_of(message)
     if not len(ranges):
         raise Damaged("expected at least one range, got none")
-    if not math.isfinite(first) or not 0 < abs(step) <= math.tau:
-        raise Damaged(f"expected a first angle and a step in radians, got {first:g} and {step:g}")
-    if is_flipped:
-        first, step = -first, -step
+    first, step, _ = angles_of(message, fov)
     reach, nearest = reach if reach > 0 else math.inf, nearest if 0 < nearest < math.inf else 0.0
-    return ranges, laser_of(first, step, len(ranges), reach, mount, nearest)
-
-
-@dataclass
-class FrameTransform:
-    """The transform from a parent frame to a frame: the pose of the frame in its parent."""
-
-    parent: str  # name of the parent frame
-    translation: Array  # (3,) translation in the last message, in metres
-    rotation: Array  # (3, 3) rotation in the last message
-    first: Pose  # pose in the plane in the first message
-    track: RecordedTrack | None  # poses in the plane over time; None for a static transform
-    count: int = 0  # number of messages
-    # Largest difference of a pose from `first`, in metres and radians.
-    off: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def is_fixed(self) -> bool:
-        return self.off[0] <= FIXED[0] and self.off[1] <= FIXED[1]
-
-
-# The transforms to each frame, by parent. A frame should have one parent, but some have several.
-Frames = dict[str, dict[str, FrameTransform]]
-
-
-def transforms_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
-    """Read the transforms to each frame of a bag, by the name of the parent frame.
-
-    Transforms over time are kept only for the frames of scans (`seen`) and their ancestors. Those
-    of the many joints of a robot are not needed. `damaged` receives messages that cannot be read.
-    """
-    frames: Frames = {}
-    topics = set(bag.topics(*TRANSFORMS))
-    fixed = {topic for topic in topics if topic.endswith("tf_static")}
-    # Static transforms come first, so that the ancestors of the scans' frames are known.
-    for group, is_static in ((fixed, True), (topics - fixed, False)):
-        for connection, number, recorded, message in bag.messages(group):
-            if isinstance(message, Damage):
-                damaged.append(message)
-                continue
-            for stamped in message.transforms:
-                child, parent = map(frame_name, (stamped.child_frame_id, stamped.header.frame_id))
-                transform = stamped.transform
-                try:
-                    edge = _record(frames, child, parent, transform, is_static)
-                except Damaged as damage:
-                    damaged.append(Damage(number, f"{connection.topic}: {child}: {damage}"))
-                    continue
-                if edge.track is not None and (
-                    edge.count == 1 or any(child in ancestors(frames, frame) for frame in seen)
-                ):
-                    flat = flat_pose(transform.translation, transform.rotation)
-                    edge.track.add(stamp_of(stamped.header), recorded, flat)
-    return frames
-
-
-def _record(
-    frames: Frames, child: str, parent: str, transform: Any, is_static: bool
-) -> FrameTransform:
-    """Record a message with the transform from a parent frame to a child frame."""
-    from scipy.spatial.transform import Rotation
-
-    move, turn = transform.translation, transform.rotation
-    flat = flat_pose(move, turn)
-    parents = frames.setdefault(child, {})
-    edge = parents.get(parent)
-    if edge is None or (edge.track is None) != is_static:
-        edge = FrameTransform(
-            parent, np.zeros(3), np.eye(3), flat, None if is_static else RecordedTrack()
-        )
-    parents.pop(parent, None)
-    parents[parent] = edge  # The parent in the last message comes last.
-    edge.translation = np.array([move.x, move.y, move.z])
-    if edge.track is None or edge.count == 0 or edge.off != (0.0, 0.0) or flat != edge.first:
-        edge.rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
-    edge.count += 1
-    x, y, angle = displacement_between(edge.first, flat)
-    edge.off = max(edge.off[0], math.hypot(x, y)), max(edge.off[1], abs(angle))
-    return edge
-
-
-def parent_of(frames: Frames, child: str) -> FrameTransform:
-    """Return the pose of a frame in its parent, as a `FrameTransform` that also names the parent.
-
-    If a frame has several parents, one with "odom" in its name is taken, otherwise the last one.
-    """
-    parents = list(frames[child].values())
-    return next((one for one in parents if "odom" in one.parent.rpartition("/")[2]), parents[-1])
-
-
-def ancestors(frames: Frames, frame: str) -> list[str]:
-    """List a frame, its parent, the parent of that, and so on, as far as transforms are known."""
-    chain: list[str] = []
-    while frame in frames and frame not in chain:
-        chain.append(frame)
-        frame = parent_of(frames, frame).parent
-    return chain
-
-
-def mount_of(
-    frames: Frames, odom: str, base: str, frame: str, notes: list[str], assumed: dict[str, str]
-) -> tuple[Pose, bool]:
-    """Return the pose of the laser in the frame of the robot, and whether it hangs upside down.
-
-    `notes` receives notes on transforms that contradict each other. `assumed` receives, by the
-    key "mount", a note if no transform leads to the laser. Then the laser is taken to be in the
-    middle of the robot.
-    """
-    if base == frame:
-        return (0.0, 0.0, 0.0), False
-    chain = ancestors(frames, frame)
-    parents = [parent_of(frames, child).parent for child in chain]
-    # If no transform leads to the robot's frame, the child of the odometry's frame is the robot.
-    top = parents.index(odom) - 1 if odom in parents else None
-    top = parents.index(base) if base in parents else top
-    if top is None:
-        assumed["mount"] = (f"{assumed['mount']} " if "mount" in assumed else "") + (
-            f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser "
-            f"({frame}): the laser is taken to sit in the robot's middle and to look ahead. "
-            "If it does not, say where it sits: --set mount=X,Y,DEGREES."
-        )
-        return (0.0, 0.0, 0.0), False
-    translation, rotation = np.zeros(3), np.eye(3)
-    for child in reversed(chain[: top + 1]):
-        edge = parent_of(frames, child)
-        translation = translation + rotation @ edge.translation
-        rotation = rotation @ edge.rotation
-        if not edge.is_fixed:
-            off, angle = edge.off[0], math.degrees(edge.off[1])
-            notes.append(
-                f"The {edge.count} transforms from {edge.parent} to {child}, by which the "
-                f"laser is mounted, contradict each other by up to {off:.2f} m and "
-                f"{angle:.0f} degrees: the last one is used."
-            )
-        if len(frames[child]) > 1:
-            others = ", ".join(
-                f"{one.parent} ({one.count} transforms)" for one in frames[child].values()
-            )
-            notes.append(
-                f"The frame {child} has several parents, {others}: that from {edge.parent} is "
-                "used for the laser's mount."
-            )
-    heading = math.atan2(rotation[1, 0], rotation[0, 0])
-    x, y, angle = (round(float(v), 6) for v in (translation[0], translation[1], heading))
-    return (x, y, angle), bool(rotation[2, 2] < 0)
-
-
-def flat_pose(position: Any, orientation: Any) -> Pose:
-    """Project a position and a quaternion to a pose in the plane.
-
-    Raises Damaged if a number is not finite, or the quaternion is nearly 0.
-    """
-    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
-    numbers = position.x, position.y, position.z, x, y, z, w
-    if not all(map(math.isfinite, numbers)) or x * x + y * y + z * z + w * w < 0.5:
-        raise Damaged(
-            "expected a position in metres and a quaternion, got "
-            f"{', '.join(f'{v:g}' for v in numbers)}"
-        )
-    return position.x, position.y, math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-
-
-def stamp_of(header: Any) -> float:
-    """Return the time in a header in seconds; 0 means that the header has none."""
-    return float(header.stamp.sec + header.stamp.nanosec * NANO)
-
-
-def frame_name(frame: str) -> str:
-    """Return the name of a frame without the slash at the beginning that ROS 1 allows."""
-    return frame.lstrip("/")
+    if mount.rotation:
+        ranges = mount.levelled(ranges, first, step, reach)
+    if mount.is_flipped:
+        first, step = -first, -step
+    return ranges, laser_of(first, step, len(ranges), reach, mount.pose, nearest)

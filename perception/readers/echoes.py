@@ -20,12 +20,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from perception.errors import LogError
 from perception.readers.scans import Array, Scan, ScanTable, shared
 from ssh_abduction.data.checks import a_number, numbers, one_of
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Pose, displacement_between
+from ssh_abduction.data.words import counted, first_few
 
 _Key = tuple[float, float, Pose]
 Bools = NDArray[np.bool_]
@@ -49,6 +51,9 @@ NOISES = (1e-5, 0.001, 0.004, 0.016)
 # of the ranges that are at least as long, and SPIKE times the ranges in an equally wide band just
 # below.
 NEARLY_ALL, SPIKE = 0.9, 10
+# A beam that returns one range up to ROBOT metres, within SAME_RANGE, in NEARLY_ALL scans sees the
+# robot itself, if it was surveyed at LEAST_POSES poses or more.
+ROBOT, SAME_RANGE, LEAST_POSES = 0.6, 0.03, 30
 # A kind of beam without a measurement is worth a note if it has at least this share of all beams.
 WORTH_A_NOTE = 0.01
 # If beams met nothing, the beams beside them are long: longer than this share of all beams. If
@@ -69,6 +74,10 @@ class LaserOptions:
         no_return: A range of at least this many metres means that nothing came back.
         zero_is: Meaning of a range of 0, below 0, below the laser's least range, or NaN: "free"
             (nothing came back) or "unknown" (nothing is known).
+        nearest: A range of at most this many metres is of the robot itself, so nothing is known.
+            None finds such beams: they return one short range in nearly all scans.
+        blind: Two bearings in degrees to the left of where the laser looks. Nothing is known of the
+            beams from the first one counterclockwise to the second one.
 
     Raises:
         LogError: A value is out of range.
@@ -78,6 +87,8 @@ class LaserOptions:
     mount: Pose | None = None
     no_return: float | None = None
     zero_is: str | None = None
+    nearest: float | None = None
+    blind: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.fov is not None and not (is_finite(self.fov) and 0 < abs(self.fov) <= 360):
@@ -95,9 +106,16 @@ class LaserOptions:
             a_number("no_return", self.no_return, LogError, above=0, what="metres", mend=mend)
         if self.zero_is is not None:
             one_of("zero_is", self.zero_is, MEANINGS, LogError, mend="name one of these")
+        if self.nearest is not None:
+            mend = "name the range below which the laser sees its robot"
+            a_number("nearest", self.nearest, LogError, 0, what="metres", mend=mend)
+        if self.blind is not None:
+            mend = "name the two bearings, as -10:10"
+            for number in numbers("blind", self.blind, LogError, 2, "degrees", mend):
+                a_number("blind", number, LogError, -360, 360, what="degrees", mend=mend)
 
     def placed(self, scan: Scan) -> Scan:
-        """Copy a scan, with the field of view and mount of the laser that the user gives."""
+        """Copy a scan, with the laser's field of view, mount and blind beams by the user."""
         laser = scan.laser
         if self.fov is not None:
             middle, fov = laser.first + laser.step * laser.steps / 2, math.radians(self.fov)
@@ -105,7 +123,14 @@ class LaserOptions:
         if self.mount is not None:
             x, y, degrees = map(float, self.mount)
             laser = replace(laser, mount=(x, y, math.radians(degrees)))
-        return scan if laser is scan.laser else replace(scan, laser=shared(laser))
+        if laser is not scan.laser:
+            scan = replace(scan, laser=shared(laser))
+        limits = np.full(len(scan.ranges), self.nearest or 0.0)
+        if self.blind is not None:
+            begin, end = self.blind
+            over = (np.degrees(scan.laser.bearings) - begin) % 360
+            limits[over <= (360 if end - begin >= 360 else (end - begin) % 360)] = np.inf
+        return _without_robot(scan, limits) if limits.any() else scan
 
     def reach(self, reach: float) -> float:
         """Return the reach of a laser in metres: from the user, or else from the log."""
@@ -123,6 +148,8 @@ class Meaning:
     """Which ranges of a laser mean that nothing came back."""
 
     reach: float  # a range of at least this many metres means that nothing came back
+    # Metres for each beam, up to which it shows the robot itself; none if the log has no such beam.
+    robot: Array
     # Kinds of beams without a measurement that also mean this, a subset of KINDS.
     free: frozenset[str]
 
@@ -164,12 +191,17 @@ def interpreter_of(
         kept = moving(members)
         some = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_SURVEYED)).astype(int))
         surveyed = [replace(kept[i], ranges=kept[i].ranges.copy()) for i in some]
-        meanings[key], said = _survey(surveyed, options)
+        robot, seen = (
+            (np.zeros(0), list[str]()) if options.nearest is not None else (_robot_in(surveyed))
+        )
+        surveyed = [_without_robot(scan, robot) for scan in surveyed]
+        notes += seen
+        meanings[key], said = _survey(surveyed, options, robot)
         notes += said
 
     def interpret(scan: Scan) -> Scan:
         placed = options.placed(scan)
-        usual = Meaning(options.reach(placed.laser.reach), options.free)
+        usual = Meaning(options.reach(placed.laser.reach), np.zeros(0), options.free)
         return _measured(placed, meanings.get(_key(placed), usual))
 
     return interpret, tuple(dict.fromkeys(notes))
@@ -183,7 +215,7 @@ def _key(scan: Scan) -> _Key:
 def interpret_scan(scan: Scan, options: LaserOptions) -> Scan:
     """Interpret the ranges of a single scan without its log, as `interpret_log` does."""
     placed = options.placed(scan)
-    return _measured(placed, Meaning(options.reach(placed.laser.reach), options.free))
+    return _measured(placed, Meaning(options.reach(placed.laser.reach), np.zeros(0), options.free))
 
 
 def moving(scans: Iterable[Scan]) -> list[Scan]:
@@ -200,6 +232,7 @@ def moving(scans: Iterable[Scan]) -> list[Scan]:
 
 def _measured(scan: Scan, meaning: Meaning) -> Scan:
     """Copy a scan, with infinite ranges if nothing came back and NaN if nothing is known."""
+    scan = _without_robot(scan, meaning.robot)
     ranges, kinds = scan.ranges.copy(), _kinds(scan)
     with np.errstate(invalid="ignore"):
         ranges[scan.ranges >= meaning.reach] = np.inf
@@ -221,7 +254,54 @@ def _kinds(scan: Scan) -> dict[str, Bools]:
     return dict(zip(KINDS, found, strict=True))
 
 
-def _survey(scans: Sequence[Scan], options: LaserOptions) -> tuple[Meaning, list[str]]:
+def _without_robot(scan: Scan, limits: Array) -> Scan:
+    """Copy a scan, with minus infinity (unknown) for ranges up to the limit of their beam.
+
+    Infinite limits hide a beam altogether. Limits of another number of beams are ignored.
+    """
+    if len(limits) != len(scan.ranges):
+        return scan
+    with np.errstate(invalid="ignore"):
+        hidden = ((scan.ranges > 0) & (scan.ranges <= limits)) | np.isinf(limits)
+    return replace(scan, ranges=np.where(hidden, -np.inf, scan.ranges))
+
+
+def _robot_in(scans: Sequence[Scan]) -> tuple[Array, list[str]]:
+    """Find the beams that the robot itself blocks: one short range at one bearing in most scans.
+
+    Return the limit of each beam in metres, 0 for the others, and a note. If there are none, or
+    too few scans show them, both are empty.
+    """
+    laser = scans[0].laser
+    alike = [scan.ranges for scan in scans if len(scan.ranges) == laser.beams]
+    if len(alike) < LEAST_POSES:
+        return np.zeros(0), []
+    ranges = np.stack(alike)
+    ranges[~(ranges > max(laser.nearest, 0.0))] = np.inf
+    usual = np.median(ranges, axis=0)
+    with np.errstate(invalid="ignore"):
+        share = (np.abs(ranges - usual) <= SAME_RANGE).mean(axis=0)
+    blocked = (usual <= ROBOT) & (share >= NEARLY_ALL)
+    if not blocked.any():
+        return np.zeros(0), []
+    # Beams beside meet the edge of the same part in some scans.
+    limits = np.where(blocked, usual + SAME_RANGE, 0.0)
+    limits = np.maximum(limits, ndimage.maximum_filter1d(limits, 3, mode="nearest"))
+    bearings = np.degrees(laser.bearings[blocked])
+    parts = np.split(bearings, np.flatnonzero(np.diff(np.flatnonzero(blocked)) > 1) + 1)
+    listed = first_few([f"{part.min():.0f} to {part.max():.0f}" for part in parts], 5)
+    return limits, [
+        f"{counted(int(blocked.sum()), 'beams')} return one short range, "
+        f"{usual[blocked].min():.2g} to {usual[blocked].max():.2g} m, in nearly all scans: at "
+        f"{listed} degrees to the left of where the laser looks. They are taken to see the robot "
+        "itself, and count as unknown. If they see walls, say --set nearest=0. If the robot hides "
+        "more, say --set nearest=METRES or --set blind=FROM:TO in degrees."
+    ]
+
+
+def _survey(
+    scans: Sequence[Scan], options: LaserOptions, robot: Array
+) -> tuple[Meaning, list[str]]:
     """Find out what the ranges of one laser mean."""
     laser, notes = scans[0].laser, list[str]()
     reach = options.reach(laser.reach)
@@ -250,9 +330,9 @@ def _survey(scans: Sequence[Scan], options: LaserOptions) -> tuple[Meaning, list
                 f"{most:.4g} m. If it reaches farther, or less far, say so: --set no_return=METRES."
             )
     if options.zero_is is not None:
-        return Meaning(reach, options.free), notes
+        return Meaning(reach, robot, options.free), notes
     free, said = _without_measurement(scans, reach)
-    return Meaning(reach, free), notes + said
+    return Meaning(reach, robot, free), notes + said
 
 
 def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:

@@ -49,6 +49,8 @@ def read_log(
     mount: Pose | None = None,
     no_return: float | None = None,
     zero_is: str | None = None,
+    nearest: float | None = None,
+    blind: tuple[float, float] | None = None,
 ) -> RobotLog:
     """Read a robot's log.
 
@@ -60,11 +62,13 @@ def read_log(
             several.
         odom_topic: Topic of the odometry in a bag; needed if there are several.
         fov: Degrees from the first beam to the last, counterclockwise, if the log does not say it
-            or is wrong. `perception.readers.echoes.LaserOptions` explains these four arguments.
+            or is wrong. `perception.readers.echoes.LaserOptions` explains these six arguments.
         mount: Position of the laser on the robot: metres ahead, metres to the left, degrees to the
             left.
         no_return: A range of at least this many metres means that nothing came back.
         zero_is: Meaning of ranges that are no measurement: "free" or "unknown".
+        nearest: A range of at most this many metres is of the robot itself.
+        blind: Two bearings in degrees between which the robot blocks the laser.
 
     Returns:
         The log. Its `notes` say what the reader assumed or found out. Its `damaged` are the parts
@@ -73,8 +77,8 @@ def read_log(
     Raises:
         LogError: The file cannot be read, has no known format, or holds no scan or no odometry.
     """
-    options = LaserOptions(fov, mount, no_return, zero_is)
-    with _reading(path, format, scan_topic, odom_topic) as reading:
+    options = LaserOptions(fov, mount, no_return, zero_is, nearest, blind)
+    with _reading(path, format, scan_topic, odom_topic, options) as reading:
         scans, damaged = ScanTable(), list[Damage]()
         for item in reading.items:
             if isinstance(item, Scan):
@@ -105,6 +109,8 @@ def stream_log(
     mount: Pose | None = None,
     no_return: float | None = None,
     zero_is: str | None = None,
+    nearest: float | None = None,
+    blind: tuple[float, float] | None = None,
 ) -> Iterator[Scan | Damage]:
     """Read the scans of a robot's log one at a time, in the order of the file.
 
@@ -115,8 +121,8 @@ def stream_log(
     Yields:
         Scans, and `Damage` for the parts that were skipped.
     """
-    options = LaserOptions(fov, mount, no_return, zero_is)
-    with _reading(path, format, scan_topic, odom_topic) as reading:
+    options = LaserOptions(fov, mount, no_return, zero_is, nearest, blind)
+    with _reading(path, format, scan_topic, odom_topic, options) as reading:
         for item in reading.items:
             yield interpret_scan(item, options) if isinstance(item, Scan) else item
 
@@ -129,16 +135,18 @@ def live_log(
     mount: Pose | None = None,
     no_return: float | None = None,
     zero_is: str | None = None,
+    nearest: float | None = None,
+    blind: tuple[float, float] | None = None,
     tell: Callable[[str], None] = lambda note: None,
 ) -> Iterator[Scan | Damage]:
     """Read the scans of a log of CARMEN from a pipe, packed or not, while they are written.
 
     The first SURVEYED scans wait until they show what the poses and ranges of the log mean. The
-    arguments from `fov` to `zero_is` are those of `read_log`. `tell` takes each note on what
+    arguments from `fov` to `blind` are those of `read_log`. `tell` takes each note on what
     the reader assumed or found out. Yield scans, and `Damage` for the parts that were skipped.
     Raises LogError if the pipe has no lines of CARMEN, or vertices, whose edges may come later.
     """
-    options = LaserOptions(fov, mount, no_return, zero_is)
+    options = LaserOptions(fov, mount, no_return, zero_is, nearest, blind)
     if not hasattr(stream, "readline") or isinstance(stream, io.TextIOBase):
         raise LogError(f"stream: expected a stream of bytes, got {brief(stream)}; open a file")
     text = piped(stream, named(source))
@@ -169,6 +177,7 @@ def _reading(
     format: str | None,
     scan_topic: str | Sequence[str] | None,
     odom_topic: str | None,
+    options: LaserOptions,
 ) -> Iterator[SurveyedLog]:
     """Open and survey a log of any format. Raises LogError."""
     path = a_path("path", path, LogError)
@@ -192,7 +201,7 @@ def _reading(
                 "the file"
             )
         with bag_files.bag_opened(path, "ros2") as bag:
-            yield bags.read(bag, topics, odom_topic)
+            yield bags.read(bag, topics, odom_topic, options)
         return
     # A file is a log in lines or a bag, by its content.
     with rereadable(os.fspath(path)) as file:
@@ -206,7 +215,7 @@ def _reading(
             yield carmen.read(file, named(path), format)
             return
     with bag_files.bag_opened(path, found) as bag:
-        yield bags.read(bag, topics, odom_topic)
+        yield bags.read(bag, topics, odom_topic, options)
 
 
 def _format(file: IO[bytes], source: str) -> str:

@@ -67,12 +67,13 @@ def _laser_value(field: str, text: str) -> Any:
     from perception.readers.echoes import LaserOptions
 
     try:
-        numbers = tuple(map(float, text.split(",")))
+        numbers = tuple(map(float, text.split(":" if field == "blind" else ",")))
     except ValueError:
         raise argparse.ArgumentTypeError(
-            f"expected numbers, got {text!r}; separate them by commas"
+            f"expected numbers, got {text!r}; separate them by "
+            f"{'a colon' if field == 'blind' else 'commas'}"
         ) from None
-    value = numbers if field == "mount" or len(numbers) != 1 else numbers[0]
+    value = numbers if field in ("mount", "blind") or len(numbers) != 1 else numbers[0]
     given: dict[str, Any] = {field: value}
     try:
         LaserOptions(**given)
@@ -117,7 +118,20 @@ READING: Rows = {
         "that the beam hit nothing, unknown that nothing is known (default: free if the "
         "neighbouring beams are long, else unknown)"
     ),
+    "--set nearest METRES": (
+        "a range of at most this length shows the robot itself, and is unknown; 0 if none does "
+        "(default: beams that return one short range in nearly all scans)",
+        {"type": partial(_laser_value, "nearest")},
+    ),
+    "--set blind A:B": (
+        "the robot blocks the beams from A to B, in degrees to the left of where the laser looks, "
+        "counterclockwise; they are unknown",
+        {"type": partial(_laser_value, "blind")},
+    ),
 }
+
+# The options that are fields of perception.readers.echoes.LaserOptions.
+LASER = ("fov", "mount", "no_return", "zero_is", "nearest", "blind")
 
 
 def read(path: str, options: argparse.Namespace) -> RobotLog:
@@ -129,10 +143,7 @@ def read(path: str, options: argparse.Namespace) -> RobotLog:
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
     """Collect the options that are arguments of `read_log`, by name."""
-    return {
-        name: getattr(options, name)
-        for name in ("format", "scan_topic", "odom_topic", "fov", "mount", "no_return", "zero_is")
-    }
+    return {name: getattr(options, name) for name in ("format", "scan_topic", "odom_topic", *LASER)}
 
 
 @verb(
@@ -189,7 +200,7 @@ def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Rob
         )
     if sys.stdin is None:
         raise AbductionError("standard input: expected a log, got a closed stream; name a file")
-    asked = {name: getattr(options, name) for name in ("fov", "mount", "no_return", "zero_is")}
+    asked = {name: getattr(options, name) for name in LASER}
     items = live_log(sys.stdin.buffer, **asked, tell=tell)
     numbers, output = count(), sys.stderr if options.output == "-" else sys.stdout
 

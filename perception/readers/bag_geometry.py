@@ -1,0 +1,189 @@
+"""Where the beams of a bag's scans point: the angles of messages, and lasers that are tilted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from perception.errors import LogError
+from perception.readers.scans import Array, Damaged
+from ssh_abduction.data.odometry import Pose
+
+# A full turn with 1 % for rounding, and the least field of view that is believed in degrees.
+FULL, LEAST_DEGREES = 1.01 * math.tau, 30.0
+# Two statements of a field of view agree if they differ by at most this share, or two steps.
+SAME_SHARE = 0.03
+# Tilts in degrees: up to LEVEL they change nothing; beyond STEEP a laser shows no floor plan.
+LEVEL, STEEP = 2.0, 45.0
+# A beam meets the floor if it ends at most this many metres above it. Beams that end more than
+# BELOW metres below the floor contradict the tilt if they are more than the share MANY_BELOW of
+# those that look at the floor. But if the share ON_FLOOR of them ends at one height, within FLOOR
+# metres, then the floor is there.
+FLOOR, BELOW, MANY_BELOW, ON_FLOOR = 0.05, 0.1, 0.1, 0.6
+
+
+def ranges_of(message: Any) -> Array:
+    """Return the ranges of a scan, or the first echoes. A beam without an echo met nothing."""
+    beams = message.ranges
+    if not isinstance(beams, np.ndarray):
+        beams = [beam.echoes[0] if len(beam.echoes) else np.inf for beam in beams]
+    return np.array(beams, dtype=np.float64)
+
+
+def angles_of(message: Any, fov: float | None = None) -> tuple[float, float, str | None]:
+    """Return the first angle and the step of a scan in radians, and a note if they are doubtful.
+
+    The number of ranges, angle_increment, and angle_min with angle_max should agree. They are
+    tried in radians and degrees. `fov` is the field of view in degrees according to the user.
+    Raises Damaged if they make no sense.
+    """
+    first, last, step = map(float, (message.angle_min, message.angle_max, message.angle_increment))
+    count = len(message.ranges)
+    if not math.isfinite(first) or not math.isfinite(step) or step == 0:
+        raise Damaged(f"expected a first angle and a step in radians, got {first:g} and {step:g}")
+    degree, steps = math.pi / 180, max(count - 1, 1)
+    by_step, by_ends = abs(step) * steps, abs(last - first)
+    for ends, increment, what in (
+        (1.0, 1.0, ""),
+        (degree, degree, "angle_min, angle_max and angle_increment are"),
+        (degree, 1.0, "angle_min and angle_max are"),
+        (1.0, degree, "angle_increment is"),
+    ):
+        one, other = by_step * increment, by_ends * ends
+        near = max(2 * abs(step) * increment, SAME_SHARE * one)
+        if abs(one - other) > near or not one <= FULL:
+            continue
+        if not what:
+            return first, step, None
+        if one >= LEAST_DEGREES * degree:
+            note = f"The angles of the scans are in degrees ({what} read so): write radians."
+            return first * ends, step * increment, note
+    # They contradict each other: the step is right, unless the beams would cover more than a turn.
+    is_known = math.isfinite(last) and last != first
+    told = f"{count} ranges with the angle_increment cover {math.degrees(by_step):.0f} degrees" + (
+        f", but angle_min to angle_max are {math.degrees(by_ends):.0f}" if is_known else ""
+    )
+    wished = None if fov is None else math.radians(abs(fov))
+    ends_fit = is_known and by_ends <= FULL
+    if by_step <= FULL and not is_known:
+        return first, step, None
+    if ends_fit and (
+        by_step > FULL or (wished is not None and abs(by_ends - wished) < abs(by_step - wished))
+    ):
+        step, used = math.copysign(by_ends / steps, step), "angle_max"
+    elif by_step <= FULL:
+        used = "the angle_increment"
+    elif wished is not None:
+        return -wished / 2, wished / steps, None
+    else:
+        raise Damaged(
+            f"expected beams over at most 360 degrees, got {told}; say what they cover (--set "
+            "fov=DEGREES)"
+        )
+    covers = f"{math.degrees(abs(step)) * steps:.0f} degrees"
+    note = (
+        f"The angles of the scans contradict each other: {told}. By {used}, the beams are taken "
+        f"to cover {covers}. If that is wrong, say so: --set fov=DEGREES."
+    )
+    return first, step, note
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where a laser is on the robot."""
+
+    pose: Pose = (0.0, 0.0, 0.0)  # in the plane, in the frame of the robot
+    is_flipped: bool = False  # whether it hangs upside down, so that its beams turn clockwise
+    # Rotation of a tilted laser in the frame of the robot, three rows; empty for a level one.
+    rotation: tuple[tuple[float, ...], ...] = ()
+    height: float = 0.0  # of a tilted laser above the floor, in metres
+
+    @property
+    def tilt(self) -> float:
+        """The angle in degrees between the plane of the beams and the floor, at most 90."""
+        return math.degrees(math.acos(min(1.0, abs(self.rotation[2][2])))) if self.rotation else 0.0
+
+    def rays(self, first: float, step: float, beams: int) -> Array:
+        """The directions of the beams in the frame of the robot: (3, beams)."""
+        angles = first + step * np.arange(beams)
+        flat = np.stack([np.cos(angles), np.sin(angles), np.zeros(beams)])
+        return np.asarray(np.array(self.rotation) @ flat)
+
+    def levelled(self, ranges: Array, first: float, step: float, reach: float) -> Array:
+        """Project ranges, (beams,), of a tilted laser to the plane.
+
+        Each bearing gets the beam that points nearest to it. Ranges are minus infinity (unknown)
+        where no beam points, and where a beam meets the floor.
+        """
+        nearest, flat, down = _levelling(self, first, step, len(ranges))
+        ranges = np.where(ranges >= reach, np.inf, ranges)
+        with np.errstate(invalid="ignore"):
+            ends = self.height + np.minimum(ranges, reach) * down
+            ranges = np.where((down < 0) & (ends <= FLOOR), -np.inf, ranges * flat)
+        return np.asarray(np.where(nearest < 0, -np.inf, ranges[nearest]))
+
+
+@lru_cache(maxsize=64)
+def _levelling(mount: Mount, first: float, step: float, beams: int) -> tuple[Array, Array, Array]:
+    """For each bearing the nearest beam, or -1; and how far each beam goes flat and up."""
+    rays = mount.rays(first, step, beams)
+    side = -1.0 if mount.is_flipped else 1.0
+    wished = side * (first + step * np.arange(beams)) + mount.pose[2]
+    off = np.abs(np.angle(np.exp(1j * (np.arctan2(rays[1], rays[0]) - wished[:, None]))))
+    nearest = np.where(off.min(axis=1) <= abs(step), off.argmin(axis=1), -1)
+    return nearest, np.hypot(rays[0], rays[1]), rays[2]
+
+
+def believed(
+    mount: Mount, scans: Sequence[Any], frame: str, source: str, is_told: bool, notes: list[str]
+) -> Mount:
+    """Check the tilt of a laser by some of its messages, and note what is done about it.
+
+    If the user tells the mount (`is_told`), or the ranges contradict the tilt, the laser counts as
+    level. Raises LogError if the laser is too steep.
+    """
+    tilt = mount.tilt
+    level = Mount(mount.pose, mount.is_flipped)
+    if tilt <= LEVEL or is_told:
+        return level
+    said = f"{tilt:.0f} degrees by the transforms to its frame {frame}"
+    if tilt > STEEP:
+        raise LogError(
+            f"{source}: expected a laser that is tilted by at most {STEEP:.0f} degrees, got "
+            f"{said}; mend the transforms, or say where it sits (--set mount=X,Y,DEGREES)"
+        )
+    ends = [np.zeros(0)]
+    for message in scans:
+        first, step, _ = angles_of(message)
+        ranges = ranges_of(message)
+        down = mount.rays(first, step, len(ranges))[2]
+        seen = (ranges > 0) & (ranges < message.range_max)
+        ends.append(
+            (mount.height + ranges * down)[seen & (mount.height < -message.range_max * down)]
+        )
+    heights = np.concatenate(ends)
+    below = heights[heights < -BELOW]
+    if len(below) > MANY_BELOW * len(heights):
+        floor = float(np.median(below))
+        if (np.abs(below - floor) <= FLOOR).mean() < ON_FLOOR:
+            notes.append(
+                f"The laser is tilted by {said}, but {100 * len(below) / len(heights):.0f} % of "
+                "the beams that look at the floor would end below it. So the transforms are not "
+                "believed, and the laser is taken to be level. Mend the transforms, or say where "
+                "the laser sits: --set mount=X,Y,DEGREES."
+            )
+            return level
+        mount = Mount(mount.pose, mount.is_flipped, mount.rotation, mount.height - floor)
+        heights = heights - floor
+    met = 100 * float((heights <= FLOOR).mean()) if len(heights) else 0.0
+    notes.append(
+        f"The laser is tilted by {said}. Its ranges are projected to the floor plane, and beams "
+        f"that meet the floor ({met:.0f} % of those that look at it) count as unknown. If it is "
+        "level, say where it sits: --set mount=X,Y,DEGREES."
+    )
+    return mount
