@@ -159,6 +159,14 @@ def _checked(fields: Mapping[str, Any], path: Path) -> MapFile:
     is_near = len(place) == 3 and all(abs(number) <= FARTHEST for number in place)
     need("origin", is_near, f"[x, y, yaw] in metres and radians, of at most {FARTHEST:,.0f}")
     x, y, yaw = place
+    if abs(yaw) > math.tau:
+        warnings.warn(
+            f"{named(path)}: origin: expected a yaw in radians, got {yaw:g}, which is read as "
+            "degrees; write radians",
+            SimulatorWarning,
+            stacklevel=5,
+        )
+        yaw = math.radians(yaw)
     image = path.parent / str(image)
     return MapFile(image, resolution, (x, y, yaw), bool(negate), occupied, free, mode)
 

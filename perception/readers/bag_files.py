@@ -250,6 +250,7 @@ PART = re.compile(r"(?P<drive>.*)_(?P<number>\d{1,3})$", re.DOTALL)
 REINDEX = "index it again (rosbag reindex, ros2 bag reindex, mcap recover), or record it anew"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 NANO = 1e-9
+ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a message that is packed with zstd
 
 
 @dataclass
@@ -350,6 +351,7 @@ class Bag:
                 here.symlink_to(path.resolve())
         try:
             self.readers.append(self._by_rosbags(here))
+            self._note_packed(source)
             return
         except Exception as error:  # Damaged bytes can raise any error in the library.
             raise_if_disk_is_full(error, named(path))
@@ -365,6 +367,17 @@ class Bag:
             f"{source} is cut, or was never closed ({why}): its {salvage.count} whole messages "
             f"are read, {salvage.seconds:.1f} s of the drive. What came after is lost."
         )
+
+    def _note_packed(self, source: str) -> None:
+        """Note that the messages of a file alone are packed, which its metadata.yaml would say."""
+        _, _, raw = next(iter(self.readers[-1].messages()), (None, 0, b""))
+        if self.format == "ros2" and bytes(raw[: len(ZSTD)]) == ZSTD:
+            if zstd_module() is None:
+                raise LogError(
+                    f"{source}: expected the package backports.zstd to unpack its messages with "
+                    "(zstd), got none; pip install 'ssh-abduction[ros]'"
+                )
+            self.notes.append(f"The messages of {source} are packed with zstd: they are unpacked.")
 
     def _by_rosbags(self, path: Path) -> Any:
         """Open a file or folder with rosbags, and return the reader, which the stack closes."""
@@ -412,8 +425,10 @@ class Bag:
                     numbers[connection.topic] += 1
                     number = numbers[connection.topic]
                     try:
-                        message = deserialize(raw, connection.msgtype)
-                    except (SerdeError, ValueError, IndexError) as error:
+                        is_packed = self.format == "ros2" and bytes(raw[: len(ZSTD)]) == ZSTD
+                        whole = zstd_module().decompress(raw) if is_packed else raw
+                        message = deserialize(whole, connection.msgtype)
+                    except damages(SerdeError, ValueError, IndexError) as error:
                         what = (
                             f"{connection.topic}: expected a message "
                             f"{connection.msgtype.rpartition('/')[2]}, got damaged data "

@@ -15,7 +15,7 @@ import lzma
 import shutil
 import tempfile
 import zlib
-from codecs import BOM_UTF8
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import IO, Any, cast
@@ -26,6 +26,8 @@ from ssh_abduction.data.files import opened_file
 
 # Longer lines are skipped: a scan of 10,000 beams is 100 kB.
 LONGEST_LINE = 2**20
+# Number of first bytes that show the encoding of a log and its line ends.
+HEAD = 2**16
 # First bytes of packed files, with the packer and the command that unpacks them.
 PACKERS = {
     b"\x1f\x8b": ("gzip", "zcat"),
@@ -154,6 +156,35 @@ def zstd_module() -> Any:
     return None
 
 
+class _Decoded:
+    """The lines of a text in another encoding or with other line ends, as in UTF-8 with LF."""
+
+    def __init__(self, stream: IO[bytes], encoding: str) -> None:
+        self._text = io.TextIOWrapper(stream, encoding, errors="replace")
+
+    def readline(self, size: int = -1) -> bytes:
+        """Read a line, at most `size` characters."""
+        return self._text.readline(size).encode()
+
+    def __del__(self) -> None:
+        """Leave the stream open: it may be read again."""
+        self._text.detach()
+
+
+def _decoded(stream: IO[bytes]) -> IO[bytes]:
+    """Recode a log in UTF-16, as some shells write it, or with line ends CR as on old Macs."""
+    head = stream.read(HEAD)
+    stream.seek(0)
+    encoding = None
+    if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+        encoding = "utf-16"
+    elif head[:2].isascii() and 0 in head[:2] and any(head[:2]) and head[:2].strip(b"\0").isalpha():
+        encoding = "utf-16-le" if head[1] == 0 else "utf-16-be"
+    elif b"\r" in head and b"\n" not in head and b"\0" not in head:
+        encoding = "latin-1"
+    return stream if encoding is None else cast(IO[bytes], _Decoded(stream, encoding))
+
+
 def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
     """Yield the lines of a file, unpacked if necessary, each with its number, from 1.
 
@@ -161,9 +192,9 @@ def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
     are damaged. The message says up to which line they can be read.
     """
     found = packer(file)
-    stream = unpacked(file, source)
     number = 0
     try:
+        stream = _decoded(unpacked(file, source))
         while line := stream.readline(LONGEST_LINE + 1):
             number += 1
             if len(line) <= LONGEST_LINE:
