@@ -264,9 +264,14 @@ def tracked(log: RobotLog, tell: Tell = tell_nobody) -> Tracked:
             _log.warning("%s: %s", named(log.source), note)
             tell(note)
 
+    logged = log
     log, corrected, whole = log_checks.checked(log)
     say([*corrected, *whole])
     track = following.follow(log)
+    if lag := odometers.lag_of(log, track):
+        log, *_ = log_checks.checked(odometers.with_lag(logged, lag))
+        track = following.follow(log)
+        say([odometers.describe_lag(lag)])
     say(odometers.describe_cuts(log, track, following.turned_wrongly(log, track)))
     # If the odometry is wrong throughout, that explains all differences between the trajectories.
     doubt = None if whole else odometers.disagreement(log, track)

@@ -68,6 +68,11 @@ LATELY = 100
 NO_RANGE = 25.0
 # A step to within this many metres of the origin means that the odometer restarted.
 ANEW = 1.0
+# Seconds by which scans may be late. Turns between scans that differ by more than CAPPED radians
+# count as CAPPED. A lag of at least LEAST_LAG seconds is found if turns then differ by CLEARLY
+# times as much, and by LEAST_GAIN radians less in the mean.
+LAGS, CAPPED = np.arange(-60, 61) * 0.05, 0.3
+LEAST_LAG, CLEARLY, LEAST_GAIN = 0.15, 0.6, 0.005
 TWO_DRIVES = (
     " Local maps that match may connect what lies before and after. If a drive through another "
     "building begins there, cut the log there, and map each part alone."
@@ -95,6 +100,47 @@ def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
     kept = TimedPoses(sources[0].astype(float), poses)
     scans = (replace(scan, odometry=kept.at(k)) for k, scan in enumerate(log.scans))
     return replace(log, scans=tuple(scans)), [said]
+
+
+def lag_of(log: RobotLog, track: Track) -> float:
+    """Estimate by how many seconds the scans are stamped late, from the turns of the track.
+
+    The turns from scan to scan agree best with those of the odometer at times that are earlier by
+    the lag. The result is 0 if that is hardly better than no lag, or the odometer has no times.
+    """
+    if log.odometer is None or any(scan.time is None for scan in log.scans) or len(log) < 2:
+        return 0.0
+    at, headings = log.odometer[0], log.odometer[1][:, 2]
+    times = np.array([scan.time for scan in log.scans], dtype=float)
+    turns = np.diff(track.poses[:, 2])
+
+    def off(lag: float) -> float:
+        measured = np.diff(np.interp(times - lag, at, headings))
+        apart = np.abs((turns - measured + math.pi) % math.tau - math.pi)
+        return float(np.minimum(apart, CAPPED).mean())
+
+    offs = [off(lag) for lag in LAGS]
+    best, now = int(np.argmin(offs)), off(0.0)
+    is_clear = offs[best] < CLEARLY * now and now - offs[best] > LEAST_GAIN
+    return float(LAGS[best]) if is_clear and abs(LAGS[best]) >= LEAST_LAG else 0.0
+
+
+def with_lag(log: RobotLog, lag: float) -> RobotLog:
+    """Copy a log with its own odometer, read `lag` seconds before the stamp of each scan."""
+    assert log.odometer is not None
+    odometer = TimedPoses(*log.odometer)
+    scans = (replace(scan, odometry=odometer.at((scan.time or 0.0) - lag)) for scan in log.scans)
+    return replace(log, scans=tuple(scans))
+
+
+def describe_lag(lag: float) -> str:
+    """Say in a note that the scans are late, or early if the lag is negative."""
+    late, then = ("late", "earlier") if lag > 0 else ("early", "later")
+    return (
+        f"The scans are stamped {abs(lag):.2f} s too {late}: their turns agree with those of the "
+        f"odometry so much {then}. So the odometry is read {then} by this. Mend the stamps of "
+        "the laser or the odometer."
+    )
 
 
 def times_back(log: RobotLog) -> int:

@@ -317,7 +317,8 @@ def read(
     notes += _gaps(poses)
     where = _ScanPoses(poses, corrections, mounts, by_stamp, told.fov)
     items = _scans(bag, set(scans), where, damaged, survey.repeated)
-    return SurveyedLog(bag.format, tuple(notes), items, assumed, tuple(sources))
+    odometry = poses.times, poses.poses
+    return SurveyedLog(bag.format, tuple(notes), items, assumed, tuple(sources), odometry)
 
 
 def _gaps(poses: TimedPoses) -> list[str]:
@@ -377,7 +378,7 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
 
 
 @dataclass
-class _Survey:
+class _FirstPass:
     """What the first pass over the scans of a bag finds."""
 
     # For each topic (n, 2): the times in the headers and of the recording, in seconds.
@@ -389,10 +390,10 @@ class _Survey:
     doubt: str | None  # a note on the angles of most scans
 
 
-def _survey(bag: Bag, topics: Sequence[str], told: LaserOptions, notes: list[str]) -> _Survey:
+def _survey(bag: Bag, topics: Sequence[str], told: LaserOptions, notes: list[str]) -> _FirstPass:
     """Read the scans of some topics, and note those that are repeated. Raises LogError."""
     times: dict[str, list[tuple[float, float]]] = {}
-    found = _Survey({}, Counter(), {}, set(), None)
+    found = _FirstPass({}, Counter(), {}, set(), None)
     doubts: Counter[str] = Counter()
     known: Counter[int] = Counter()
     for connection, number, recorded, message in bag.messages(set(topics)):

@@ -178,7 +178,7 @@ def _decoded(stream: IO[bytes]) -> IO[bytes]:
     encoding = None
     if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
         encoding = "utf-16"
-    elif head[:2].isascii() and 0 in head[:2] and any(head[:2]) and head[:2].strip(b"\0").isalpha():
+    elif head[:2].count(0) == 1:
         encoding = "utf-16-le" if head[1] == 0 else "utf-16-be"
     elif b"\r" in head and b"\n" not in head and b"\0" not in head:
         encoding = "latin-1"

@@ -93,7 +93,8 @@ def read_log(
     meant, found_out = interpret_log(scans, options)
     notes = (*reading.notes, *_assumed(reading, options), *found_out)
     source = os.fspath(path)
-    log = RobotLog(meant, tuple(damaged), reading.format, source, notes, reading.sources)
+    about = reading.sources, reading.odometer
+    log = RobotLog(meant, tuple(damaged), reading.format, source, notes, *about)
     for warning in log.warnings:
         _log.warning("%s: %s", named(path), warning)
     return log

@@ -136,6 +136,8 @@ class RobotLog:
         notes: Sentences about the log that a user should know, for example that its odometry was
             reconstructed.
         sources: Sentences that say which parts of a bag the scans and poses come from.
+        odometer: Times in seconds, (n,), and poses at them, (n, 3), of an odometer with messages
+            of its own; None if poses come with the scans.
     """
 
     scans: Sequence[Scan]
@@ -144,6 +146,7 @@ class RobotLog:
     source: str = ""
     notes: tuple[str, ...] = ()
     sources: tuple[str, ...] = ()
+    odometer: tuple[Array, Array] | None = None
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -180,6 +183,7 @@ class SurveyedLog:
     # `perception.readers.echoes.LaserOptions` by which a user can say otherwise.
     assumed: Mapping[str, str] = field(default_factory=dict)
     sources: tuple[str, ...] = ()  # as in `RobotLog`
+    odometer: tuple[Array, Array] | None = None  # as in `RobotLog`
 
 
 class ScanTable(Sequence[Scan]):

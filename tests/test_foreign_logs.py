@@ -1,0 +1,243 @@
+"""Logs of other people's robots, with a mistake that the reader corrects and names."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from coarse import hall
+from test_bags import notes, written
+from test_readers import LASER, SMALL, Messages, bag, drive
+
+from perception.errors import LogError
+from perception.places.following import follow
+from perception.places.odometers import lag_of, with_lag
+from perception.readers.echoes import LaserOptions, interpret_log
+from perception.readers.lines import zstd_module
+from perception.readers.logs import read_log
+from perception.readers.scans import RobotLog
+from perception.readers.writers import write_carmen
+from simulator.errors import SimulatorWarning
+from simulator.world import World
+
+Listed = list[tuple[str, float, Any]]
+
+
+def ahead(m: Messages, change: Callable[[Any, int], None] = lambda scan, i: None) -> Listed:
+    """A robot that drives ahead, whose scans are changed."""
+    found: Listed = []
+    for i in range(60):
+        scan = m.scan(1.0 + i)
+        scan.ranges = np.array([1, 2, 3, 4 + i / 100, 5], dtype=np.float32)
+        change(scan, i)
+        found += [
+            ("/odom", 1.0 + i, m.odometry(1.0 + i, (0.5 * i, 0.0, 0.1 * math.sin(i)))),
+            ("/scan", 1.0 + i, scan),
+        ]
+    return found
+
+
+def angles(first: float, last: float, step: float) -> Callable[[Any, int], None]:
+    def change(scan: Any, _: int) -> None:
+        scan.angle_min, scan.angle_max, scan.angle_increment = first, last, step
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("given", "step", "said"),
+    [
+        ((-90.0, 90.0, 45.0), math.pi / 4, "are in degrees (angle_min, angle_max and"),
+        ((-1.5708, 1.5708, 45.0), math.pi / 4, "are in degrees (angle_increment is"),
+        (
+            (-math.pi, math.pi, math.pi),
+            math.pi / 2,
+            "By angle_max, the beams are taken to cover 360",
+        ),
+        ((-1.0, 1.0, 0.5), 0.5, ""),
+    ],
+)
+def test_angles_that_make_no_sense_are_named(
+    tmp_path: Path, given: tuple[float, float, float], step: float, said: str
+) -> None:
+    log = read_log(bag(tmp_path / "bag", lambda m: ahead(m, angles(*given))))
+    assert log.scans[0].laser.step == pytest.approx(step, rel=1e-3)
+    assert said in notes(log)
+    assert ("The angles of the scans" in notes(log)) == bool(said)
+
+
+def test_beams_over_more_than_a_turn_are_refused_unless_told(tmp_path: Path) -> None:
+    path = bag(tmp_path / "bag", lambda m: ahead(m, angles(-6.5, 6.5, 3.25)))
+    with pytest.raises(LogError, match=r"at most 360 degrees, got 5 ranges .* cover 745 degrees"):
+        read_log(path)
+    assert read_log(path, fov=180).scans[0].laser.step == pytest.approx(math.pi / 4)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "height", "said"),
+    [(10, 0.3, "projected to the floor plane"), (30, 0.3, "not believed"), (1, 0.3, "")],
+)
+def test_tilted_laser_is_levelled_or_not_believed(
+    tmp_path: Path, degrees: float, height: float, said: str
+) -> None:
+    floor = height / math.sin(math.radians(10))
+
+    def change(scan: Any, i: int) -> None:
+        scan.header.frame_id = "laser"
+        middle = floor if degrees == 10 else 2 + i / 20
+        ranges = np.array([1, 1.5, middle, 1.5, 1])
+        scan.ranges = (ranges + (0 if degrees == 10 else i / 30)).astype(np.float32)
+
+    path = bag(tmp_path / "bag", lambda m: tilted(m, degrees, change))
+    log = read_log(path, no_return=7)
+    assert said in notes(log)
+    if degrees == 10:
+        assert math.isnan(log.scans[0].ranges[2])
+        assert 1.4 < log.scans[0].ranges[1] < 1.5
+    else:
+        assert log.scans[0].ranges[1] == 1.5
+    assert "tilted" not in notes(read_log(path, mount=(0, 0, 0)))
+
+
+def tilted(m: Messages, degrees: float, change: Callable[[Any, int], None]) -> Listed:
+    """A laser that looks down by some degrees."""
+    transform = m.transform("base_link", "laser", (0.0, 0.0, 0.0))
+    half = math.radians(degrees) / 2
+    turn = m.types["geometry_msgs/msg/Quaternion"](x=0.0, y=math.sin(half), z=0.0, w=math.cos(half))
+    transform.transforms[0].transform.rotation = turn
+    return [("/tf_static", 0.5, transform), *ahead(m, change)]
+
+
+def test_steep_laser_is_refused(tmp_path: Path) -> None:
+    path = bag(tmp_path / "bag", lambda m: tilted(m, 60, lambda scan, i: None))
+    with pytest.raises(LogError, match=r"tilted by at most 45 degrees, got 60 degrees"):
+        read_log(path)
+
+
+def test_beams_on_the_robot_itself_are_unknown() -> None:
+    scans = [replace(scan, ranges=scan.ranges.copy()) for scan in drive(60, LASER)]
+    for scan in scans:
+        scan.ranges[40:50] = 0.24
+    meant, said = interpret_log(scans, LaserOptions())
+    assert all(np.isnan(scan.ranges[40:50]).all() for scan in meant)
+    assert "10 beams return one short range, 0.24 to 0.24 m" in " ".join(said)
+    meant, said = interpret_log(scans, LaserOptions(nearest=0.0))
+    assert (meant[0].ranges[40:50] == 0.24).all()
+    meant, _ = interpret_log(scans, LaserOptions(nearest=0.35, blind=(-90.0, -80.0)))
+    assert np.isnan(meant[0].ranges[40:50]).all()
+    assert np.isnan(meant[0].ranges[:11]).all()
+
+
+def test_repeated_scans_are_left_out(tmp_path: Path) -> None:
+    log = read_log(bag(tmp_path / "bag", lambda m: [one for one in ahead(m) for _ in range(2)]))
+    assert len(log) == 60
+    assert "60 of 120 scans repeat an earlier one" in notes(log)
+
+
+def test_prefixed_frames_are_found(tmp_path: Path) -> None:
+    mount = (0.1, 0.0, math.pi)
+    path = bag(
+        tmp_path / "bag",
+        lambda m: [("/tf_static", 0.5, m.transform("r/base_link", "r/laser", mount)), *ahead(m)],
+    )
+    log = read_log(path)
+    assert log.scans[0].laser.mount == pytest.approx(mount, abs=1e-5)
+    assert "laser is r/laser" in notes(log)
+
+
+def bend(i: int) -> tuple[float, float, float, float]:
+    """Time, x, y and heading of a robot that drives to and fro in bends, and ahead."""
+    return 1.0 + i, 0.5 * i, 2 * math.sin(i / 5), math.atan(0.8 * math.cos(i / 5))
+
+
+@pytest.mark.parametrize("kind", ["inverted", "exchanged", "about x"])
+def test_odometry_with_swapped_frames_or_axes_is_read(tmp_path: Path, kind: str) -> None:
+    def messages(m: Messages) -> Listed:
+        found: Listed = []
+        for i in range(60):
+            t, x, y, turn = bend(i)
+            one = m.odometry(t, (x, y, turn), base="laser")
+            pose = one.pose.pose
+            if kind == "about x":
+                pose.orientation.x, pose.orientation.z = pose.orientation.z, 0.0
+            else:
+                one.header.frame_id, one.child_frame_id = "laser", "odom"
+            if kind == "inverted":
+                cos, sin = math.cos(turn), math.sin(turn)
+                pose.position.x, pose.position.y = -cos * x - sin * y, sin * x - cos * y
+                pose.orientation.z *= -1
+            found += [("/odom", t, one), ("/scan", t, m.scan(t))]
+        return found
+
+    log = read_log(bag(tmp_path / "bag", messages))
+    assert log.scans[20].odometry == pytest.approx(bend(20)[1:])
+    assert {"inverted": "inverted", "exchanged": "exchanged", "about x": "turn about x"}[
+        kind
+    ] in notes(log)
+
+
+def test_gap_in_the_odometry_is_named(tmp_path: Path) -> None:
+    path = bag(
+        tmp_path / "bag",
+        lambda m: [one for one in ahead(m) if one[0] == "/scan" or not 20 < one[1] < 40],
+    )
+    assert "The odometry has 1 gap: for 20.0 s from 20.0 s on" in notes(read_log(path))
+
+
+def test_late_scans_are_found_by_their_turns() -> None:
+    scans = hall(every=0.5)[:120]
+    times = np.array([scan.time for scan in scans])
+    poses = np.array([scan.odometry for scan in scans])
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    log = RobotLog(scans, odometer=(times, poses))
+    assert lag_of(log, follow(log)) == 0
+    late = replace(log, odometer=(times - 0.7, poses))
+    assert lag_of(late, follow(log)) == pytest.approx(0.7, abs=0.11)
+    assert with_lag(late, 0.7).scans[50].odometry == pytest.approx(scans[50].odometry, abs=1e-6)
+
+
+def test_first_scan_of_a_second_laser_follows_the_odometry() -> None:
+    one, other = hall()[:2]
+    back = replace(other, laser=replace(other.laser, mount=(-0.3, 0.0, math.pi)))
+    assert follow(RobotLog((one, back))).poses[1] == pytest.approx(
+        follow(RobotLog((one, replace(back, ranges=np.full_like(back.ranges, np.inf))))).poses[1]
+    )
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "cr"])
+def test_logs_in_other_encodings_are_read(tmp_path: Path, encoding: str) -> None:
+    path, scans = tmp_path / "a.log", drive(40, SMALL)
+    write_carmen(path, scans)
+    text = path.read_text()
+    path.write_bytes(
+        text.replace("\n", "\r").encode() if encoding == "cr" else text.encode(encoding)
+    )
+    assert len(read_log(path)) == len(scans)
+
+
+def test_packed_messages_in_a_file_alone_are_unpacked(tmp_path: Path) -> None:
+    path = written(tmp_path, "ros2")
+    with sqlite3.connect(path) as database:
+        for number, data in database.execute("SELECT id, data FROM messages").fetchall():
+            packed = zstd_module().compress(data)
+            database.execute("UPDATE messages SET data = ? WHERE id = ?", (packed, number))
+    log = read_log(path)
+    assert len(log) == 40
+    assert "are packed with zstd" in notes(log)
+
+
+def test_yaw_in_degrees_of_an_occupancy_map_is_named(tmp_path: Path) -> None:
+    from PIL import Image
+
+    pixels = np.full((60, 60), 255, np.uint8)
+    pixels[[0, -1]] = pixels[:, [0, -1]] = 0
+    Image.fromarray(pixels).save(tmp_path / "map.pgm")
+    (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.1\norigin: [0, 0, 90]\n")
+    with pytest.warns(SimulatorWarning, match="got 90, which is read as degrees"):
+        World.from_occupancy(tmp_path / "map.yaml")
