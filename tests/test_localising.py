@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from unittest.mock import patch
 
 import pytest
@@ -14,7 +15,7 @@ from ssh_abduction.data.groups import numbered
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.sources.exact import visit_labels as same
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
-from ssh_abduction.solver.steps.chart import Chart, FramedChart, Located, State, faced, located
+from ssh_abduction.solver.steps.chart import Chart, FramedChart, State, faced, located
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.speedups import Speedups
 
@@ -35,8 +36,8 @@ def true_states(walk: Walk, chart: FramedChart) -> list[State]:
     return [4 * cell + heading for cell, (_, _, heading) in zip(cells, at.values(), strict=True)]
 
 
-def labels(chart: FramedChart, found: Located) -> list[int]:
-    return [faced(found.states[visit], slot) for visit, slot in chart.facing]
+def labels(chart: FramedChart, found: Sequence[State]) -> list[int]:
+    return [faced(found[visit], slot) for visit, slot in chart.facing]
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -47,11 +48,11 @@ def test_map_of_some_visits_locates_all_visits(seed: int) -> None:
     states = true_states(walk, chart)
     chance = random.Random(seed)
     told = {0, *chance.sample(range(len(states)), 5)}
-    while missed := located(chart, {visit: states[visit] for visit in told}).missed:
+    while missed := located(chart, {visit: states[visit] for visit in told})[1]:
         assert set(missed) - told
         assert max(missed) < len(states)
         told.update(missed)
-    assert list(located(chart, {visit: states[visit] for visit in told}).states) == states
+    assert list(located(chart, {visit: states[visit] for visit in told})[0]) == states
     assert len(told) < 0.8 * len(states)
 
 
@@ -77,12 +78,12 @@ def test_map_of_a_prefix_locates_all_visits_or_names_missing_ones(seed: int) -> 
             if at[i] // 4 == at[j] // 4
         ):
             continue  # later steps show that the map is wrong
-        found = located(chart, at)
-        if found.missed:
-            assert set(found.missed) - set(at)
+        found, missed = located(chart, at)
+        if missed:
+            assert set(missed) - set(at)
         else:
             assert chart.is_map(labels(chart, found))
-            assert {visit: found.states[visit] for visit in at} == at
+            assert {visit: found[visit] for visit in at} == at
 
 
 def test_long_trace_is_solved_from_some_of_its_visits() -> None:

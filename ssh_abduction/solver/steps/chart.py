@@ -274,28 +274,20 @@ class FramedChart(Chart):
         return misfits
 
 
-@dataclass(frozen=True)
-class Located:
-    """The result of localising all visits.
-
-    Attributes:
-        states: The state of each visit; empty if the map does not locate all of them.
-        missed: The visits to add to the map so that it locates more visits; empty if it locates
-            all.
-    """
-
-    states: tuple[State, ...]
-    missed: tuple[int, ...] = ()
-
-
-def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
+def located(
+    chart: FramedChart, states: Mapping[int, State]
+) -> tuple[tuple[State, ...], tuple[int, ...]]:
     """Find the state of every visit of a chart from the given states of some visits.
 
     The first visit must have a state. The states must make a map: visits at one place do not
     contradict each other, and an action leads from a state to one state.
+
+    Returns:
+        The states of all visits; empty if the map does not locate all of them. And the visits to
+        add to the map so that it locates more visits; empty if it locates all.
     """
     if len(states) == len(chart.stars):
-        return Located(tuple(states[visit] for visit in range(len(states))))
+        return tuple(states[visit] for visit in range(len(states))), ()
     return _VisitLocaliser(chart, states).located()
 
 
@@ -318,7 +310,7 @@ class _VisitLocaliser:
         }
         self._fits = _fitting(chart, states)
 
-    def located(self) -> Located:
+    def located(self) -> tuple[tuple[State, ...], tuple[int, ...]]:
         """Find the states of all visits, or the visits that are missed."""
         possible = self._anywhere(0)
         found = [possible]
@@ -334,11 +326,9 @@ class _VisitLocaliser:
                     break
                 possible = possible or self._anywhere(visit)
             found.append(possible)
-        return (
-            Located((), tuple(sorted(missed)))
-            if missed
-            else Located(tuple(state for (state,) in found))
-        )
+        if missed:
+            return (), tuple(sorted(missed))
+        return tuple(state for (state,) in found), ()
 
     def _stretch_up_to(self, visit: int) -> Iterable[int]:
         """Find a short stretch of visits, up to this one, that the map cannot explain.

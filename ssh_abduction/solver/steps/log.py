@@ -9,8 +9,6 @@ does that.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import Enum
 from functools import partial
 
 from ssh_abduction.data.groups import numbered
@@ -27,28 +25,6 @@ TRIED = 100
 STEPS_TRIED = 3_000_000
 # For a long trace, predict up to this many steps for each step of the trace, if that is more.
 EACH = 20
-
-
-class Outcome(Enum):
-    """How a replay of a trace over a map ended."""
-
-    PREDICTED = "predicted"  # the map explains every step
-    CONTRADICTED = "contradicted"  # a step contradicts the dstate that the map predicts for it
-    UNKNOWN = "unknown"  # an action was never tried in its dstate
-
-
-@dataclass(frozen=True, slots=True)
-class Replay:
-    """The result of a replay of a trace over a map.
-
-    Attributes:
-        labels: The dstates of the first steps, as far as the map explains them.
-        outcome: How the replay ended. Unless it is PREDICTED, step number len(labels) is the first
-            one that the map does not explain.
-    """
-
-    labels: tuple[int, ...]
-    outcome: Outcome
 
 
 def observation(step: Step, theory: Theory) -> tuple[View | None, object]:
@@ -103,36 +79,29 @@ class Log:
         self,
         labels: Sequence[int],
         place_of: Sequence[int | None] | None = None,
-    ) -> Replay:
+    ) -> tuple[int, ...]:
         """Replay the trace over the map that `labels` make of its first steps.
 
         `place_of` has the place of each dstate, to check the evidence about places; None if the map
-        has no places.
+        has no places. Returns the dstates of the first steps, as far as the map explains them. It
+        explains all steps if there are as many dstates.
         """
         actions, seen, known = self.actions, self.seen, len(labels)
         if known == len(seen):
-            return Replay(tuple(labels), Outcome.PREDICTED)
+            return tuple(labels)
         links = {(labels[t], actions[t]): labels[t + 1] for t in range(known - 1)}
         sights = {(labels[t], seen[t]) for t in range(known)}
         found = list(labels)
-        label = found[-1]
-        outcome = Outcome.PREDICTED
         for t in range(known, len(seen)):
-            following = links.get((label, actions[t - 1]))
-            if following is None:
-                outcome = Outcome.UNKNOWN
+            following = links.get((found[-1], actions[t - 1]))
+            if following is None or (following, seen[t]) not in sights:
                 break
-            if (following, seen[t]) not in sights:
-                outcome = Outcome.CONTRADICTED
-                break
-            label = following
-            found.append(label)
+            found.append(following)
             # Evidence about pairs of steps can contradict the dstate, too.
             if t in self.pairs.asked_for and not self.pairs.allow(t, found, place_of):
                 found.pop()
-                outcome = Outcome.CONTRADICTED
                 break
-        return Replay(tuple(found), outcome)
+        return tuple(found)
 
     def merged(self) -> tuple[int, ...]:
         """Label all steps greedily, so that the labels make a causal map. It need not be minimal.

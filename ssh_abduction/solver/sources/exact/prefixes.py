@@ -59,7 +59,6 @@ from ssh_abduction.solver.board import Judging, Known
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 from ssh_abduction.solver.sources.exact.engine import Engine, Task
 from ssh_abduction.solver.sources.exact.readable import StepEngine, paths_needed
-from ssh_abduction.solver.steps.log import Outcome, Replay
 from ssh_abduction.solver.values import Found, Status
 from ssh_abduction.theory.evidence import Equality
 
@@ -111,19 +110,15 @@ class Prefixes:
             self._known.raise_lower(minimal.cost)
             replayed = self._replay(minimal.map)
             _log.debug(
-                "its minimal cost is %s; its map explains %d steps",
-                minimal.cost,
-                len(replayed.labels),
+                "its minimal cost is %s; its map explains %d steps", minimal.cost, len(replayed)
             )
             if self._predicts_all(minimal, replayed):
-                self._known.keep(
-                    replace(minimal, map=self._whole(minimal.map, replayed)), replayed.labels
-                )
+                self._known.keep(replace(minimal, map=self._whole(minimal.map, replayed)), replayed)
             # If the best map of the whole trace is as cheap as this minimal map, it is minimal.
             if self._known.best is not None and self._known.cost <= minimal.cost:
                 self._known.status = Status.OPTIMAL
                 return
-            size = self.engine.next_size(len(replayed.labels))
+            size = self.engine.next_size(len(replayed))
 
     def minimise(self) -> Found | None:
         """Find a minimal map of the prefix (first steps) that no evidence rejects, or None."""
@@ -169,9 +164,7 @@ class Prefixes:
                 self._known.partial = found.map
                 replayed = self._replay(found.map)
                 if self._known.is_better(found) and self._predicts_all(found, replayed):
-                    self._known.keep(
-                        replace(found, map=self._whole(found.map, replayed)), replayed.labels
-                    )
+                    self._known.keep(replace(found, map=self._whole(found.map, replayed)), replayed)
                 self._report()
                 if (
                     not self._at_once
@@ -182,10 +175,10 @@ class Prefixes:
             if not self._name_more_paths(minimal.cost if minimal else None):
                 return minimal
 
-    def _predicts_all(self, found: Found, replayed: Replay) -> bool:
+    def _predicts_all(self, found: Found, replayed: tuple[int, ...]) -> bool:
         """Whether a map of the prefix replays to the end, and no evidence rejects the whole map."""
-        whole = replayed.outcome is Outcome.PREDICTED
-        return whole and not self._judging.why_refused(self._whole(found.map, replayed))
+        is_whole = len(replayed) == len(self._task.trace)
+        return is_whole and not self._judging.why_refused(self._whole(found.map, replayed))
 
     def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
         """Begin again with more names for paths, if the proof of this cost needs them."""
@@ -227,8 +220,8 @@ class Prefixes:
             for found in self.engine.maps_of_cost(self._known.cost, asked):
                 came += 1
                 replayed = self._replay(found.map)
-                if replayed.outcome is not Outcome.PREDICTED:
-                    return len(replayed.labels)
+                if len(replayed) < len(self._task.trace):
+                    return len(replayed)
                 whole = self._whole(found.map, replayed)
                 key = hash(whole)
                 if key in given:
@@ -250,39 +243,27 @@ class Prefixes:
             else:
                 return 0
 
-    def _replay(self, ssh_map: SSHMap) -> Replay:
-        """Replay the trace over a map of a prefix.
+    def _replay(self, ssh_map: SSHMap) -> tuple[int, ...]:
+        """Replay the trace over a map of a prefix. Return the dstates of the steps it explains.
 
         If stars (the openings seen at a step) need to agree only within their spread, also find out
         at the end whether the stars of all steps fit the map.
         """
-        log = self._task.log
-        replayed = log.replay(
-            ssh_map.dstate_at, [s.place for s in ssh_map.dstates] if log.pairs else None
-        )
-        replays = replayed.outcome is Outcome.PREDICTED and len(ssh_map.dstate_at) < len(
-            replayed.labels
-        )
-        if (
-            self._in_tolerance
-            and replays
-            and with_allowed_headings(
-                self._task.trace,
-                replace(ssh_map, dstate_at=replayed.labels),
-                self._task.theory.axioms,
-            )
-            is None
-        ):
-            return Replay(replayed.labels[: len(ssh_map.dstate_at)], Outcome.CONTRADICTED)
+        log, trace, prefix = self._task.log, self._task.trace, ssh_map.dstate_at
+        replayed = log.replay(prefix, [s.place for s in ssh_map.dstates] if log.pairs else None)
+        if self._in_tolerance and len(prefix) < len(replayed) == len(trace):
+            whole = replace(ssh_map, dstate_at=replayed)
+            if with_allowed_headings(trace, whole, self._task.theory.axioms) is None:
+                return prefix
         return replayed
 
-    def _whole(self, ssh_map: SSHMap, replayed: Replay) -> SSHMap:
+    def _whole(self, ssh_map: SSHMap, replayed: tuple[int, ...]) -> SSHMap:
         """Extend a map of a prefix to all steps that a replay explains.
 
         If stars need to agree only within their spread, give the map headings that all stars allow.
         """
-        whole = replace(ssh_map, dstate_at=replayed.labels)
-        if not self._in_tolerance or len(ssh_map.dstate_at) == len(replayed.labels):
+        whole = replace(ssh_map, dstate_at=replayed)
+        if not self._in_tolerance or len(ssh_map.dstate_at) == len(replayed):
             return whole
         return with_allowed_headings(self._task.trace, whole, self._task.theory.axioms) or whole
 

@@ -50,7 +50,7 @@ from ssh_abduction.solver.asp.facts import number_symbols, sides
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.fitting import Member
 from ssh_abduction.solver.steps.apart import clique
-from ssh_abduction.solver.steps.chart import Chart, FramedChart, Located, State, faced, located
+from ssh_abduction.solver.steps.chart import Chart, FramedChart, State, faced, located
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.pairs import pairs_in
@@ -207,10 +207,11 @@ class VisitLabels:
             program = self.program
             if threes := intransitive(pairs, program.fits, program.chart):
                 program.close(threes)
-            elif (located := program.located(pairs)).missed:
-                self._give_more(located.missed)
-            else:
-                return program.labels(located)
+                continue
+            labels, missed = program.labels(pairs)
+            if not missed:
+                return labels
+            self._give_more(missed)
         return None
 
     def _best_answer(self) -> list[Pair] | None:
@@ -462,8 +463,12 @@ class VisitProgram:
         rules = (f"via({self._closed},{','.join(map(str, three))})." for three in threes)
         self.add_rules("\n".join(rules), "closed", self._closed)
 
-    def located(self, pairs: Iterable[Pair]) -> Located:
-        """Locate all visits by the pairs in a transitive answer; else return the missed visits."""
+    def labels(self, pairs: Iterable[Pair]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the dstate of each node by the pairs in a transitive answer, and missed visits.
+
+        Dstates are numbered in the order of their first nodes. If visits are missed, so that the
+        answer does not locate all of them, no dstates are returned.
+        """
         first: dict[int, tuple[int, int]] = {}
         for i, j, r in sorted(pairs):
             first.setdefault(j, (i, r))
@@ -472,13 +477,9 @@ class VisitProgram:
         for visit in sorted(self.visits):
             i, r = first.get(visit, (visit, 0))
             states[visit] = 4 * number.setdefault(i, len(number)) + -r % 4
-        return located(self.chart, states)
-
-    def labels(self, everywhere: Located) -> tuple[int, ...]:
-        """Return the dstate of each node, numbered in the order of their first nodes."""
-        return tuple(
-            numbered(faced(everywhere.states[visit], slot) for visit, slot in self.chart.facing)
-        )
+        everywhere, missed = located(self.chart, states)
+        facing = () if missed else self.chart.facing
+        return tuple(numbered(faced(everywhere[visit], slot) for visit, slot in facing)), missed
 
     def spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
         """List the pairs of visits that must be at one place if nodes have these dstates."""
