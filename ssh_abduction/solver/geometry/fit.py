@@ -23,10 +23,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Sequence
+from contextlib import suppress
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.sparse.linalg import splu
@@ -55,6 +57,8 @@ SWEEPS, HELD = 20, 1e-2
 # a weight that keeps poses in place if no equation determines them.
 LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-12, 1e8, 100, 1e-10, 1e-4
 HELD_STILL = 1e-9
+# With at most this many unknowns, compute an inverse from a dense matrix.
+DENSE_INVERSE = 3000
 # The share of the diagonal that least squares add to it, far above the rounding errors.
 DAMPING = 1e-10
 
@@ -461,7 +465,27 @@ def inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
     for name in np.unique(block[rows]):
         look_at_clock()
         own, wanted = np.flatnonzero(block == name), np.flatnonzero(block[rows] == name)
-        columns = (own[:, None] == rows[wanted]).astype(float)
-        solved = system_solved(square[own][:, own], added[own], columns)
-        found[np.ix_(wanted, wanted)] = solved[np.searchsorted(own, rows[wanted])]
+        part = square[own][:, own]
+        found[np.ix_(wanted, wanted)] = _block_inverse(
+            part, added[own], np.searchsorted(own, rows[wanted])
+        )
+    return found
+
+
+def _block_inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
+    """Compute the same as `inverse` at once."""
+    if square.shape[0] <= DENSE_INVERSE:
+        # If these rows come last, the wanted part of the inverse depends only on the last block of
+        # the Cholesky factor.
+        order = np.concatenate([np.setdiff1d(np.arange(len(added)), rows), rows])
+        with suppress(np.linalg.LinAlgError):
+            whole = square.toarray() + np.diag(added)
+            factor = np.linalg.cholesky(whole[np.ix_(order, order)])
+            first = len(order) - len(rows)
+            root = solve_triangular(factor[first:, first:], np.identity(len(rows)), lower=True)
+            part: Array = root.T @ root
+            return part
+    columns = np.zeros((len(added), len(rows)))
+    columns[rows, np.arange(len(rows))] = 1.0
+    found: Array = system_solved(square, added, columns)[rows]
     return found
