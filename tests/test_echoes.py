@@ -146,7 +146,7 @@ def test_invalid_reach_becomes_the_largest_range(drive: tuple[Scan, ...]) -> Non
 
 
 @pytest.mark.parametrize("value", [0.0, math.nan, -1.0, 0.05])
-def test_zeros_beside_long_beams_are_free(drive: tuple[Scan, ...], value: float) -> None:
+def test_zeros_where_no_walls_are_seen_are_free(drive: tuple[Scan, ...], value: float) -> None:
     scans, notes = interpret_log(written(drive, constant(value), nearest=0.1), LaserOptions())
     assert re.search(r"\d+ % of the beams are .*nothing came back.*--set zero_is=unknown", notes[0])
     for scan, true in zip(scans, drive, strict=True):
@@ -163,6 +163,20 @@ def test_zeros_at_random_are_unknown(drive: tuple[Scan, ...], value: float) -> N
     (note,) = (note for note in notes if "of the beams are" in note)
     assert re.search(r"\d+ % of the beams are .*nothing is known there.*--set zero_is=free", note)
     assert all(np.isnan(scan.ranges).any() for scan in scans)
+
+
+def test_zeros_at_far_walls_are_unknown(drive: tuple[Scan, ...]) -> None:
+    """A weak laser often fails at walls beyond 4 m. The beams beside its zeros are long, too."""
+    rng = np.random.default_rng(1)
+
+    def fails(ranges: Array, _: Array) -> Array:
+        return np.where((ranges > 4) & (rng.random(len(ranges)) < 0.6), 0.0, ranges)
+
+    logged = written(drive, fails, 30.0)
+    scans, notes = interpret_log(logged, LaserOptions())
+    assert any(re.search(r"beams are 0\. .*nothing is known there", note) for note in notes)
+    zeros = [scan.ranges[raw.ranges == 0] for scan, raw in zip(scans, logged, strict=True)]
+    assert np.isnan(np.concatenate(zeros)).all()
 
 
 @pytest.mark.parametrize("meaning", MEANINGS)

@@ -5,8 +5,8 @@ constant below it, 0, or NaN. A log rarely says which. So the whole log is surve
 
 - If a range repeats at many poses, and hardly any range is longer, it is no wall. It means that
   nothing came back.
-- If the neighbours of beams with 0 or NaN are long, such a beam means that nothing came back. If
-  the neighbours have usual lengths, the laser failed there, and nothing is known.
+- If beams with 0 or NaN point where scans from nearby see no walls, nothing came back. If they
+  point at walls nearly as often as other beams, the laser failed there, and nothing is known.
 
 Notes say what was found. `LaserOptions` holds what the user says instead.
 """
@@ -30,6 +30,7 @@ from ssh_abduction.data.odometry import Pose, displacement_between
 from ssh_abduction.data.words import counted, first_few
 
 _Key = tuple[float, float, Pose]
+_Pair = tuple[Scan, Scan]
 Bools = NDArray[np.bool_]
 
 # Meaning of a beam without a measurement: nothing is near, or nothing is known.
@@ -56,9 +57,13 @@ NEARLY_ALL, SPIKE = 0.9, 10
 ROBOT, SAME_RANGE, LEAST_POSES = 0.6, 0.03, 30
 # A kind of beam without a measurement is worth a note if it has at least this share of all beams.
 WORTH_A_NOTE = 0.01
-# If beams met nothing, the beams beside them are long: longer than this share of all beams. If
-# beams failed at random, the beams beside them are longer than about half of all.
-LONG = 0.8
+# Beams met nothing if scans from nearby see walls in their directions less often than this share of
+# what chance would give. It was 0.003 in a log where zeros mean that nothing came back, and 0.3 in
+# one where the laser failed.
+BY_CHANCE = 0.1
+# Scans are near if the robot moved at most NEARBY metres and radians between them. Walls at up to
+# the share INSIDE of the largest range count, as both scans must reach them.
+NEARBY, INSIDE = (1.0, 0.6), 0.8
 
 
 @dataclass(frozen=True)
@@ -196,7 +201,8 @@ def interpreter_of(
         )
         surveyed = [_without_robot(scan, robot) for scan in surveyed]
         notes += seen
-        meanings[key], said = _survey(surveyed, options, robot)
+        pairs = [(kept[i], kept[i + 1]) for i in some if i + 1 < len(kept)]
+        meanings[key], said = _survey(surveyed, pairs, options, robot)
         notes += said
 
     def interpret(scan: Scan) -> Scan:
@@ -300,9 +306,9 @@ def _robot_in(scans: Sequence[Scan]) -> tuple[Array, list[str]]:
 
 
 def _survey(
-    scans: Sequence[Scan], options: LaserOptions, robot: Array
+    scans: Sequence[Scan], pairs: Sequence[_Pair], options: LaserOptions, robot: Array
 ) -> tuple[Meaning, list[str]]:
-    """Find out what the ranges of one laser mean."""
+    """Find out what the ranges of one laser mean. `pairs` are scans that follow each other."""
     laser, notes = scans[0].laser, list[str]()
     reach = options.reach(laser.reach)
     if options.no_return is None and (repeated := _repeated(scans)) is not None:
@@ -331,7 +337,7 @@ def _survey(
             )
     if options.zero_is is not None:
         return Meaning(reach, robot, options.free), notes
-    free, said = _without_measurement(scans, reach)
+    free, said = _without_measurement(scans, pairs, reach)
     return Meaning(reach, robot, free), notes + said
 
 
@@ -367,53 +373,70 @@ def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
     return None
 
 
-def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset[str], list[str]]:
+def _without_measurement(
+    scans: Sequence[Scan], pairs: Sequence[_Pair], reach: float
+) -> tuple[frozenset[str], list[str]]:
     """Find the kinds of beams without a measurement that mean "nothing came back"."""
-    counts = dict.fromkeys(KINDS, 0)
-    beside: dict[str, list[Array]] = {kind: [] for kind in KINDS}
-    lengths: list[Array] = []
-    for scan in scans:
-        with np.errstate(invalid="ignore"):
-            good = np.flatnonzero(scan.ranges > max(scan.laser.nearest, 0.0))
-        ranges = np.minimum(scan.ranges[good], reach)
-        lengths.append(ranges[ranges < reach])
-        for kind, is_of_kind in _kinds(scan).items():
-            counts[kind] += int(is_of_kind.sum())
-            if len(good) and is_of_kind.any():
-                # The longer of the next measured beams on both sides.
-                after = np.searchsorted(good, np.flatnonzero(is_of_kind))
-                before, behind = np.maximum(after - 1, 0), np.minimum(after, len(good) - 1)
-                beside[kind].append(np.maximum(ranges[before], ranges[behind]))
-    everything = np.concatenate(lengths)
-    usual = float(np.median(everything)) if len(everything) else 0.0
     beams = sum(len(scan.ranges) for scan in scans)
+    masks = [_kinds(scan) for scan in scans]
+    with np.errstate(invalid="ignore"):
+        found = [
+            s.ranges[(s.ranges > max(s.laser.nearest, 0.0)) & (s.ranges < reach)] for s in scans
+        ]
+    farthest = max((float(ranges.max()) for ranges in found if len(ranges)), default=0.0)
     free: set[str] = set()
     notes: list[str] = []
-    for kind, count in counts.items():
+    for kind in KINDS:
+        count = sum(int(of_kind[kind].sum()) for of_kind in masks)
         if count < WORTH_A_NOTE * beams:
             continue
-        if not len(everything):
+        if not farthest:
             notes.append(
                 f"{_percent(count / beams)} of the beams are {kind}, and no beam measured "
                 "anything. Look at the laser and its driver."
             )
             continue
-        typical = float(np.median(np.concatenate(beside[kind]))) if beside[kind] else 0.0
-        is_free = math.isfinite(reach) and float((everything < typical).mean()) >= LONG
+        walls = _walls_there(pairs, kind, INSIDE * farthest) if math.isfinite(reach) else None
+        is_free = walls is not None and walls < BY_CHANCE
         free |= {kind} if is_free else set()
         taken, other = (
             ("nothing came back", "unknown") if is_free else ("nothing is known there", "free")
         )
-        sides = (
-            f"The beams beside them are {typical:.2g} m long, where {usual:.2g} m is usual"
-            if typical
-            else "Most of their scans measured nothing at all"
+        shown = (
+            "No scan from nearby shows whether walls are there"
+            if walls is None
+            else f"Scans from nearby see walls there {walls:.2g} times as often as elsewhere"
         )
         notes.append(
-            f"{_percent(count / beams)} of the beams are {kind}. {sides}. So they are taken "
+            f"{_percent(count / beams)} of the beams are {kind}. {shown}. So they are taken "
             f"to mean that {taken}. If that is wrong, say --set zero_is={other}."
         )
     return frozenset(free), notes
+
+
+def _walls_there(pairs: Sequence[_Pair], kind: str, most: float) -> float | None:
+    """Return how often beams of a kind point at walls that the next scan sees, relative to chance.
+
+    Walls count up to `most` metres. None if no two scans are near each other, or see walls.
+    """
+    walls = hits = of_kind = beams = 0
+    for scan, then in pairs:
+        dx, dy, turned = displacement_between(scan.odometry, then.odometry)
+        if math.hypot(dx, dy) > NEARBY[0] or abs(turned) > NEARBY[1]:
+            continue
+        with np.errstate(invalid="ignore"):
+            seen = (then.ranges > max(then.laser.nearest, ROBOT)) & (then.ranges < most)
+        x, y, facing = then.laser.mount
+        points = x + 1j * y + then.ranges[seen] * np.exp(1j * (then.laser.bearings[seen] + facing))
+        x, y, facing = scan.laser.mount
+        points = dx + 1j * dy + np.exp(1j * turned) * points - (x + 1j * y)
+        step, found = scan.laser.step, _kinds(scan)[kind]
+        off = np.angle(points * np.exp(-1j * facing)) - scan.laser.first
+        beam = np.round(off / step).astype(int) % round(math.tau / abs(step))
+        beam = beam[(beam < len(found)) & (np.abs(points) < most)]
+        walls, hits = walls + len(beam), hits + int(found[beam].sum())
+        of_kind, beams = of_kind + int(found.sum()), beams + len(found)
+    return hits / walls / (of_kind / beams) if walls and of_kind else None
 
 
 def _percent(share: float) -> str:
