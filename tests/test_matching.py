@@ -229,3 +229,21 @@ def test_visit_is_matched_with_a_limited_number_of_earlier_ones(
     found = find_closures(track, visits, patches, 2 * WINDOW)
     assert len(asked) == len(set(map(id, asked))) <= len(visits)
     assert {closing.last for closing in found} == {closing.last for closing in every}
+
+
+@pytest.mark.parametrize(("points", "turned"), [(20, 0.0), (300, -45.0)])
+def test_few_points_do_not_outweigh_the_odometer(points: int, turned: float) -> None:
+    """The scan shows a wall 45 degrees to the left of one that looks the same."""
+
+    def wall(bearing: float) -> Surfaces:
+        ahead = Surfaces(
+            np.stack([np.full(points, 3.0), np.linspace(-1, 1, points)], 1),
+            np.tile([-1.0, 0.0], (points, 1)),
+        )
+        return ahead.moved((0.0, 0.0, bearing))
+
+    onward = (0.2, 0.0, 0.0)
+    scan = Scan(np.ones(1), LaserScanner(0.0, 0.1, 1, 10.0), onward)
+    motion = ScanMotion(scan, wall(math.pi / 4), [wall(0.0)], (0.0, 0.0, 0.0), onward, onward)
+    pose, _, _ = motion.matched(onward, odometer_covariance(onward))
+    assert math.degrees(pose[2]) == pytest.approx(turned, abs=6)

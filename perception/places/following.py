@@ -66,8 +66,10 @@ RECENT = 40
 # Largest number of points of a scan to match, evenly spread. It bounds the time for a scan.
 POINTS = 150
 # A match is poor if less than the share POOR of the points lies on walls. Then HEADINGS headings
-# are tried, because odometers miss turns, and logs miss lines.
-POOR, HEADINGS = 0.5, 24
+# are tried, because odometers miss turns, and logs miss lines. An independent point on a wall is
+# worth a nat. The points must gain more than what the odometry loses, or MISSED nats, as it misses
+# a turn once in thousands of steps.
+POOR, HEADINGS, MISSED = 0.5, 24, 8.0
 # Matching fails in at most 1.5 % of the scans of good logs.
 FAILING = 0.05
 # This many scans show whether a robot stood while its odometer stood still.
@@ -283,7 +285,9 @@ class ScanMotion:
                 best = max(
                     (fit.improved(other, weight) for other in turned), key=lambda found: found[0]
                 )
-                if best[0] > 1.5 * share:
+                gain = (best[0] - share) * len(self.seen) / TOGETHER
+                before, after = (_square(at - guess, weight) for at in (pose, best[1]))
+                if gain > min((after - before) / 2, MISSED):
                     share, pose, information = best
         covariance = covariance_turned(-self.last[2], _accumulating(information, weight))
         off = pose - guess
@@ -320,6 +324,12 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
         if abs(off) > TURNED and track.shares[i] >= POOR and i not in track.cuts:
             found.append((i, off))
     return found
+
+
+def _square(off: Array, information: Array) -> float:
+    """The chi-square of a pose that is off by this much, (3,), in metres and radians."""
+    off = np.array([off[0], off[1], wrapped(float(off[2]))])
+    return float(off @ information @ off)
 
 
 def _accumulating(information: Array, prior: Array) -> Array:

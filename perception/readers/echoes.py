@@ -61,6 +61,8 @@ WORTH_A_NOTE = 0.01
 # what chance would give. It was 0.003 in a log where zeros mean that nothing came back, and 0.3 in
 # one where the laser failed.
 BY_CHANCE = 0.1
+# Fewer walls than these, by chance, show nothing.
+LEAST_WALLS = 10
 # Scans are near if the robot moved at most NEARBY metres and radians between them. Walls at up to
 # the share INSIDE of the largest range count, as both scans must reach them.
 NEARBY, INSIDE = (1.0, 0.6), 0.8
@@ -417,7 +419,7 @@ def _without_measurement(
 def _walls_there(pairs: Sequence[_Pair], kind: str, most: float) -> float | None:
     """Return how often beams of a kind point at walls that the next scan sees, relative to chance.
 
-    Walls count up to `most` metres. None if no two scans are near each other, or see walls.
+    Walls count up to `most` metres. None if too few scans are near each other, or see walls.
     """
     walls = hits = of_kind = beams = 0
     for scan, then in pairs:
@@ -436,7 +438,8 @@ def _walls_there(pairs: Sequence[_Pair], kind: str, most: float) -> float | None
         beam = beam[(beam < len(found)) & (np.abs(points) < most)]
         walls, hits = walls + len(beam), hits + int(found[beam].sum())
         of_kind, beams = of_kind + int(found.sum()), beams + len(found)
-    return hits / walls / (of_kind / beams) if walls and of_kind else None
+    by_chance = walls * of_kind / beams if beams else 0.0
+    return hits / by_chance if by_chance >= LEAST_WALLS else None
 
 
 def _percent(share: float) -> str:
