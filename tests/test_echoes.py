@@ -179,6 +179,18 @@ def test_zeros_at_far_walls_are_unknown(drive: tuple[Scan, ...]) -> None:
     assert np.isnan(np.concatenate(zeros)).all()
 
 
+def test_zeros_of_a_blind_sector_are_unknown(drive: tuple[Scan, ...]) -> None:
+    """Where a mast hides all walls, no scan from nearby sees one either."""
+
+    def blind(ranges: Array, _: Array) -> Array:
+        ranges[80:110] = 0.0
+        return ranges
+
+    scans, notes = interpret_log(written(drive, blind, 30.0), LaserOptions())
+    assert any("of the beams are 0. No scan from nearby shows" in note for note in notes)
+    assert np.isnan(np.stack([scan.ranges[80:110] for scan in scans])).all()
+
+
 @pytest.mark.parametrize("meaning", MEANINGS)
 def test_zero_is_setting_is_obeyed_without_a_note(drive: tuple[Scan, ...], meaning: str) -> None:
     told = LaserOptions(zero_is=meaning, no_return=11.0)

@@ -422,9 +422,14 @@ def _walls_there(pairs: Sequence[_Pair], kind: str, most: float) -> float | None
     Walls count up to `most` metres. None if too few scans are near each other, or see walls.
     """
     walls = hits = of_kind = beams = 0
-    for scan, then in pairs:
+    masks = [_kinds(scan)[kind] for scan, _ in pairs]
+    alike = [mask for mask in masks if len(mask) == len(masks[0])]
+    # A beam that nearly never measures, as behind a mast, meets no wall that the next scan sees.
+    works = np.mean(alike, axis=0) < NEARLY_ALL if alike else np.zeros(0, bool)
+    for (scan, then), mask in zip(pairs, masks, strict=True):
         dx, dy, turned = displacement_between(scan.odometry, then.odometry)
-        if math.hypot(dx, dy) > NEARBY[0] or abs(turned) > NEARBY[1]:
+        is_near = math.hypot(dx, dy) <= NEARBY[0] and abs(turned) <= NEARBY[1]
+        if not is_near or len(mask) != len(works):
             continue
         with np.errstate(invalid="ignore"):
             seen = (then.ranges > max(then.laser.nearest, ROBOT)) & (then.ranges < most)
@@ -432,12 +437,13 @@ def _walls_there(pairs: Sequence[_Pair], kind: str, most: float) -> float | None
         points = x + 1j * y + then.ranges[seen] * np.exp(1j * (then.laser.bearings[seen] + facing))
         x, y, facing = scan.laser.mount
         points = dx + 1j * dy + np.exp(1j * turned) * points - (x + 1j * y)
-        step, found = scan.laser.step, _kinds(scan)[kind]
         off = np.angle(points * np.exp(-1j * facing)) - scan.laser.first
-        beam = np.round(off / step).astype(int) % round(math.tau / abs(step))
-        beam = beam[(beam < len(found)) & (np.abs(points) < most)]
-        walls, hits = walls + len(beam), hits + int(found[beam].sum())
-        of_kind, beams = of_kind + int(found.sum()), beams + len(found)
+        beam = np.round(off / scan.laser.step).astype(int)
+        beam %= round(math.tau / abs(scan.laser.step))
+        beam = beam[(beam < len(mask)) & (np.abs(points) < most)]
+        beam = beam[works[beam]]
+        walls, hits = walls + len(beam), hits + int(mask[beam].sum())
+        of_kind, beams = of_kind + int(mask[works].sum()), beams + int(works.sum())
     by_chance = walls * of_kind / beams if beams else 0.0
     return hits / by_chance if by_chance >= LEAST_WALLS else None
 
