@@ -115,8 +115,8 @@ READING: Rows = {
     ),
     f"--set zero_is {{{','.join(MEANINGS)}}}": (
         "how to read ranges that are NaN, at most 0, or below the laser's minimum: free means "
-        "that the beam hit nothing, unknown that nothing is known (default: free if the "
-        "neighbouring beams are long, else unknown)"
+        "that the beam hit nothing, unknown that nothing is known (default: free if "
+        "scans from nearby see hardly any walls there, else unknown)"
     ),
     "--set nearest METRES": (
         "a range of at most this length shows the robot itself, and is unknown; 0 if none does "
