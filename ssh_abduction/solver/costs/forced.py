@@ -223,9 +223,7 @@ class _Joined:
             ((b, action, arrives), (a, out)) for a, out, action, arrives, b in links
         )
         self._ways = gathered((b, (action, arrives)) for b, action, arrives in self._into)
-        nodes, self._node_of = np.unique(
-            np.column_stack([of[visits.visit], visits.direction]), axis=0, return_inverse=True
-        )
+        nodes = np.unique(np.column_stack([of[visits.visit], visits.direction]), axis=0)
         a, x = nodes.T
         self._node = {(a, x): node for node, (a, x) in enumerate(nodes.tolist())}
         apart = self.apart[(x - x[:, None]) % self._turns, a[:, None], a]
