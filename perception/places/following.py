@@ -32,6 +32,7 @@ from perception.places.track import (
     Array,
     Track,
     covariance_turned,
+    errors_of,
     odometer_covariance,
     points_moved,
     points_turned,
@@ -286,14 +287,14 @@ class ScanMotion:
                     (fit.improved(other, weight) for other in turned), key=lambda found: found[0]
                 )
                 gain = (best[0] - share) * len(self.seen) / TOGETHER
-                before, after = (_square(at - guess, weight) for at in (pose, best[1]))
+                before, after = (_square(at, guess, weight) for at in (pose, best[1]))
                 if gain > min((after - before) / 2, MISSED):
                     share, pose, information = best
         covariance = covariance_turned(-self.last[2], _accumulating(information, weight))
-        off = pose - guess
-        astray = np.array([*points_turned(-self.last[2], off[:2]), wrapped(float(off[2]))])
-        if share < CLEAR and astray @ np.linalg.solve(prior, astray) > CONTRARY:
-            covariance += np.diag(astray**2)
+        if share < CLEAR and _square(pose, guess, weight) > CONTRARY:
+            off = errors_of(pose, guess)
+            off[:2] = points_turned(-self.last[2], off[:2])
+            covariance += np.diag(off**2)
         return (float(pose[0]), float(pose[1]), wrapped(float(pose[2]))), covariance, share
 
     def _without_odometry(self) -> Followed | None:
@@ -326,9 +327,9 @@ def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
     return found
 
 
-def _square(off: Array, information: Array) -> float:
-    """The chi-square of a pose that is off by this much, (3,), in metres and radians."""
-    off = np.array([off[0], off[1], wrapped(float(off[2]))])
+def _square(pose: Array, guess: Array, information: Array) -> float:
+    """The chi-square of a pose, (3,), by a guess with this inverse covariance, (3, 3)."""
+    off = errors_of(pose, guess)
     return float(off @ information @ off)
 
 

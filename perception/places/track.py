@@ -130,7 +130,7 @@ def seen_from(first: Array, last: Array) -> Array:
 
 
 def errors_of(poses: Array, matches: Array) -> Array:
-    """Subtract poses found by matching from poses of the track: (..., 3) metres and radians."""
+    """Subtract poses, (..., 3): metres and radians. Headings differ by at most half a turn."""
     off = poses - matches
     off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
     return off

@@ -171,6 +171,8 @@ def same_frame(frames: Frames, name: str) -> str:
     A prefix is added, removed or changed if the transforms do not know the name, and only one of
     their frames has this name without its prefix.
     """
+    if name in frames:
+        return name
     known = {*frames, *(parent for parents in frames.values() for parent in parents)}
     if name in known:
         return name

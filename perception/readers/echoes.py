@@ -30,7 +30,6 @@ from ssh_abduction.data.odometry import Pose, displacement_between
 from ssh_abduction.data.words import counted, first_few
 
 _Key = tuple[float, float, Pose]
-_Pair = tuple[Scan, Scan]
 Bools = NDArray[np.bool_]
 
 # Meaning of a beam without a measurement: nothing is near, or nothing is known.
@@ -203,8 +202,8 @@ def interpreter_of(
         )
         surveyed = [_without_robot(scan, robot) for scan in surveyed]
         notes += seen
-        pairs = [(kept[i], kept[i + 1]) for i in some if i + 1 < len(kept)]
-        meanings[key], said = _survey(surveyed, pairs, options, robot)
+        after = [kept[i + 1] for i in some if i + 1 < len(kept)]
+        meanings[key], said = _survey(surveyed, after, options, robot)
         notes += said
 
     def interpret(scan: Scan) -> Scan:
@@ -308,9 +307,9 @@ def _robot_in(scans: Sequence[Scan]) -> tuple[Array, list[str]]:
 
 
 def _survey(
-    scans: Sequence[Scan], pairs: Sequence[_Pair], options: LaserOptions, robot: Array
+    scans: Sequence[Scan], after: Sequence[Scan], options: LaserOptions, robot: Array
 ) -> tuple[Meaning, list[str]]:
-    """Find out what the ranges of one laser mean. `pairs` are scans that follow each other."""
+    """Find out what the ranges of one laser mean. `after` has those that follow."""
     laser, notes = scans[0].laser, list[str]()
     reach = options.reach(laser.reach)
     if options.no_return is None and (repeated := _repeated(scans)) is not None:
@@ -339,7 +338,7 @@ def _survey(
             )
     if options.zero_is is not None:
         return Meaning(reach, robot, options.free), notes
-    free, said = _without_measurement(scans, pairs, reach)
+    free, said = _without_measurement(scans, after, reach)
     return Meaning(reach, robot, free), notes + said
 
 
@@ -376,7 +375,7 @@ def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
 
 
 def _without_measurement(
-    scans: Sequence[Scan], pairs: Sequence[_Pair], reach: float
+    scans: Sequence[Scan], after: Sequence[Scan], reach: float
 ) -> tuple[frozenset[str], list[str]]:
     """Find the kinds of beams without a measurement that mean "nothing came back"."""
     beams = sum(len(scan.ranges) for scan in scans)
@@ -398,7 +397,10 @@ def _without_measurement(
                 "anything. Look at the laser and its driver."
             )
             continue
-        walls = _walls_there(pairs, kind, INSIDE * farthest) if math.isfinite(reach) else None
+        walls = None
+        if math.isfinite(reach):
+            pairs = [*zip(scans, after, (of_kind[kind] for of_kind in masks), strict=False)]
+            walls = _walls_there(pairs, INSIDE * farthest)
         is_free = walls is not None and walls < BY_CHANCE
         free |= {kind} if is_free else set()
         taken, other = (
@@ -416,17 +418,17 @@ def _without_measurement(
     return frozenset(free), notes
 
 
-def _walls_there(pairs: Sequence[_Pair], kind: str, most: float) -> float | None:
+def _walls_there(pairs: Sequence[tuple[Scan, Scan, Bools]], most: float) -> float | None:
     """Return how often beams of a kind point at walls that the next scan sees, relative to chance.
 
-    Walls count up to `most` metres. None if too few scans are near each other, or see walls.
+    Each pair is a scan, the next one, and the mask of the beams of the kind in the first. Walls
+    count up to `most` metres. None if too few scans are near each other, or see walls.
     """
     walls = hits = of_kind = beams = 0
-    masks = [_kinds(scan)[kind] for scan, _ in pairs]
-    alike = [mask for mask in masks if len(mask) == len(masks[0])]
+    alike = [mask for *_, mask in pairs if len(mask) == len(pairs[0][2])]
     # A beam that nearly never measures, as behind a mast, meets no wall that the next scan sees.
     works = np.mean(alike, axis=0) < NEARLY_ALL if alike else np.zeros(0, bool)
-    for (scan, then), mask in zip(pairs, masks, strict=True):
+    for scan, then, mask in pairs:
         dx, dy, turned = displacement_between(scan.odometry, then.odometry)
         is_near = math.hypot(dx, dy) <= NEARBY[0] and abs(turned) <= NEARBY[1]
         if not is_near or len(mask) != len(works):
