@@ -21,6 +21,7 @@ import numpy as np
 from arguments import seeds_from
 from doubts import DOUBTS, spoilt, with_images
 from numpy.typing import NDArray
+from paper_experiments import one_to_one, true_dstates
 
 from perception.errors import PerceptionError
 from perception.images import images_of
@@ -29,7 +30,6 @@ from perception.views import ViewClusterer
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.paper_experiments import one_to_one, true_dstates
 from ssh_abduction.learning.learner import BootstrapLearner, LearnerError
 from ssh_abduction.learning.traces import Traces
 from ssh_abduction.theory.theory import Theory

@@ -20,6 +20,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from arguments import seeds_from
 from numpy.typing import NDArray
+from paper_experiments import (
+    VIEWS_ALONE,
+    notched,
+    one_to_one,
+    true_dstates,
+)
 
 from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning, PerceptionError
@@ -30,12 +36,6 @@ from simulator.robot import Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.paper_experiments import (
-    VIEWS_ALONE,
-    notched,
-    one_to_one,
-    true_dstates,
-)
 from ssh_abduction.learning.learner import (
     AmbiguousMapWarning,
     BootstrapLearner,

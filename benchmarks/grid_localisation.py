@@ -45,13 +45,13 @@ from grid_filter import BeamModel, Filter, Grid, Histogram, Particles
 from grid_worlds import Scene, boxes, comb, maze, rectangle, ring, taylor_hall
 from localisation import first, in_front, spliced
 from numpy.typing import NDArray
+from paper_experiments import one_to_one
 
 from perception.appearance import ReciprocalTransformer
 from perception.images import images_of
 from perception.views import ViewClusterer
 from simulator.world import World
 from ssh_abduction import Localiser, Trace
-from ssh_abduction.evaluation.paper_experiments import one_to_one
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.online.localiser import LOCATED, Chances
 

@@ -28,6 +28,7 @@ import numpy as np
 import streets
 from arguments import seeds_from
 from numpy.typing import NDArray
+from paper_experiments import VIEWS_ALONE, one_to_one, true_dstates
 from scipy.optimize import linear_sum_assignment
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.cluster import HDBSCAN, AgglomerativeClustering, SpectralClustering
@@ -45,7 +46,6 @@ from simulator.panorama import Camera, Paint
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.paper_experiments import VIEWS_ALONE, one_to_one, true_dstates
 from ssh_abduction.learning.learner import (
     AmbiguousMapWarning,
     BootstrapLearner,

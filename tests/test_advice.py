@@ -40,7 +40,6 @@ SAID_BY = {
     "ssh_abduction/cli/mapping.py": ("map",),
     "ssh_abduction/cli/shared.py": (*WITH_MAP, *WITH_THEORY),
     "ssh_abduction/cli/text.py": ("solve",),
-    "ssh_abduction/evaluation/paper_report.py": ("reproduce",),
     "ssh_abduction/evaluation": ("evaluate",),
     "ssh_abduction/solver/entry.py": ("solve",),
     "ssh_abduction/robot_logs/log_maps.py": ("map",),
@@ -63,7 +62,7 @@ SEVERAL = {
     "ssh_abduction/cli/judge.py": ("check", "explain"),
     "ssh_abduction/cli/learn.py": ("cluster", "train", "learning-curve", "tell-apart", "recognise"),
     "ssh_abduction/cli/use.py": ("localise", "route", "show", "export", "view"),
-    "ssh_abduction/cli/simulate.py": ("simulate", "reproduce", "examples"),
+    "ssh_abduction/cli/simulate.py": ("simulate", "examples"),
 }
 OPTION = re.compile(r"(?:(?<![\w-])(\w[\w-]*) (?:with )?)?(?<![\w-])(--set [a-z_]+|--[a-z][a-z-]*)")
 FOREIGN = re.compile(

@@ -561,10 +561,9 @@ def test_wrong_usage_names_the_wrong_option(
 def test_error_messages_say_how_to_mend_the_input(
     tmp_path: Path, refuses: Callable[..., None], solved: Path
 ) -> None:
-    many, none, taken = tmp_path / "many.jsonl", tmp_path / "none.json", tmp_path / "taken"
+    many, none = tmp_path / "many.jsonl", tmp_path / "none.json"
     many.write_text("{}\n{}\n")
     none.write_text('{"maps": []}')
-    taken.touch()
     for words, message in [
         (
             ["show", str(many)],
@@ -579,14 +578,6 @@ def test_error_messages_say_how_to_mend_the_input(
         (
             ["train", str(solved), ACES, "--map", "5", "-o", "x"],
             "expected the number of a map, 1 to 4, or its id, got '5'",
-        ),
-        (
-            ["reproduce", "notched-rectangle", "--jobs", "0"],
-            "--jobs: expected a number of processes",
-        ),
-        (
-            ["reproduce", "notched-rectangle", "--seeds", "0", "--jobs", "1", "-o", str(taken)],
-            "File exists; take another name",
         ),
     ]:
         refuses(words, message)

@@ -13,7 +13,6 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -133,7 +132,6 @@ def test_closed_pipe_and_circular_link_are_errors(
         "simulate notched-rectangle",
         "cluster x",
         "train x y",
-        "reproduce notched-rectangle --seeds 0",
         "learning-curve x y --plot",
     ],
 )
@@ -232,7 +230,6 @@ def test_missing_matplotlib_is_an_error_before_the_work(
     for words in (
         [*learnt, "--plot", str(never / "x.png")],
         ["cluster", learnt[1], "-o", str(never), "--plot", str(never / "x.png")],
-        ["reproduce", "notched-rectangle", "-o", str(never)],
     ):
         assert main(words) == 1
         captured = capsys.readouterr()
@@ -257,41 +254,6 @@ def test_failed_picture_loses_no_other_output(
     assert main(["cluster", learnt[2], "--k", "2", "-o", str(clustered), *plot]) == 1
     assert Trace.load(clustered)
     assert "chosen" in capsys.readouterr().out
-
-
-def test_reproduce_writes_its_data_before_it_draws(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from ssh_abduction.evaluation import paper_report as report
-
-    def fails(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(report, "_each", lambda *_: iter([SimpleNamespace(seed=0)]))
-    monkeypatch.setattr(report, "asdict", lambda run: {"seed": getattr(run, "seed", 0)})
-    monkeypatch.setattr(
-        report,
-        "summary",
-        lambda *_: [
-            {"claim": "c", "ours": False, "paper": "p", "here": {"0": "x"}, "holds": 1, "seeds": 1}
-        ],
-    )
-    monkeypatch.setattr(report, "_draw", fails)
-    assert (
-        main(["reproduce", "taylor-hall", "--seeds", "0", "--jobs", "1", "-o", str(tmp_path)]) == 1
-    )
-    captured = capsys.readouterr()
-    assert "1 of 1" in captured.out
-    assert (
-        captured.err
-        == f"ssh-abduction: {tmp_path}: cannot be written: No space left on device; make room\n"
-    )
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "claims.json",
-        "runs.json",
-        "configuration.json",
-        "report.html",
-    }
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals")

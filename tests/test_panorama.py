@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from paper_experiments import VIEWS_ALONE, one_to_one, true_dstates
 from sklearn.cluster import AgglomerativeClustering
 from sklearn.preprocessing import FunctionTransformer
 
@@ -26,7 +27,6 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.cli import main
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.paper_experiments import VIEWS_ALONE, one_to_one, true_dstates
 from ssh_abduction.learning.learner import BootstrapLearner
 
 ROOM = World.named("notched-rectangle")

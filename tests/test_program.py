@@ -18,9 +18,8 @@ from in_processes import from_here, from_there, until
 from worlds import TOURS, drive
 
 from perception.readers.writers import write_carmen
-from ssh_abduction import AbductionError, Solution, Theory, Trace
+from ssh_abduction import Solution, Theory, Trace
 from ssh_abduction.cli import main
-from ssh_abduction.evaluation import paper_report as report
 from ssh_abduction.evaluation.rungs import UnderWay
 from ssh_abduction.robot_logs.log_maps import LogMapping
 from ssh_abduction.runtime import program
@@ -206,18 +205,3 @@ list(workers.answers(leave_a_temporary_file, [(0, {str(told)!r})], 1, lambda: Fa
         parent.kill()
     until(lambda: not Path(told.read_text()).exists())
     until(lambda: list(tmp_path.iterdir()) == [told])
-
-
-@pytest.mark.slow
-def test_results_and_errors_of_processes_keep_their_order() -> None:
-    found = report._each(divmod, [(9, i) for i in (4, 3, 2, 1, 0)], 2)
-    assert [next(found) for _ in range(4)] == [(2, 1), (3, 0), (4, 1), (9, 0)]
-    with pytest.raises(ZeroDivisionError):
-        next(found)
-    assert list(report._each(divmod, [(9, 4)], 2)) == [(2, 1)]
-
-
-@pytest.mark.slow
-def test_killed_worker_is_an_error() -> None:
-    with pytest.raises(AbductionError, match="expected an answer, got a killed process"):
-        list(report._each(os._exit, [(1,), (1,)], 2))

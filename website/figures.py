@@ -2,7 +2,7 @@
 
 They show one simulated drive and one example.
 
-python website/figures.py
+    PYTHONPATH=benchmarks python website/figures.py
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ os.environ["SOURCE_DATE_EPOCH"] = (
 
 import matplotlib
 import numpy as np
+from paper_figures import draw_views, draw_world
 
 from perception.images import images_of
 from perception.recognition import telling_features
@@ -26,12 +27,7 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.evaluation.figures import (
-    draw_quality,
-    draw_telling,
-    draw_views,
-    draw_world,
-)
+from ssh_abduction.evaluation.figures import draw_quality, draw_telling
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output import to_svg
 

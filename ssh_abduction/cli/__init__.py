@@ -77,7 +77,6 @@ VERBS: Mapping[str, tuple[Verb, ...]] = {
     ),
     "make: simulated robots and the paper's experiments": (
         simulate.run_simulate,
-        simulate.run_reproduce,
         simulate.run_examples,
     ),
     "about: the axioms, their input, and your shell": (

@@ -278,12 +278,12 @@ def refuse(options: argparse.Namespace, beside: str, *names: str) -> None:
             )
 
 
-def check_jobs(jobs: int | None, things: str, default: int = 1) -> None:
+def check_jobs(jobs: int | None, things: str) -> None:
     """Raise AbductionError if the option --jobs is 0."""
     if jobs == 0:
         raise AbductionError(
             f"--jobs: expected a number of {things}, or -1 for one per core, got 0; leave it out "
-            f"for {default}"
+            "for 1"
         )
 
 

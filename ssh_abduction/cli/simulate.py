@@ -1,4 +1,4 @@
-"""ssh-abduction simulate, reproduce and examples: simulated robots and the paper's experiments."""
+"""ssh-abduction simulate and examples: simulated robots, and the examples of the package."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import simulator
-from ssh_abduction.cli.outcome import progress_bar
 from ssh_abduction.cli.parsing import verb
-from ssh_abduction.cli.shared import OUTPUT_TRACE, check_jobs, write_trace
-from ssh_abduction.cli.text import counted, table
-from ssh_abduction.data.errors import AbductionError, brief, named, printable
+from ssh_abduction.cli.shared import OUTPUT_TRACE, write_trace
+from ssh_abduction.cli.text import counted
+from ssh_abduction.data.errors import AbductionError, named, printable
 from ssh_abduction.data.files import save_file, shipped, write_file
 from ssh_abduction.data.trace import Trace
 
@@ -219,81 +218,6 @@ def _with_table(trace: Trace, target: str) -> Trace:
     save_images(path, images_of(trace))
     steps = tuple(replace(step, image=i) for i, step in enumerate(trace.steps))
     return replace(trace, steps=steps, images=path.name)
-
-
-# Each seed takes seconds. More than this many seeds are a typing error, and would fill the memory.
-MOST_SEEDS = 10_000
-
-
-@verb(
-    {
-        "experiment {notched-rectangle,taylor-hall}": "which experiment of the paper to repeat",
-        "--seeds SEEDS=0-19": "random seeds, such as 0-19 or 1,5,7",
-        "--json": "print each claim, with the paper's value and ours for each seed, as JSON",
-        "--jobs N=2": "the number of processes; -1 for one per core",
-        "--set outcomes true|false=true": (
-            "for notched-rectangle, whether to try other depths of the notch and other spreads of "
-            "the robot's poses, too"
-        ),
-        "-o --output FOLDER": "folder to write (default: out/EXPERIMENT)",
-    }
-)
-def run_reproduce(options: argparse.Namespace) -> int:
-    """Run the paper's experiments.
-
-    Reproduce an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn. Writes
-    figures, data and a page into a folder.
-    """
-    from ssh_abduction.evaluation.paper_report import reproduce, steps
-
-    seeds, name = _seeds(options.seeds), options.experiment
-    check_jobs(options.jobs, "processes", default=2)
-    folder = Path(options.output or f"out/{name}")
-    with progress_bar() as progress:
-        task = progress.add_task(name, total=steps(name, seeds, options.outcomes))
-
-        def done(what: str) -> None:
-            progress.update(task, advance=1, description=f"{name}: {what}")
-
-        def show(rows: list[dict[str, Any]]) -> None:
-            progress.stop()  # or the bar would be drawn into the table
-            _print(options, rows)
-            progress.start()
-
-        shown: dict[str, Any] = {"on_done": done, "on_table": show}
-        reproduce(name, seeds, folder, options.jobs, options.outcomes, **shown)
-    if not options.json:
-        print(f"\nThe page with the figures is {named(folder / 'report.html')}")
-    return 0
-
-
-def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
-    from ssh_abduction.evaluation.paper_report import claimed, spread_of
-
-    if options.json:
-        record = {"experiment": options.experiment, "claims": rows}
-        print(json.dumps(record, ensure_ascii=False, indent=1), flush=True)
-        return
-    cells = [[claimed(r), r["paper"], spread_of(r), f"{r['holds']} of {r['seeds']}"] for r in rows]
-    print(table(["claim", "paper", "here", "holds"], cells), flush=True)
-
-
-def _seeds(text: str) -> list[int]:
-    """List the seeds in a text such as "0-19" or "1,5,7". Raise AbductionError for others."""
-    try:
-        found: list[int] = []
-        for part in text.split(","):
-            first, _, last = part.partition("-")
-            numbers = range(int(first), int(last or first) + 1)
-            if not numbers or numbers[-1] >= 2**32 or len(found) + len(numbers) > MOST_SEEDS:
-                raise ValueError
-            found += numbers
-    except (ValueError, OverflowError):
-        raise AbductionError(
-            f"--seeds: expected numbers as 0-19 or 1,5,7, at most {MOST_SEEDS:,} and below "
-            f"{2**32:,}, got {brief(text)}; write fewer"
-        ) from None
-    return found
 
 
 @verb({"-o --output FOLDER=examples": "folder to write"})

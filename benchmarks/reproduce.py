@@ -1,41 +1,49 @@
-"""Write a reproduction of the paper into a folder: figures, a page, data, and the configuration."""
+"""Repeat an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn.
+
+    python benchmarks/reproduce.py notched-rectangle|taylor-hall [--seeds 0-19] [--jobs 2]
+                                   [--no-outcomes] [-o out/EXPERIMENT]
+
+The script writes a folder: a page with the table of claims and figures, each claim by seed, all
+measurements, and the configuration. For the notched rectangle, it also tries other depths of the
+notch and other spreads of the robot's poses, unless --no-outcomes is given.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import platform
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import paper_figures
+from arguments import seeds_from
 from joblib import Parallel, delayed
-from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-from perception.images import images_of
-from simulator.driver import STILL, Tolerance
-from simulator.robot import Body, Laser
-from simulator.tours import simulate
-from simulator.world import World
-from ssh_abduction.data.checks import one_of
-from ssh_abduction.data.errors import AbductionError
-from ssh_abduction.data.files import filled, write_file
-from ssh_abduction.evaluation import figures
-from ssh_abduction.evaluation.paper_experiments import (
+from paper_experiments import (
     EXPERIMENTS,
     VIEWS_ALONE,
     WITH_STARS,
-    NotchOutcome,
     SeedRun,
     measure,
     outcome,
     summary,
     true_dstates,
 )
+
+from perception.images import images_of
+from simulator.driver import STILL, Tolerance
+from simulator.robot import Body, Laser
+from simulator.tours import simulate
+from simulator.world import World
+from ssh_abduction.cli.text import table as text_table
+from ssh_abduction.data.files import filled
+from ssh_abduction.evaluation import figures
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output import to_svg
 
@@ -65,15 +73,9 @@ FIGURES = {
 
 
 def reproduce(
-    name: str,
-    seeds: Sequence[int],
-    folder: Path,
-    jobs: int = 2,
-    outcomes: bool = True,
-    on_done: Callable[[str], None] = lambda _: None,
-    on_table: Callable[[list[dict[str, Any]]], None] = lambda _: None,
+    name: str, seeds: Sequence[int], folder: Path, jobs: int = 2, outcomes: bool = True
 ) -> list[dict[str, Any]]:
-    """Run an experiment for all seeds, and write everything into a folder.
+    """Run an experiment for all seeds, write everything into a folder, and return the table.
 
     Args:
         name: The experiment: "notched-rectangle" or "taylor-hall".
@@ -82,79 +84,44 @@ def reproduce(
         jobs: The number of processes that work at once; -1 for one per processor.
         outcomes: Whether to also run other notches and other spreads of poses. This is only for the
             notched rectangle.
-        on_done: Called with a sentence after each part of the work. The function `steps` returns
-            the number of parts.
-        on_table: Called with the table once all data is written, before anything is drawn. So no
-            data is lost if a figure fails.
-
-    Raises:
-        AbductionError: There is no such experiment, no seed, or no matplotlib, or a process died.
     """
-    one_of("experiment", name, EXPERIMENTS, AbductionError)
-    if not seeds:
-        raise AbductionError("seeds: expected at least one, got none; write 0-19")
-    figures.require_matplotlib()  # now, and not after hours of work
     folder.mkdir(parents=True, exist_ok=True)
-    runs: list[SeedRun] = []
-    for run in _each(measure, [(name, seed) for seed in seeds], jobs):
-        runs.append(run)
-        on_done(f"seed {run.seed}")
+    workers = Parallel(jobs, verbose=1)
+    runs = workers(delayed(measure)(name, seed) for seed in seeds)
     # The data comes first, the pictures last.
     table = summary(name, runs)
     _dump(folder / "claims.json", table)
     _dump(folder / "runs.json", [asdict(run) for run in runs])
     _dump(folder / "configuration.json", _configuration(name, seeds, outcomes))
-    found: list[NotchOutcome] = []
     if outcomes and name == "notched-rectangle":
-        grid = [(notch, scale) for notch in NOTCHES for scale in SCALES]
-        for o in _each(outcome, grid, jobs):
-            found.append(o)
-            on_done(f"notch {100 * o.notch:g} cm, spread {1000 * o.spread:.1f} mm")
+        found = workers(delayed(outcome)(notch, scale) for notch in NOTCHES for scale in SCALES)
         _dump(folder / "outcomes.json", [asdict(o) for o in found])
-    write_file(folder / "report.html", _page(name, runs, table, folder).encode())
-    on_table(table)
-    _draw(name, runs[0], folder, on_done)
-    if found:
         depth = -float(World.named(name).segments[:, 1::2].min())
-        figures.draw_outcomes(folder / "outcomes.png", found, (depth, 1.0))
-    write_file(folder / "report.html", _page(name, runs, table, folder).encode())
+        paper_figures.draw_outcomes(folder / "outcomes.png", found, (depth, 1.0))
+    _draw(name, runs[0], folder)
+    (folder / "report.html").write_text(_page(name, runs, table, folder), encoding="utf-8")
     return table
 
 
-def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
-    """Yield the results of `work` for these tasks, in their order, from `jobs` processes."""
-    try:
-        yield from Parallel(jobs, return_as="generator")(delayed(work)(*task) for task in tasks)
-    except TerminatedWorkerError:
-        raise AbductionError(
-            "process: expected an answer, got a killed process (when memory runs out); "
-            "take fewer --jobs"
-        ) from None
-
-
-def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:
-    """Count how often `reproduce` will call `on_done` with these arguments, for a progress bar."""
-    has_outcomes = outcomes and name == "notched-rectangle"
-    return len(seeds) + 1 + (len(NOTCHES) * len(SCALES) if has_outcomes else 0)
-
-
-def _draw(name: str, run: SeedRun, folder: Path, on_done: Callable[[str], None]) -> None:
+def _draw(name: str, run: SeedRun, folder: Path) -> None:
     """Draw the figures of one run, and write its trace."""
     world = World.named(name)
     trace = simulate(world, EXPERIMENTS[name].tours, run.seed)
     trace.save(folder / "run.jsonl")
     learner = BootstrapLearner(VIEWS_ALONE).fit(trace)
-    figures.draw_world(folder / "world.png", world, [step.truth["pose"] for step in trace.steps])
-    figures.draw_views(folder / "views.png", images_of(trace), learner.views_, true_dstates(trace))
+    paper_figures.draw_world(
+        folder / "world.png", world, [step.truth["pose"] for step in trace.steps]
+    )
+    paper_figures.draw_views(
+        folder / "views.png", images_of(trace), learner.views_, true_dstates(trace)
+    )
     figures.draw_quality(folder / "quality.png", run.quality, run.uncertainty, run.k)
     figures.draw_learning(folder / "learning.png", {"labels from the map": run.curve})
-    figures.draw_spread(folder / "spread.png", run.spread)
+    paper_figures.draw_spread(folder / "spread.png", run.spread)
     # The map from the views alone, and with the openings seen.
     starred = BootstrapLearner(WITH_STARS).fit(trace)
     for file, ssh_map in (("map", learner.map_), ("map-with-openings", starred.map_)):
-        write_file(folder / f"{file}.svg", f"{to_svg(ssh_map)}\n".encode())
-        figures.draw_map(folder / f"{file}.png", ssh_map)
-    on_done("figures")
+        (folder / f"{file}.svg").write_text(f"{to_svg(ssh_map)}\n", encoding="utf-8")
 
 
 def _configuration(name: str, seeds: Sequence[int], outcomes: bool) -> dict[str, Any]:
@@ -162,8 +129,8 @@ def _configuration(name: str, seeds: Sequence[int], outcomes: bool) -> dict[str,
     packages = ("ssh-abduction", "clingo", "numpy", "scipy", "scikit-learn", "networkx")
     return {
         "experiment": name,
-        "command": f"ssh-abduction reproduce {name} --seeds {','.join(map(str, seeds))}"
-        f"{'' if outcomes else ' --set outcomes=false'}",
+        "command": f"benchmarks/reproduce.py {name} --seeds {seeds[0]}-{seeds[-1]}"
+        f"{'' if outcomes else ' --no-outcomes'}",
         **asdict(EXPERIMENTS[name]),
         "seeds": list(seeds),
         "laser": asdict(Laser()),
@@ -176,11 +143,11 @@ def _configuration(name: str, seeds: Sequence[int], outcomes: bool) -> dict[str,
 
 
 def _dump(path: Path, value: Any) -> None:
-    write_file(path, f"{json.dumps(value, indent=1, ensure_ascii=False)}\n".encode())
+    path.write_text(f"{json.dumps(value, indent=1, ensure_ascii=False)}\n", encoding="utf-8")
 
 
 def _page(name: str, runs: Sequence[SeedRun], table: Sequence[dict[str, Any]], folder: Path) -> str:
-    """Write the HTML page, with the figures that are already in the folder."""
+    """Make the HTML page, with the figures that are already in the folder."""
     rows = "\n".join(
         f"<tr class='{'ours' if row['ours'] else 'paper'}'><td>{escape(claimed(row))}</td>"
         f"<td>{escape(row['paper'])}</td><td>{escape(spread_of(row))}</td>"
@@ -194,7 +161,7 @@ def _page(name: str, runs: Sequence[SeedRun], table: Sequence[dict[str, Any]], f
         if (folder / file).exists()
     )
     return filled(
-        Path(__file__).parent / "paper_report.html",
+        Path(__file__).parent / "reproduce.html",
         title=escape(World.named(name).name),
         seeds=str(len(runs)),
         first=str(runs[0].seed),
@@ -215,3 +182,22 @@ def spread_of(row: dict[str, Any]) -> str:
         return str(found[0][0])
     said = "; ".join(f"{value} (x{seeds})" for value, seeds in found[:3])
     return said + ("; …" if len(found) > 3 else "")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("experiment", choices=EXPERIMENTS)
+    parser.add_argument("--seeds", type=seeds_from, default=seeds_from("0-19"), metavar="A-B")
+    parser.add_argument("--jobs", type=int, default=2, metavar="N")
+    parser.add_argument("--no-outcomes", action="store_true")
+    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER")
+    options = parser.parse_args()
+    name, folder = options.experiment, options.output or Path("out", options.experiment)
+    rows = reproduce(name, options.seeds, folder, options.jobs, not options.no_outcomes)
+    cells = [[claimed(r), r["paper"], spread_of(r), f"{r['holds']} of {r['seeds']}"] for r in rows]
+    print(text_table(["claim", "paper", "here", "holds"], cells))
+    print(f"\nThe page with the figures is {folder / 'report.html'}")
+
+
+if __name__ == "__main__":
+    main()
