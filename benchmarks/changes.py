@@ -35,10 +35,10 @@ from pathlib import Path
 import networkx as nx
 import numpy as np
 from instances import HEADINGS, doors_of, maze
+from plan_tours import Floor, RoomPlan, Stand
 from together import joined
 from truth import NOISE, Known, is_true, with_truth
 
-from simulator.plans import Floor, Plan, Stand
 from simulator.robot import reported
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.data import Action, Odometry, Step
@@ -102,7 +102,7 @@ def _other(gateway: Gateway) -> Gateway:
     return (x + HEADINGS[way][0], y + HEADINGS[way][1]), (way + 2) % 4
 
 
-def case_of_plan(plan: Plan, steps: int, seed: int, changes: int, views: int) -> Case:
+def case_of_plan(plan: RoomPlan, steps: int, seed: int, changes: int, views: int) -> Case:
     """Make two drives through a plan. Some doors are closed on one of them.
 
     The closed doors belong to rooms that the other drive saw. The plan stays connected.
@@ -126,7 +126,9 @@ def case_of_plan(plan: Plan, steps: int, seed: int, changes: int, views: int) ->
     return Case(known, frozenset(end for end in ends if end[0] in both))
 
 
-def _closable(plan: Plan, seen: Collection[object], count: int, chance: random.Random) -> list[int]:
+def _closable(
+    plan: RoomPlan, seen: Collection[object], count: int, chance: random.Random
+) -> list[int]:
     """Choose doors of rooms that were seen, such that the plan stays connected if they are closed.
 
     No path leads straight on through such a door: a robot that comes to a closed door ahead would
@@ -150,7 +152,9 @@ def _closable(plan: Plan, seen: Collection[object], count: int, chance: random.R
     return found
 
 
-def _plan_drive(plan: Plan, steps: int, seed: tuple[int, int], closed: Collection[int]) -> Trace:
+def _plan_drive(
+    plan: RoomPlan, steps: int, seed: tuple[int, int], closed: Collection[int]
+) -> Trace:
     """Drive through a plan with some closed doors, which stars lack.
 
     The name of a turn has its angle, too.
@@ -179,7 +183,7 @@ def _plan_drive(plan: Plan, steps: int, seed: tuple[int, int], closed: Collectio
     return Trace(tuple(logged), odometry=noise)
 
 
-def _heading(plan: Plan, stand: Stand) -> float:
+def _heading(plan: RoomPlan, stand: Stand) -> float:
     gateway = plan.gateways[stand.room][stand.gateway]
     return (gateway.bearing + (0 if stand.faces else 180)) % 360
 
@@ -226,7 +230,7 @@ def _rounds(
 
 
 def _renamed(
-    action: Action, plan: Plan, stand: Stand, goal: int, closed: Collection[int]
+    action: Action, plan: RoomPlan, stand: Stand, goal: int, closed: Collection[int]
 ) -> Action:
     """A turn right or left, with its number among the open doors, and its angle in its name.
 
@@ -246,7 +250,7 @@ def _renamed(
     return Action.of({"name": name, "kind": "turn", "turn": action.turn, "gateway": number})
 
 
-def named_doors(ssh_map: SSHMap, known: Known, plan: Plan) -> Iterator[Gateway]:
+def named_doors(ssh_map: SSHMap, known: Known, plan: RoomPlan) -> Iterator[Gateway]:
     """The doors that a map says to have changed, by the true room and heading of the place."""
     plan = plan.told_apart()
     for fault in ssh_map.faults:
@@ -300,7 +304,7 @@ def main() -> None:
         true = changed = apart = found = others = none = 0
         began = time.process_time()
         seeds = range(options.first, options.first + options.seeds)
-        rows = [*product([Plan.load(path) for path in plans] or [None], seeds)]
+        rows = [*product([RoomPlan.load(path) for path in plans] or [None], seeds)]
         for plan, seed in rows:
             one = (
                 case(options.cells, options.steps, seed, changes, options.views)

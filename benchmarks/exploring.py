@@ -14,7 +14,7 @@ is halved. The explorer also says itself when it is done.
     explorer  Explorer of ssh_abduction/online/explorer.py.
     random    Any action that the robot can do, drawn uniformly.
     rule      Mazes: look around at each place, then follow the wall to the right.
-              Plans: the drive of simulator/plans.py, which knows where the robot is and
+              Plans: the drive of benchmarks/plan_tours.py, which knows where the robot is and
               goes through the door that it passed least often.
     hW        AALpy's learner without resets. Its oracle knows the truth, and only the steps of a
               shortest counterexample are counted. An impossible action costs nothing. So hW does
@@ -42,9 +42,9 @@ from typing import Any, Protocol
 
 from arguments import add_number
 from instances import HEADINGS, TURNS, doors_of
+from plan_tours import Floor, RoomPlan
 from truth import Known, is_true, share_all
 
-from simulator.plans import Floor, Plan
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.online.explorer import Explorer
@@ -137,7 +137,7 @@ class Building:
     theory, margin = Theory.causal().replace(star="alike"), 0
 
     def __init__(self, file: Path) -> None:
-        self._floor = Floor(Plan.load(file).told_apart())
+        self._floor = Floor(RoomPlan.load(file).told_apart())
         self.name, self.start = self._floor.plan.name, self._floor.start
         self.sight, self.ends = self._floor.sight, self._floor.ends
 

@@ -23,6 +23,7 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
+from plan_tours import RoomPlan, tour
 from truth import (
     NOISE,
     ROOT,
@@ -36,7 +37,6 @@ from truth import (
     worlds,
 )
 
-from simulator.plans import Plan, tour
 from ssh_abduction import SSHMap, Theory
 from ssh_abduction.data import Odometry, together
 from ssh_abduction.solver.sources.metric.beam import Beam
@@ -142,7 +142,7 @@ def report_of_guesses(traces: Iterator[Known], theory: Theory, width: int | None
 def of_plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
     """Yield joint traces of tours of floor plans, one for each plan and seed."""
     for path in sorted(folder.glob("*.xml"), key=lambda path: path.stem.lower()):
-        plan = Plan.load(path)
+        plan = RoomPlan.load(path)
         for seed in seeds:
             name = f"{plan.name}, {seed}"
             tours = [tour(plan, steps, DRIVES * seed + i, noise.odometry) for i in range(DRIVES)]

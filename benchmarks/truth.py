@@ -30,8 +30,8 @@ from pathlib import Path
 
 from arguments import add_number
 from instances import displaced, maze
+from plan_tours import RoomPlan, tour
 
-from simulator.plans import Plan, tour
 from simulator.robot import Body
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry
@@ -184,7 +184,7 @@ def with_faults(known: Known, misread: int, jumped: int, seed: int) -> Known:
 
 def plans(folder: Path, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
     for path in sorted(folder.glob("*.xml"), key=lambda path: path.stem.lower()):
-        plan = Plan.load(path)
+        plan = RoomPlan.load(path)
         for seed in seeds:
             trace = tour(plan, steps, seed, noise.odometry, scale=noise.scale, bend=noise.bend)
             yield with_truth(f"{plan.name}, {seed}", trace)

@@ -292,7 +292,7 @@ def record_plan(
 
 
 def _name(room: int) -> str:
-    """The name of a room in the truth, the same as in `plans.tour`."""
+    """The name of a room in the truth."""
     return f"room {room}"
 
 

@@ -13,11 +13,11 @@ import pytest
 import truth
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plan_tours import tour
 from strategies import theories, traces
 from test_plans import plan_of, xml
 from turns import guessed
 
-from simulator.plans import tour
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry

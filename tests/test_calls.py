@@ -147,7 +147,6 @@ RIGHT: dict[str, set[str]] = {
     "Paint.keys.walls": {"huge"},
     "Plan.rooms": EMPTY,
     "Plan.doors": EMPTY,
-    "Plan.told_apart.degrees": {"3.5"},
     "SSHMap.right_of.direction": {"-1"},
     "Speedups.that_hold_for.theory": {"None"},
     "Speedups.without.names": {"empty text", "dict", *EMPTY},

@@ -98,7 +98,6 @@ THEMES: dict[str, tuple[str, ...]] = {
         "simulator.panorama.Camera",
         "simulator.panorama.Paint",
         "simulator.plans.Plan",
-        "simulator.plans.tour",
         "perception.errors.PerceptionError",
         "simulator.errors.SimulatorError",
     ),
