@@ -34,12 +34,11 @@ from pathlib import Path
 
 import networkx as nx
 import numpy as np
-from instances import HEADINGS, doors_of, maze
+from instances import HEADINGS, doors_of, maze, reported
 from plan_tours import Floor, RoomPlan, Stand
 from together import joined
 from truth import NOISE, Known, is_true, with_truth
 
-from simulator.robot import reported
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.data import Action, Odometry, Step
 from ssh_abduction.data.odometry import displacement_between

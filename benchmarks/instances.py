@@ -15,10 +15,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from simulator.robot import reported
+from simulator.robot import DIGITS
 from ssh_abduction import Trace
 from ssh_abduction.data import Odometry
-from ssh_abduction.data.odometry import Pose, displacement_between
+from ssh_abduction.data.odometry import Displacement, Pose, displacement_between
 
 HEADINGS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # north, east, south, west
 TURNS = {"right": 1, "around": 2, "left": 3}
@@ -32,6 +32,29 @@ class Walk:
 
     trace: Trace
     truth: tuple[object, ...]
+
+
+def reported(
+    displacement: Displacement,
+    odometry: Odometry,
+    rng: np.random.Generator,
+    *,
+    scale: float = 0.0,
+    bend: float = 0.0,
+) -> Displacement:
+    """Add systematic errors and random noise to a displacement, as odometry reports it, rounded.
+
+    A displacement is metres ahead and to the left, and radians turned. The noise is drawn with
+    the covariance of the odometry. Reported distances are too long by the share `scale`. The
+    reported heading drifts to the left by `bend` radians per metre.
+    """
+    dx, dy, turned = displacement
+    drift = bend * math.hypot(dx, dy)
+    # On average, the direction of motion is off by half of the drift.
+    cos, sin = ((1 + scale) * math.cos(drift / 2), (1 + scale) * math.sin(drift / 2))
+    noise = np.linalg.cholesky(np.array(odometry.covariance(displacement))) @ rng.normal(size=3)
+    x, y, heading = np.array([cos * dx - sin * dy, sin * dx + cos * dy, turned + drift]) + noise
+    return round(float(x), DIGITS), round(float(y), DIGITS), round(float(heading), DIGITS)
 
 
 def displaced(

@@ -24,10 +24,10 @@ from functools import cached_property
 
 import networkx as nx
 import numpy as np
+from instances import reported
 
 from simulator.errors import SimulatorError
 from simulator.plans import Plan
-from simulator.robot import reported
 from ssh_abduction.data.odometry import Odometry, Pose, displacement_between
 from ssh_abduction.data.star import Gateway as Sighted
 from ssh_abduction.data.trace import Action, Step, Trace

@@ -27,7 +27,7 @@ import numpy as np
 from simulator.errors import SimulatorError
 from simulator.world import Array, World
 from ssh_abduction.data.checks import a_number
-from ssh_abduction.data.odometry import Displacement, Odometry, Pose, displacement_between, moved
+from ssh_abduction.data.odometry import Displacement, Pose, displacement_between, moved
 
 # Largest errors of the odometry that the robot drives by, as a share and in radians per metre. With
 # larger ones, the robot does not notice that it left a place.
@@ -250,29 +250,6 @@ def _motions(poses: Array) -> tuple[Array, Array, Array]:
     cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     turned = np.remainder(steps[:, 2] + np.pi, 2 * np.pi) - np.pi
     return cos * steps[:, 0] + sin * steps[:, 1], cos * steps[:, 1] - sin * steps[:, 0], turned
-
-
-def reported(
-    displacement: Displacement,
-    odometry: Odometry,
-    rng: np.random.Generator,
-    *,
-    scale: float = 0.0,
-    bend: float = 0.0,
-) -> Displacement:
-    """Add systematic errors and random noise to a displacement, as odometry reports it, rounded.
-
-    A displacement is metres ahead and to the left, and radians turned. The noise is drawn with
-    the covariance of the odometry. Reported distances are too long by the share `scale`. The
-    reported heading drifts to the left by `bend` radians per metre.
-    """
-    dx, dy, turned = displacement
-    drift = bend * math.hypot(dx, dy)
-    # On average, the direction of motion is off by half of the drift.
-    cos, sin = ((1 + scale) * math.cos(drift / 2), (1 + scale) * math.sin(drift / 2))
-    noise = np.linalg.cholesky(np.array(odometry.covariance(displacement))) @ rng.normal(size=3)
-    x, y, heading = np.array([cos * dx - sin * dy, sin * dx + cos * dy, turned + drift]) + noise
-    return round(float(x), DIGITS), round(float(y), DIGITS), round(float(heading), DIGITS)
 
 
 @dataclass(frozen=True)

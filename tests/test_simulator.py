@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from instances import reported
 
 from simulator.driver import LONG, Driver, Tolerance, act, climb, sight
 from simulator.errors import SimulatorError
-from simulator.robot import BEARINGS, Body, Laser, SimulatedRobot, reported
+from simulator.robot import BEARINGS, Body, Laser, SimulatedRobot
 from simulator.tours import covariance_of, simulate
 from simulator.world import World
 from ssh_abduction import Trace
