@@ -32,8 +32,8 @@ from ssh_abduction.data.odometry import Displacement, Pose, displacement_between
 # Largest errors of the odometry that the robot drives by, as a share and in radians per metre. With
 # larger ones, the robot does not notice that it left a place.
 DRIVABLE = 0.5
-# Options of `simulate` for these errors.
-OPTIONS = {"odometry": "odometry-noise", "scale": "scale-error", "bend": "bend-error"}
+# Settings of `simulate` for these errors.
+OPTIONS = {"odometry": "odometry_noise", "scale": "scale_error", "bend": "bend_error"}
 # Largest value of a field; a worse odometer would be useless.
 WORST = 1.0
 # Reported displacements are rounded to this many decimals, as in a log.
@@ -80,7 +80,7 @@ class Body:
 
     def __post_init__(self) -> None:
         for name, least in (("odometry", 0.0), ("scale", -DRIVABLE), ("bend", -DRIVABLE)):
-            mend = f"choose a smaller error (--{OPTIONS[name]})"
+            mend = f"choose a smaller error (--set {OPTIONS[name]})"
             if name == "bend":
                 mend += f"; {DRIVABLE} radians per metre are {math.degrees(DRIVABLE):.1f} degrees"
             a_number(
@@ -181,7 +181,7 @@ class Odometer:
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             least = -WORST if name in ("scale", "bend") else 0.0
-            option = f" (--{OPTIONS[name]})" if name in OPTIONS else ""
+            option = f" (--set {OPTIONS[name]})" if name in OPTIONS else ""
             mend = f"choose a smaller error{option}"
             a_number(f"odometer.{name}", value, SimulatorError, least, WORST, mend=mend)
 
