@@ -581,7 +581,7 @@ class Returns:
         size = float(np.hypot(*off[0, :2]))
         along = off[0, :2] / size if size else np.array([1.0, 0.0])
         return Closing(
-            way=float(loops.ways[last, 0] - loops.ways[first, 0]),
+            way=float(loops.bent[last, 2] - loops.bent[first, 2]),
             size=size,
             size_sigma=math.sqrt(along @ covariance[0, :2, :2] @ along),
             turned=float(off[0, 2]),

@@ -17,8 +17,13 @@ step k turns the rest of the loop. To first order, it moves the end of the loop 
 
 where R(k) is the heading before the displacement, and S a quarter turn. The covariance of the
 closing is the sum of the covariances of these moves (Smith, Self & Cheeseman 1990, "Estimating
-uncertain spatial relationships in robotics"). It is a polynomial in p(j), so prefix sums give it
-for any loop at once.
+uncertain spatial relationships in robotics").
+
+The error moves the plane as a whole, so it is described by how it moves the pose at the origin: by
+(R(k) e_xy - e_theta S p(k), e_theta), which is called its *twist*. A twist (t, e) moves the pose at
+position p by (t + e S p, e). So the twists of all errors of a loop may be summed first, and moved
+to the end of the loop then. Prefix sums of their covariances give the covariance of any loop at
+once.
 
 Two errors are not noise, but unknown constants of the whole trace: a wrong scale, and a steady
 drift of heading. The measured pose of a dstate (a place and a heading) may also be off at each
@@ -60,8 +65,8 @@ BENDS_A_SIGMA = 2
 MOST_BENDS = 6
 # How many steps are computed at once. Intermediate arrays take some ten megabytes.
 AT_A_TIME = 1000
-# How many columns a step has: 3 for its pose, 17 for `moments`, 3 for `ways`.
-COLUMNS = 3 + 17 + 3
+# How many columns a step has: 3 for its pose, 9 for `twists`, 3 for `levers`, 3 for `bent`.
+COLUMNS = 3 + 9 + 3 + 3
 
 
 @dataclass(frozen=True)
@@ -73,9 +78,12 @@ class Loops:
             the pose is the same as at the step before.
         part: For each step, the number of missing displacements up to it. If a displacement on a
             loop is missing, nothing is known about the loop.
-        moments: Sums over the displacements up to each step, n x 17. They give covariances.
-        ways: Metres driven up to each step, and the sum of metres times positions, turned by S (a
-            quarter turn), n x 3.
+        twists: The covariance of the twist by the noise of all displacements up to each step,
+            n x 3 x 3.
+        levers: The sum, over the displacements up to each step, of the variance of the heading
+            times x, y and the squared distance of the step from the origin, n x 3.
+        bent: The twist by a drift of heading of 1 radian per metre up to each step, n x 3. The last
+            column is the metres driven.
         odometry: The noise model, for errors that all displacements share.
         bend: The drift of heading that was removed from the displacements, in radians per metre.
         drift: The standard deviation of the drift that is left, in radians per metre.
@@ -83,8 +91,9 @@ class Loops:
 
     poses: Array
     part: Steps
-    moments: Array
-    ways: Array
+    twists: Array
+    levers: Array
+    bent: Array
     odometry: Odometry
     bend: float
     drift: float
@@ -104,7 +113,9 @@ class Loops:
 
     @staticmethod
     def _of(sums: Array, part: Steps, odometry: Odometry, bend: float, drift: float) -> Loops:
-        return Loops(sums[..., :3], part, sums[..., 3:20], sums[..., 20:], odometry, bend, drift)
+        poses, twists, levers, bent = np.split(sums, (3, 12, 15), axis=-1)
+        twists = twists.reshape(*twists.shape[:-1], 3, 3)
+        return Loops(poses, part, twists, levers, bent, odometry, bend, drift)
 
     def closings(self, first: ArrayLike, last: ArrayLike) -> tuple[Array, Array]:
         """Return the errors at the end of m loops, in the frame of the first step of the trace.
@@ -151,33 +162,8 @@ class Loops:
 
         They are between m loops that end at the steps `end`, and m loops that end at `other_end`.
         """
-        sums = self.moments[j] - self.moments[i]
-        position, mixed, mixed_across = (
-            sums[:, :4].reshape(-1, 2, 2),
-            sums[:, 4:6],
-            sums[:, 6:10].reshape(-1, 2, 2),
-        )
-        angle, angle_across, angle_square = (
-            sums[:, 10],
-            sums[:, 11:13],
-            sums[:, 13:17].reshape(-1, 2, 2),
-        )
-        a, b = _quarter_turned(self.poses[end, :2]), _quarter_turned(self.poses[other_end, :2])
-        covariance = np.empty((len(sums), 3, 3))
-        covariance[:, :2, :2] = (
-            position
-            + mixed[:, :, None] * b[:, None, :]
-            - mixed_across
-            + a[:, :, None] * mixed[:, None, :]
-            - mixed_across.transpose(0, 2, 1)
-            + angle[:, None, None] * a[:, :, None] * b[:, None, :]
-            - a[:, :, None] * angle_across[:, None, :]
-            - angle_across[:, :, None] * b[:, None, :]
-            + angle_square
-        )
-        covariance[:, :2, 2] = mixed + angle[:, None] * a - angle_across
-        covariance[:, 2, :2] = mixed + angle[:, None] * b - angle_across
-        covariance[:, 2, 2] = angle
+        onward, other = (_moved_from_origin(self.poses[steps, :2]) for steps in (end, other_end))
+        covariance: Array = onward @ (self.twists[j] - self.twists[i]) @ other.swapaxes(-1, -2)
         return covariance
 
     def _repeated(self, loops: tuple[Steps, Steps], others: tuple[Steps, Steps]) -> Array:
@@ -192,30 +178,23 @@ class Loops:
 
     def _by_bend(self, i: Steps, j: Steps) -> Array:
         """Return how far a drift of 1 radian per metre moves the end of each loop, m x 3."""
-        sums = self.ways[j] - self.ways[i]
-        return np.hstack(
-            [sums[:, :1] * _quarter_turned(self.poses[j, :2]) - sums[:, 1:], sums[:, :1]]
-        )
+        twist = (self.bent[j] - self.bent[i])[..., None]
+        return np.asarray((_moved_from_origin(self.poses[j, :2]) @ twist)[..., 0])
 
     def _heading_variance(self, i: Steps, j: Steps) -> Array:
         """Return the variance of the turn from steps i to steps j, by noise and drift, (m,)."""
         variance: Array = (
-            self.moments[j, 10]
-            - self.moments[i, 10]
-            + (self.drift * (self.ways[j, 0] - self.ways[i, 0])) ** 2
+            self.twists[j, 2, 2]
+            - self.twists[i, 2, 2]
+            + (self.drift * (self.bent[j, 2] - self.bent[i, 2])) ** 2
         )
         return variance
 
     def _moved_by_heading(self, i: Steps, j: Steps) -> Array:
         """Return the variance of each loop's end, in x plus in y, from errors of heading."""
-        sums = self.moments[j] - self.moments[i]
-        end = _quarter_turned(self.poses[j, :2])
-        white = (
-            sums[:, 10] * (end**2).sum(1)
-            - 2 * (end * sums[:, 11:13]).sum(1)
-            + sums[:, 13]
-            + sums[:, 16]
-        )
+        end, levers = self.poses[j, :2], self.levers[j] - self.levers[i]
+        angle = self.twists[j, 2, 2] - self.twists[i, 2, 2]
+        white = angle * (end**2).sum(1) - 2 * (end * levers[:, :2]).sum(1) + levers[:, 2]
         moved: Array = np.maximum(white, 0.0) + self.drift**2 * (
             self._by_bend(i, j)[:, :2] ** 2
         ).sum(1)
@@ -307,8 +286,8 @@ class Reckoning:
         begin = int(known[-1]) if start else 0
         since = slice(begin, None)
         angle, way, part = (
-            loops.moments[since, 10].tolist(),
-            loops.ways[since, 0].tolist(),
+            loops.twists[since, 2, 2].tolist(),
+            loops.bent[since, 2].tolist(),
             loops.part[since].tolist(),
         )
         found, shift = [], begin
@@ -357,7 +336,7 @@ def _parts(trace: Trace, start: int = 0, missing: int = 0) -> Steps:
 
 
 def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Array:
-    """The poses, moments and ways of steps, as in Loops: drifts x steps x COLUMNS.
+    """The poses, twists, levers and bent of steps, as in Loops: drifts x steps x COLUMNS.
 
     `bends` are the drifts in radians per metre. `last` is the row of the step before, drifts x
     COLUMNS.
@@ -374,29 +353,18 @@ def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Arr
     before = heading - rotated  # the heading at the start of each displacement
     onward = vectors_turned(straight, before)
     position = _summed(last[:, :2], onward)
-    rotation = np.zeros((*before.shape, 3, 3))
-    rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(before)
-    rotation[..., 1, 0], rotation[..., 0, 1], rotation[..., 2, 2] = (
-        np.sin(before),
-        -np.sin(before),
-        1.0,
-    )
-    noise = rotation @ noise @ rotation.swapaxes(-1, -2)
-    across = _quarter_turned(position)
-    angle, mixed = noise[..., 2, 2], noise[..., :2, 2]
-    middle = position - onward / 2
-    ways = np.broadcast_to(way, before.shape)[..., None]
+    # The twist by an error of a displacement, and by a drift of heading.
+    twist = _moved_from_origin(-position)
+    twist[..., 0, 0] = twist[..., 1, 1] = np.cos(before)
+    twist[..., 1, 0], twist[..., 0, 1] = np.sin(before), -np.sin(before)
+    noise = twist @ noise @ twist.swapaxes(-1, -2)
+    angle = noise[..., 2, 2, None]
+    bent = way[:, None] * _moved_from_origin(onward / 2 - position)[..., 2]
     columns = [
-        noise[..., :2, :2].reshape(*before.shape, 4),
-        mixed,
-        (mixed[..., :, None] * across[..., None, :]).reshape(*before.shape, 4),
-        angle[..., None],
-        angle[..., None] * across,
-        (angle[..., None, None] * across[..., :, None] * across[..., None, :]).reshape(
-            *before.shape, 4
-        ),
-        ways,
-        ways * _quarter_turned(middle),
+        noise.reshape(*before.shape, 9),
+        angle * position,
+        angle * (position**2).sum(axis=-1, keepdims=True),
+        bent,
     ]
     sums = _summed(last[:, 3:], np.concatenate(columns, axis=-1))
     return np.concatenate([position, heading[..., None], sums], axis=-1)
@@ -433,3 +401,11 @@ def vectors_turned(vectors: Array, angles: Array | float) -> Array:
 def _quarter_turned(vectors: Array) -> Array:
     """Turn vectors of shape (..., 2) counterclockwise by a right angle."""
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
+
+
+def _moved_from_origin(positions: Array) -> Array:
+    """Return how twists (see above) move poses at these positions (..., 2): (..., 3, 3)."""
+    moved = np.zeros((*positions.shape[:-1], 3, 3))
+    moved[..., range(3), range(3)] = 1.0
+    moved[..., :2, 2] = _quarter_turned(positions)
+    return moved
