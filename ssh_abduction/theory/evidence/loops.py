@@ -126,10 +126,14 @@ class Loops:
         i, j = np.asarray(first, dtype=int), np.asarray(last, dtype=int)
         closing = self.poses[j] - self.poses[i]
         closing[:, 2] = np.remainder(closing[:, 2] + math.pi, math.tau) - math.pi
-        covariance = self.noise(i, j) + self.repeated(i, j)
-        lost = self._heading_variance(i, j)
-        moved_by_heading = self._moved_by_heading(i, j)
-        bent = (SIGMAS / 2) ** 2 * lost * moved_by_heading + ROUNDED**2
+        noise, repeated = self.noise(i, j), self._by_constants(i, j)
+        covariance = noise + repeated @ repeated.swapaxes(-1, -2)
+        # Add what is lost by first order: the variance of the heading, times how far errors of the
+        # heading move the end.
+        angle, end, levers = noise[:, 2, 2], self.poses[j, :2], self.levers[j] - self.levers[i]
+        moved = angle * (end**2).sum(1) - 2 * (end * levers[:, :2]).sum(1) + levers[:, 2]
+        moved = np.maximum(moved, 0.0) + (repeated[:, :2, 1] ** 2).sum(1)
+        bent = (SIGMAS / 2) ** 2 * covariance[:, 2, 2] * moved + ROUNDED**2
         covariance += 2 * self.at_end
         covariance[:, 0, 0] += bent
         covariance[:, 1, 1] += bent
@@ -149,7 +153,7 @@ class Loops:
         )
         begin, end = np.maximum(i, k), np.minimum(j, m)
         covariance = self._white(begin, np.maximum(begin, end), j, m)
-        return covariance + self._repeated((i, j), (k, m))
+        return covariance + self._by_constants(i, j) @ self._by_constants(k, m).swapaxes(-1, -2)
 
     @property
     def at_end(self) -> Array:
@@ -166,39 +170,16 @@ class Loops:
         covariance: Array = onward @ (self.twists[j] - self.twists[i]) @ other.swapaxes(-1, -2)
         return covariance
 
-    def _repeated(self, loops: tuple[Steps, Steps], others: tuple[Steps, Steps]) -> Array:
-        """Return covariances between closings (loop errors) from wrong scale and steady drift."""
+    def _by_constants(self, i: Steps, j: Steps) -> Array:
+        """Return how far a standard deviation of the scale, and of the drift, moves ends of loops.
+
+        The result is m x 3 x 2, for m loops from steps i to steps j.
+        """
         # A scale that is wrong by 1 moves the end of a loop by the whole loop.
-        scaled, other_scaled = (
-            (self.poses[j] - self.poses[i]) * (1.0, 1.0, 0.0) for i, j in (loops, others)
-        )
-        bent, other_bent = (self._by_bend(*pair) for pair in (loops, others))
-        by_scale: Array = self.odometry.scale**2 * scaled[:, :, None] * other_scaled[:, None, :]
-        return by_scale + self.drift**2 * bent[:, :, None] * other_bent[:, None, :]
-
-    def _by_bend(self, i: Steps, j: Steps) -> Array:
-        """Return how far a drift of 1 radian per metre moves the end of each loop, m x 3."""
+        scaled = (self.poses[j] - self.poses[i]) * (1.0, 1.0, 0.0)
         twist = (self.bent[j] - self.bent[i])[..., None]
-        return np.asarray((_moved_from_origin(self.poses[j, :2]) @ twist)[..., 0])
-
-    def _heading_variance(self, i: Steps, j: Steps) -> Array:
-        """Return the variance of the turn from steps i to steps j, by noise and drift, (m,)."""
-        variance: Array = (
-            self.twists[j, 2, 2]
-            - self.twists[i, 2, 2]
-            + (self.drift * (self.bent[j, 2] - self.bent[i, 2])) ** 2
-        )
-        return variance
-
-    def _moved_by_heading(self, i: Steps, j: Steps) -> Array:
-        """Return the variance of each loop's end, in x plus in y, from errors of heading."""
-        end, levers = self.poses[j, :2], self.levers[j] - self.levers[i]
-        angle = self.twists[j, 2, 2] - self.twists[i, 2, 2]
-        white = angle * (end**2).sum(1) - 2 * (end * levers[:, :2]).sum(1) + levers[:, 2]
-        moved: Array = np.maximum(white, 0.0) + self.drift**2 * (
-            self._by_bend(i, j)[:, :2] ** 2
-        ).sum(1)
-        return moved
+        bent = (_moved_from_origin(self.poses[j, :2]) @ twist)[..., 0]
+        return np.stack([self.odometry.scale * scaled, self.drift * bent], axis=-1)
 
     def of_ends(self, end: int) -> Array:
         """Compute the covariance of the pose at `end` by noise up to each step: (end + 1) x 9."""
@@ -212,7 +193,8 @@ class Loops:
 
     def repeated(self, first: Steps, last: Steps) -> Array:
         """Return the covariances that a wrong scale and a steady drift cause, m x 3 x 3."""
-        return self._repeated((first, last), (first, last))
+        moved = self._by_constants(first, last)
+        return np.asarray(moved @ moved.swapaxes(-1, -2))
 
 
 class Reckoning:
