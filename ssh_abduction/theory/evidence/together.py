@@ -15,17 +15,14 @@ whitened matrix are at least 1 - s, so the joint chi-square is at most (z1 + z2)
 
 C comes from the errors that both loops share: errors of common displacements, and errors that
 repeat. If these errors contribute F to S1, then s squared is at most the largest eigenvalue of
-S1^-1 F. A first bound on this eigenvalue is the trace of the matrix. The matrix trace is a sum over
-displacements, so two look-ups in a table give it. Pairs that the first bound does not accept are
-few. For these, there is a sharper bound (Wolkowicz & Styan 1980, "Bounds for eigenvalues using
-traces").
+S1^-1 F, and so at most the trace of this matrix. The trace is a sum over displacements, so two
+look-ups in a table give it. Pairs that this bound does not accept are few.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,29 +39,14 @@ MARGIN = 1e-3
 AT_A_TIME = 1_000_000
 
 
-@dataclass(frozen=True)
-class _ReturnsAlone:
-    """What is known about each of m returns alone, for one drift of heading.
+class _ReturnsAlone(NamedTuple):
+    """What is known about each of m returns alone, if the heading does not drift."""
 
-    Attributes:
-        inverse: The inverse covariance of each closing (the error at the end of the loop), m x 9.
-            Its entries for the heading are 0 for a return to a place.
-        square: The chi-square of each closing, an array of length m.
-        repeated: The covariance of each closing from errors that repeat, m x 9.
-    """
-
+    # The inverse covariance of each closing (the error at the end of the loop), m x 9. Its entries
+    # for the heading are 0 for a return to a place.
     inverse: Array
-    square: Array
-    repeated: Array
-
-    def followed_by(self, other: _ReturnsAlone) -> _ReturnsAlone:
-        """Append what is known about other returns."""
-        pairs = (
-            (self.inverse, other.inverse),
-            (self.square, other.square),
-            (self.repeated, other.repeated),
-        )
-        return _ReturnsAlone(*(np.concatenate(pair) for pair in pairs))
+    square: Array  # the chi-square of each closing, an array of length m
+    repeated: Array  # the covariance of each closing from errors that repeat, m x 9
 
 
 class Together:
@@ -89,7 +71,11 @@ class Together:
         """
         self.rows = rows
         self._reckoning, self._thresholds = reckoning, thresholds
-        self._alone: dict[int, _ReturnsAlone] = dict(before._alone) if before else {}
+        new, loops = rows[len(before.rows) if before else 0 :], reckoning.loops(0)
+        closings = loops.closings(new[:, 0], new[:, 1])
+        alone = _alone(*closings, loops.repeated(new[:, 0], new[:, 1]), new[:, 2])
+        pairs = zip(before._alone, alone, strict=True) if before else ()
+        self._alone: _ReturnsAlone = _ReturnsAlone(*map(np.concatenate, pairs)) if before else alone
 
     def worst(self, new: Mask) -> frozenset[Equality] | None:
         """Return the pair of returns that is rejected most clearly; None if there is none.
@@ -112,7 +98,7 @@ class Together:
             for earlier in self._overlapping(later, new):
                 look_at_clock()
                 pairs = self._unsafe(end, later, earlier, new)
-                excess = self._least_excess(end, *pairs)
+                excess = self._least_excess(*pairs)
                 if len(excess) and excess.max() > most:
                     best = int(excess.argmax())
                     most = float(excess[best])
@@ -133,12 +119,12 @@ class Together:
         return [earlier[at : at + size] for at in range(0, len(earlier), size)]
 
     def _unsafe(self, end: int, later: Steps, earlier: Steps, new: Mask) -> tuple[Steps, Steps]:
-        """Find the pairs that the first bound does not accept, without a drift of heading.
+        """Find the pairs that the bound does not accept, without a drift of heading.
 
         Rows `later` end at step `end`. Returns the index of the later and of the earlier row of
         each pair.
         """
-        alone, rows = self._of_each(0), self.rows
+        alone, rows = self._alone, self.rows
         first = rows[later, 0]
         inverse = alone.inverse[later]
         loops = self._reckoning.loops(0)
@@ -152,102 +138,31 @@ class Together:
             + (inverse * alone.repeated[later]).sum(1)
             + _common_ends(rows[earlier, None], rows[later]) * (inverse @ loops.at_end.ravel())
         )
-        unsafe = ~self._is_safe(share, alone.square[earlier, None] + alone.square[later], 0)
+        squares = alone.square[earlier, None] + alone.square[later]
+        left = 1 - squares / min(self._thresholds.values())
+        unsafe = (left <= 0) | (share + MARGIN > left**2)
         unsafe &= rows[earlier, 1, None] > first
         unsafe &= (earlier[:, None] < later) & (new[earlier, None] | new[later])
         others, these = np.nonzero(unsafe)
         return later[these], earlier[others]
 
-    def _is_safe(self, share: Array, squares: Array, number: int) -> Mask:
-        """Mark the pairs of returns that a bound shows not to be rejected, for the drift `number`.
+    def _least_excess(self, later: Steps, earlier: Steps) -> Array:
+        """Return chi-square minus threshold of each pair, the least over all drifts of heading.
 
-        `share` bounds s squared (see the head of this module). `squares` are sums of two
-        chi-squares.
+        It is 0 for a pair that is not rejected.
         """
-        allowed = min(self._thresholds.values()) - self._reckoning.unlikely[number]
-        left = 1 - squares / allowed if allowed > 0 else np.full_like(squares, -1.0)
-        safe: Mask = (left > 0) & (share + MARGIN <= left**2)
-        return safe
-
-    def _least_excess(self, end: int, later: Steps, earlier: Steps) -> Array:
-        """Return the least `_excess` of each pair of returns over all drifts of heading."""
+        freedom = 4 + self.rows[later, 2] + self.rows[earlier, 2]
+        most = np.array([self._thresholds[f] for f in freedom.tolist()])
         excess = np.full(len(later), np.inf)
-        for number in range(len(self._reckoning.bends)):
+        for number, unlikely in enumerate(self._reckoning.unlikely):
             left = np.flatnonzero(excess > 0)
             if not len(left):
                 break
-            excess[left] = np.minimum(
-                excess[left], self._excess(number, end, later[left], earlier[left])
-            )
+            pairs = (self.rows[some[left]] for some in (later, earlier))
+            squares = joint_squares(self._reckoning.loops(number), *pairs)
+            off = np.maximum(squares + unlikely - most[left], 0.0)
+            excess[left] = np.minimum(excess[left], off)
         return excess
-
-    def _excess(self, number: int, end: int, later: Steps, earlier: Steps) -> Array:
-        """Return chi-square minus threshold of each pair of returns, at least 0, for one drift."""
-        alone, rows, loops = self._of_each(number), self.rows, self._reckoning.loops(number)
-        squares = alone.square[later] + alone.square[earlier]
-        # The stretch that both loops share.
-        begin, stop = (np.maximum(rows[earlier, 0], rows[later, 0]), rows[earlier, 1])
-        gathered = loops.of_ends(end)
-        ends = np.outer(_common_ends(rows[earlier], rows[later]), loops.at_end)
-        share = self._largest_share(alone, later, gathered[stop] - gathered[begin] + ends)
-        excess = np.zeros(len(later))
-        left = np.flatnonzero(~self._is_safe(share, squares, number))
-        if not len(left):
-            return excess
-        noise = loops.noise(begin[left], stop[left]).reshape(-1, 9) + ends[left]
-        share = np.minimum(share[left], 1.0) * np.minimum(
-            self._largest_share(alone, earlier[left], noise), 1.0
-        )
-        left = left[~self._is_safe(share, squares[left], number)]
-        if not len(left):
-            return excess
-        joint = (
-            joint_squares(loops, rows[later[left]], rows[earlier[left]])
-            + self._reckoning.unlikely[number]
-        )
-        most = np.array(
-            [
-                self._thresholds[f]
-                for f in (4 + rows[later[left], 2] + rows[earlier[left], 2]).tolist()
-            ]
-        )
-        excess[left] = np.maximum(joint - most, 0.0)
-        return excess
-
-    def _largest_share(self, alone: _ReturnsAlone, returns: Steps, noise: Array) -> Array:
-        """Return an upper bound on the largest eigenvalue of S^-1 F for some returns.
-
-        S is the covariance of a return, and F the part of it that `noise`, m x 9, and repeated
-        errors cause.
-        """
-        product = alone.inverse[returns].reshape(-1, 3, 3) @ (
-            noise + alone.repeated[returns]
-        ).reshape(-1, 3, 3)
-        trace, square, freedom = (
-            np.einsum("mii->m", product),
-            np.einsum("mij,mji->m", product, product),
-            2 + self.rows[returns, 2],
-        )
-        bound: Array = trace / freedom + np.sqrt(
-            np.maximum((freedom - 1) / freedom * (square - trace**2 / freedom), 0.0)
-        )
-        return bound
-
-    def _of_each(self, number: int) -> _ReturnsAlone:
-        """Return what is known about each return alone, for the drift with this index."""
-        known = self._alone.get(number)
-        if known is None or len(known.square) < len(self.rows):
-            loops, rows = (
-                self._reckoning.loops(number),
-                self.rows[0 if known is None else len(known.square) :],
-            )
-            new = _alone(
-                *loops.closings(rows[:, 0], rows[:, 1]),
-                loops.repeated(rows[:, 0], rows[:, 1]),
-                rows[:, 2],
-            )
-            known = self._alone[number] = known.followed_by(new) if known else new
-        return known
 
 
 def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
