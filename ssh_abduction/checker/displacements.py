@@ -8,8 +8,7 @@ shows that they are not rejected. Let z and y be the chi-squares of the two retu
 the inverse of the covariance of the later return, times the covariance of the noise that both
 returns share. If s is at least the greatest eigenvalue of M, the chi-square of the pair is at most
 (z + y) / (1 - sqrt(s)). The trace of M is such an s. It is fast to compute, as the difference of
-two values of a table. The square root of the trace of M squared is a smaller s. It is used for the
-pairs that are left.
+two values of a table.
 
 The error of the robot's pose is predicted as in a Kalman filter. Let E(t) be the error of the pose
 by dead reckoning at step t, in the frame of the first step, and V(t) its covariance. An error at
@@ -297,28 +296,16 @@ def _unsafe(
         + _common_ends(rows, earlier[:, None], later) * (alone.inverse[later] @ at_end)
     )
     squares = alone.square[earlier, None] + alone.square[later]
-    others, these = np.nonzero(
-        ~_is_safe(trace, squares, most) & (stop > first) & (earlier[:, None] < later)
-    )
-    share = new[rows[earlier[others], 1]] - new[begin[others, these]] + alone.repeated[later[these]]
-    share += _common_ends(rows, earlier[others], later[these])[:, None] * at_end
-    share = alone.inverse[later[these]].reshape(-1, 3, 3) @ share.reshape(-1, 3, 3)
-    norm = np.sqrt(np.maximum(np.einsum("mij,mji->m", share, share), 0.0))
-    left = ~_is_safe(norm, squares[others, these], most)
-    return earlier[others[left]], later[these[left]]
+    left = 1 - squares / most
+    is_safe = (left > 0) & (trace + MARGIN <= left**2)
+    others, these = np.nonzero(~is_safe & (stop > first) & (earlier[:, None] < later))
+    return earlier[others], later[these]
 
 
 def _common_ends(rows: Steps, here: Steps, others: Steps) -> Steps:
     """Count the common ends of the loops of the returns `here` and `others` (indices)."""
     same: Steps = (rows[here, :2] == rows[others, :2]).sum(-1)
     return same
-
-
-def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
-    """Tell for each pair of returns whether the bound shows that it is not rejected."""
-    left = 1 - squares / most
-    safe: NDArray[np.bool_] = (left > 0) & (share + MARGIN <= left**2)
-    return safe
 
 
 def _square_together(filtered: ErrorFilter, rows: Steps, here: Steps, others: Steps) -> Array:
