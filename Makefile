@@ -43,7 +43,7 @@ types: .venv/dev
 	$(BIN)/mypy
 
 unit: .venv/dev
-	$(BIN)/pytest -n auto --dist loadfile $(WHICH)
+	$(BIN)/pytest -n auto --dist worksteal $(WHICH)
 
 docs: .venv/dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -q

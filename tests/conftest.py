@@ -18,6 +18,7 @@ from worlds import rectangle
 
 from ssh_abduction import SSHMap, Trace, solve
 from ssh_abduction.cli import jobs, main, outcome
+from ssh_abduction.output import layout
 
 # Hypothesis has no deadlines, because clingo takes a hundred times as long for some random traces
 # as for others. Examples are the same in each run, unless NEW_EXAMPLES is set.
@@ -31,6 +32,9 @@ settings.load_profile("the same everywhere")
 
 # Commands print no progress by default. Tests of progress set the interval.
 outcome.EVERY = math.inf
+
+# Drawings of maps get little work by default. Tests of drawings use `careful_drawings`.
+CAREFUL, layout.WORK = layout.WORK, 0
 
 # Background processes and their children ignore Ctrl-C. Restore the handler for tests.
 with contextlib.suppress(ValueError):
@@ -74,6 +78,12 @@ def without_processes(
     """`in_this_process`, for a whole test."""
     with in_this_process():
         yield
+
+
+@pytest.fixture
+def careful_drawings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw maps with the care that users get, which may take seconds."""
+    monkeypatch.setattr(layout, "WORK", CAREFUL)
 
 
 @pytest.fixture(scope="session")

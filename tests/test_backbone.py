@@ -214,7 +214,7 @@ def test_interrupted_list_leaves_the_backbone_unproven() -> None:
 
 def test_solution_is_a_plain_value(tmp_path: Path) -> None:
     """A solution survives pickle, copies and files, and finds a backbone only if asked."""
-    solution = aces.solution(max_maps=1)
+    solution = solve(aces.route(16), max_maps=1)
     solution.save(tmp_path / "maps.json")
     loaded = Solution.load(tmp_path / "maps.json", solution.trace)
     copies = [pickle.loads(pickle.dumps(solution)), deepcopy(solution), replace(solution), loaded]
@@ -237,14 +237,14 @@ def test_find_backbone_without_time_returns_the_unproven_backbone() -> None:
 
 
 def test_a_backbone_needs_the_trace(tmp_path: Path) -> None:
-    data = aces.solution(max_maps=1).to_dict()
+    data = solve(aces.route(16), max_maps=1).to_dict()
     (tmp_path / "maps.json").write_text(json.dumps({**data, "trace": None}))
     loaded = Solution.load(tmp_path / "maps.json")
     with pytest.raises(SolverError, match="trace: expected the trace that was solved, got none"):
         find_backbone(loaded)
     with pytest.raises(MapError):
         find_backbone(loaded, rectangle(14))
-    assert find_backbone(loaded, Trace.load(ACES3)) is not None
+    assert find_backbone(loaded, aces.route(16)) is not None
 
 
 def test_online_backbone_is_that_of_the_listed_maps() -> None:

@@ -16,7 +16,6 @@ import pytest
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.output import layout
 from ssh_abduction.solver import Status
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -95,7 +94,6 @@ def test_adventure_maps_the_maze_and_writes_its_trace(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_notebook_cells_print_their_stored_output(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each cell prints and returns what is stored beside it. Drawings are not compared."""
-    monkeypatch.setattr(layout, "WORK", 0)
     cells = json.loads((EXAMPLES / "story.ipynb").read_text(encoding="utf-8"))["cells"]
     assert len(cells) == 20
     monkeypatch.chdir(EXAMPLES)

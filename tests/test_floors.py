@@ -234,7 +234,7 @@ def test_simulated_robot_changes_floors_by_lifts_only(floors: int, dstates: int)
 
 
 def test_map_of_a_simulated_tower_is_true() -> None:
-    trace = driven(2)
+    trace = driven(2).prefix(40)
     trace = trace.with_views([str(step.star) for step in trace.steps])
     solution = solve(trace, Theory(displacement="none"), max_maps=1)
     assert solution.status is Status.OPTIMAL

@@ -23,6 +23,7 @@ from ssh_abduction.output import plot, to_networkx, to_pandas, to_svg
 from ssh_abduction.output.layout import Layout, layout
 from ssh_abduction.output.roads import Roads
 
+pytestmark = pytest.mark.usefixtures("careful_drawings")
 SIX = streets(
     *((f"{x}{y}", "E", f"{x + 1}{y}") for x in range(5) for y in range(6)),
     *((f"{x}{y}", "S", f"{x}{y + 1}") for x in range(6) for y in range(5)),

@@ -478,7 +478,7 @@ def test_limit_during_ranking_leaves_the_list_complete() -> None:
     [
         lambda solution: solve(solution.trace),
         find_backbone,
-        lambda solution: explain_pair(solution.trace, 0, 4),
+        lambda solution: explain_pair(solution.trace, 0, 8),
         lambda solution: explain_trace(solution.trace),
         lambda _: explain(CLASH),
         lambda _: check_rules(Theory.causal().replace(rules=[Rules("own.lp", EXAMPLE)])),

@@ -4,6 +4,7 @@ Names of tests are short."""
 from __future__ import annotations
 
 import ast
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -53,10 +54,9 @@ def test_no_two_public_functions_share_a_name() -> None:
 
 def test_names_of_tests_have_at_most_80_characters() -> None:
     found = [
-        node.name
+        name
         for path in sorted((ROOT / "tests").glob("test_*.py"))
-        for node in parsed(path).body
-        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+        for name in re.findall(r"^def (test_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)
     ]
     assert len(found) > 1000
     assert [name for name in found if len(name) > 80] == []

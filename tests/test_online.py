@@ -212,7 +212,7 @@ def test_online_mapper_without_time_has_a_map_and_proves_it_later(data: st.DataO
 
 def test_online_limit_leaves_feasible_maps_and_sound_bounds() -> None:
     """The first half of the tour is solved. After that there is no time."""
-    trace = drive(*TOURS["plus"])
+    trace = drive(*TOURS["tee"])
     theory = settle(trace).theory
     half = len(trace) // 2
     mapper, _ = follow(trace.prefix(half), theory)

@@ -24,7 +24,7 @@ import pytest
 from ssh_abduction import OnlineMapper, SSHMap
 from ssh_abduction.cli import main, parser
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.output import layout, to_svg
+from ssh_abduction.output import to_svg
 from ssh_abduction.robot_logs import log_maps
 from ssh_abduction.solver import Solution, Status, solve
 from ssh_abduction.theory.encodings import Rules
@@ -216,7 +216,6 @@ def compare(block: Block) -> None:
 def test_code_blocks_print_the_shown_output(
     block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(layout, "WORK", 0)  # no page shows what these lines draw
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     compare(block)
@@ -268,6 +267,7 @@ def test_trace_of_the_formats_page_has_a_map(tmp_path: Path) -> None:
     assert solve(Trace.load(written)).status is Status.OPTIMAL
 
 
+@pytest.mark.usefixtures("careful_drawings")
 def test_picture_on_the_page_equals_the_drawn_map() -> None:
     (ssh_map,) = solve(Trace.load(ROOT / "examples" / "notched-rectangle.jsonl")).maps
     assert (ROOT / "docs" / "figures" / "notched-rectangle.svg").read_text() == to_svg(
@@ -275,6 +275,7 @@ def test_picture_on_the_page_equals_the_drawn_map() -> None:
     ) + "\n"
 
 
+@pytest.mark.usefixtures("careful_drawings")
 @pytest.mark.parametrize("name", figures.DRAWN)
 def test_figures_equal_the_output_of_the_program(name: str) -> None:
     assert (figures.FIGURES / f"{name}.svg").read_text() == figures.DRAWN[name]() + "\n"

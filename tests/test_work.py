@@ -41,7 +41,7 @@ def answer_by_a_random_clock(trace: Trace, theory: Theory, work: float, seed: in
     return solution.maps, solution.stopped, answer
 
 
-@pytest.mark.parametrize("work", [0.02, 0.2, 1.0])
+@pytest.mark.parametrize("work", [0.02, 0.2, pytest.param(1.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("theory", [Theory.topological(), COSTS, Theory.causal()], ids=str)
 def test_one_work_limit_gives_one_answer(work: float, theory: Theory) -> None:
     trace = Trace.load(ROUTE)
@@ -49,7 +49,9 @@ def test_one_work_limit_gives_one_answer(work: float, theory: Theory) -> None:
     assert other == first
 
 
-@pytest.mark.parametrize(("seed", "work"), [(900, 0.3), (902, 0.6)])
+@pytest.mark.parametrize(
+    ("seed", "work"), [(900, 0.3), pytest.param(902, 0.6, marks=pytest.mark.slow)]
+)
 def test_threads_give_one_answer(seed: int, work: float) -> None:
     """Threads wait for each other while clingo grounds, so limits are reached at other times."""
     trace = maze(5, 5, steps=120, seed=seed).trace
