@@ -10,7 +10,7 @@ import clingo
 
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, named_steps
-from ssh_abduction.data.groups import gathered, minimal_part
+from ssh_abduction.data.groups import minimal_part
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import closures_among
 from ssh_abduction.data.trace import Action, Step, Trace
@@ -64,34 +64,6 @@ class _ModelMap(NamedTuple):
         return all((named[e.of][e.first] == named[e.of][e.second]) == e.holds for e in equalities)
 
 
-class _ArgumentModel(NamedTuple):
-    """A model that clingo found during an argument: its conclusions, and the links that it breaks.
-
-    `one` has an atom for each pair of steps at one dstate of the model.
-    """
-
-    conclusions: frozenset[clingo.Symbol]
-    broken: frozenset[clingo.Symbol]
-    one: frozenset[clingo.Symbol]
-
-    @classmethod
-    def of(cls, model: clingo.Model) -> _ArgumentModel:
-        """Read a model of clingo."""
-        atoms = gathered((symbol.name, symbol) for symbol in model.symbols(atoms=True))
-        broken = (
-            clingo.Function("active", symbol.arguments) for symbol in atoms.get("violation", ())
-        )
-        return cls(
-            frozenset(atoms.get("so", ())), frozenset(broken), frozenset(atoms.get("same", ()))
-        )
-
-    def suits(self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]) -> bool:
-        """Tell whether these axioms and assumptions hold in the model."""
-        return self.broken.isdisjoint(active) and all(
-            (symbol in self.one) == true for symbol, true in assumed
-        )
-
-
 def active_at(axiom: str, t: int) -> clingo.Symbol:
     """Return the atom that says that an axiom must hold at step t (explain.lp)."""
     return clingo.Function("active", [clingo.Function(axiom), *facts.number_symbols(t)])
@@ -134,10 +106,8 @@ class Axioms:
         trace, theory = piece.trace, piece.theory
         self._piece = piece
         self._stop = stop
-        self._refusals = 0  # constraints added so far, because evidence rejected a map
         self._conclusions: list[clingo.Symbol] = []
         self._picked = frozenset[clingo.Symbol]()  # in a query, one of these has to fail
-        self._seen: list[_ArgumentModel] = []
         self._control = Control(["--heuristic=Domain"] if relaxed else [])
         self._ground(piece, relaxed=relaxed)
         last = len(trace) - 1
@@ -150,12 +120,8 @@ class Axioms:
             if axiom != Planar.axiom or t == last
         )
         self._pairs = {active_at(axiom, t): (axiom, t) for axiom, t in pairs} if relaxed else {}
-        self._drawn = {active_at(Planar.axiom, last)} & self._pairs.keys()
-        self._placed = [
-            symbol for symbol, (axiom, _) in self._pairs.items() if axiom == "one_place"
-        ]
-        if self._drawn:
-            self._control.tell(f":- {active_at(Planar.axiom, last)}, violation(one_place,T).")
+        if (drawn := active_at(Planar.axiom, last)) in self._pairs:
+            self._control.tell(f":- {drawn}, violation(one_place,T).")
 
     def _ground(self, piece: Piece, *, relaxed: bool) -> None:
         """Ground the axioms for all steps. Raises Interrupted if `stop` returns True."""
@@ -235,18 +201,10 @@ class Axioms:
         # Clingo's cautious reasoning loses atoms under assumptions. So each query asks for a model
         # in which at least one unproven conclusion fails, until there is none.
         found = frozenset(self._conclusions)
-        holding = active if self._drawn.isdisjoint(active) else [*active, *self._placed]
-        for answer in self._seen:
-            if answer.suits(holding, assumed):
-                found &= answer.conclusions
 
         def keep(model: clingo.Model) -> None:
             nonlocal found
-            seen = _ArgumentModel.of(model)
-            found &= seen.conclusions
-            # with added constraints, a model does not list every axiom that it breaks
-            if not self._refusals:
-                self._seen.append(seen)
+            found &= {symbol for symbol in model.symbols(atoms=True) if symbol.name == "so"}
 
         doubtful = found - frozenset(known)
         self._pick(doubtful)
@@ -341,7 +299,6 @@ class Axioms:
 
     def _forbid(self, refusal: Refusal, where: clingo.Symbol | None = None) -> None:
         """Add a constraint: while the atom `where` is true, these equalities do not all hold."""
-        self._refusals += 1
         self._control.tell(facts.forbidden_equalities(refusal, where))
 
     def sentences(self, clash: Sequence[tuple[str, int]]) -> tuple[str, ...]:
