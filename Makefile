@@ -2,6 +2,7 @@
 # make bench  time and memory on this machine, ours and those of peers from PyPI, as a table; the better part of an hour
 # make bench-faults  the same of faults: are they found, by ours and by peers; some hours, or ARGS="--seeds 2 --limit 10"
 # make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
+# make bench-wings  a repeated wing, by ours and by robust pose graphs of gtsam; ten minutes, or ARGS="--seeds 7700-7703"
 # make parts  times of single parts: images, and exploring step by step
 # make docs   the pages of docs/ and a page for each public name as a site, with its links checked; open site/index.html
 # make test   lint, types, layers and tests, with the development tools in .venv; make test-all also runs slow tests
@@ -15,7 +16,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # The tests that tell most about a change of an axiom or of the solver.
 QUICK := $(addprefix tests/test_,axioms.py brute_force.py property.py tables.py checker.py speedups.py)
 
-.PHONY: demo test test-all quick lint style types unit docs bench bench-faults bench-grid parts lines lock clean
+.PHONY: demo test test-all quick lint style types unit docs bench bench-faults bench-grid bench-wings parts lines lock clean
 
 demo: .venv/base
 	$(BIN)/python examples/demo.py out
@@ -58,6 +59,9 @@ bench-faults: .venv/bench
 bench-grid: .venv/base
 	$(BIN)/python benchmarks/grid_localisation.py $(ARGS)
 
+bench-wings: .venv/bench
+	$(BIN)/python benchmarks/tournament.py $(ARGS)
+
 parts: .venv/dev
 	$(BIN)/python benchmarks/images.py
 	$(BIN)/python benchmarks/online.py
@@ -82,7 +86,7 @@ lock: .venv/dev
 
 # A peer that does not install is left out, and its cells of the table say so.
 .venv/bench: .venv/base
-	$(BIN)/pip install -q -e '.[bench]' || for peer in '-e .[plot]' aalpy dfainductor python-sat z3gi; do $(BIN)/pip install -q $$peer || true; done
+	$(BIN)/pip install -q -e '.[bench]' || for peer in '-e .[plot]' aalpy dfainductor gtsam python-sat z3gi; do $(BIN)/pip install -q $$peer || true; done
 	touch $@
 
 clean:
