@@ -2,7 +2,7 @@
 # make bench  time and memory on this machine, ours and those of peers from PyPI, as a table; the better part of an hour
 # make bench-faults  the same of faults: are they found, by ours and by peers; some hours, or ARGS="--seeds 2 --limit 10"
 # make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
-# make bench-wings  a repeated wing, by ours and by robust pose graphs of gtsam; six CPU minutes, or ARGS="--seeds 7700-7703"
+# make bench-wings  a repeated wing, by ours and by robust pose graphs of gtsam; eight CPU minutes, or ARGS="--seeds 7700-7703"
 # make parts  times of single parts: images, and exploring step by step
 # make docs   the pages of docs/ and a page for each public name as a site, with its links checked; open site/index.html
 # make test   lint, types, layers and tests, with the development tools in .venv; make test-all also runs slow tests
