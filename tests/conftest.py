@@ -18,7 +18,6 @@ from worlds import rectangle
 
 from ssh_abduction import SSHMap, Trace, solve
 from ssh_abduction.cli import jobs, main, outcome
-from ssh_abduction.output import layout
 
 # Hypothesis has no deadlines, because clingo takes a hundred times as long for some random traces
 # as for others. Examples are the same in each run, unless NEW_EXAMPLES is set.
@@ -32,9 +31,6 @@ settings.load_profile("the same everywhere")
 
 # Commands print no progress by default. Tests of progress set the interval.
 outcome.EVERY = math.inf
-
-# Drawings of maps get little work by default. Tests of drawings use `careful_drawings`.
-CAREFUL, layout.WORK = layout.WORK, 0
 
 # Background processes and their children ignore Ctrl-C. Restore the handler for tests.
 with contextlib.suppress(ValueError):
@@ -80,10 +76,23 @@ def without_processes(
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def care() -> Iterator[int]:
+    """Draw maps with little care, which saves seconds. The value is the care that users get."""
+    from ssh_abduction.output import layout
+
+    usual = layout.WORK
+    with patch.object(layout, "WORK", 0):
+        yield usual
+
+
 @pytest.fixture
-def careful_drawings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw maps with the care that users get, which may take seconds."""
-    monkeypatch.setattr(layout, "WORK", CAREFUL)
+def careful_drawings(care: int) -> Iterator[None]:
+    """Draw maps with the care that users get."""
+    from ssh_abduction.output import layout
+
+    with patch.object(layout, "WORK", care):
+        yield
 
 
 @pytest.fixture(scope="session")

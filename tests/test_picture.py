@@ -6,6 +6,7 @@ import math
 import random
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -178,12 +179,18 @@ def test_picture_ellipses_show_the_covariance() -> None:
 
 
 @pytest.mark.parametrize(
-    "ssh_map",
-    [surveyed(), surveyed("causal"), grid(2), grid(9), grid(3, apart=0.02)],
+    "make",
+    [
+        surveyed,
+        lambda: surveyed("causal"),
+        lambda: grid(2),
+        lambda: grid(9),
+        lambda: grid(3, apart=0.02),
+    ],
     ids=["square", "causal", "four", "many", "near"],
 )
-def test_picture_marks_lie_within_the_page(ssh_map: SSHMap) -> None:
-    picture = to_svg(ssh_map)
+def test_picture_marks_lie_within_the_page(make: Callable[[], SSHMap]) -> None:
+    picture = to_svg(make())
     left, top, right, bottom = page(picture)
     inside = []
     for mark in ET.fromstring(picture).iter():

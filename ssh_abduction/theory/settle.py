@@ -10,11 +10,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Literal, TypeAlias
+from functools import cached_property, lru_cache
+from typing import Any, Literal, TypeAlias
 
 from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Displacement, Evidence, evidence_of, pairs_of
 from ssh_abduction.theory.fields import AUTO, can_weigh, choice
 from ssh_abduction.theory.overlap import Overlap
@@ -91,8 +92,9 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
     views = set(trace.views)
     if views == {None} and not theory.unknown_views:  # a part of a trace may have no view
         raise _no_view(trace)
-    settled = replace(
+    settled = _settled(
         theory,
+        encodings.axioms(),
         star=star,
         displacement=displacement,
         weigh=_weigh_of(theory, displacement),
@@ -100,19 +102,29 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
         several_drives=any(action.starts for action in trace.actions),
         lifts=any(action.changes_floor for action in trace.actions),
     )
-    _check_faults(settled)
-    if settled.changed and star == "gateways" and "gateway_end" not in settled.without:
-        # A path may lead on by a gateway that is closed on a drive.
-        settled = replace(settled, without=(*settled.without, "gateway_end"))
-    counts = ["dstates" if count == "tenths" else count for count in settled.priorities]
-    prefer = tuple(c for c in counts if c in theory.prefer or c != "excuses")
-    settled = replace(settled, prefer=prefer)
     for i, step in enumerate(trace.steps):
         settled.require(step, trace.at(i))
     problem = Problem(trace, settled, evidence_of(settled, known.evidence if known else ()))
     if displacement == "use" and not settled.returns:
         problem = problem.changed(theory=replace(settled, returns=count_returns(problem)))
     return problem
+
+
+@lru_cache(maxsize=32)
+def _settled(theory: Theory, axioms: tuple[encodings.Axiom, ...], **chosen: Any) -> Theory:
+    """Replace fields of a theory by the chosen values, and each other "auto".
+
+    The result is kept, as a robot that maps step by step settles one theory after each step. It is
+    forgotten if the `axioms` of the encodings change.
+    """
+    settled = replace(theory, **chosen)
+    _check_faults(settled)
+    if settled.changed and settled.star == "gateways" and "gateway_end" not in settled.without:
+        # A path may lead on by a gateway that is closed on a drive.
+        settled = replace(settled, without=(*settled.without, "gateway_end"))
+    counts = ["dstates" if count == "tenths" else count for count in settled.priorities]
+    prefer = tuple(c for c in counts if c in theory.prefer or c != "excuses")
+    return replace(settled, prefer=prefer)
 
 
 def _check_faults(settled: Theory) -> None:
