@@ -23,10 +23,10 @@ def test_clash_of_a_whole_visit_is_found_after_the_limit(
     done = [*["travel"] * 40, *turns, "travel", *["travel"] * 40]
     views = [*range(41), *("ab" * 8), "c", *range(50, 91)]
     trace = Trace.from_steps(views, done)
-    found = solve(trace, Theory(star="none"), time_limit=0.2, max_maps=1)
+    found = solve(trace, Theory(star="none"), work_limit=0.1, max_maps=1)
     assert found.status is Status.UNSATISFIABLE
     trace.save(tmp_path / "trace.jsonl")
-    words = ["solve", str(tmp_path / "trace.jsonl"), "--set", "star=none", "--time-limit", "0.2"]
+    words = ["solve", str(tmp_path / "trace.jsonl"), "--set", "star=none", "--work-limit", "0.1"]
     monkeypatch.setattr(outcome, "EXPLAINING", 0.0)
     assert main(words) == 20
     told = capsys.readouterr().out
