@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -81,7 +82,7 @@ def test_dead_reckoning_of_a_growing_maze_agrees() -> None:
     assert np.array_equal(reckoning.begins, whole.begins)
     for number, bend in enumerate(whole.bends):
         here, there, anew = reckoning.loops(number), whole.loops(number), Loops.of(trace, bend)
-        for name in ("poses", "part", "moments", "ways"):
+        for name in ("poses", "part", "twists", "levers", "bent"):
             assert np.allclose(getattr(here, name), getattr(there, name), rtol=1e-12, atol=1e-12)
             assert np.allclose(getattr(here, name), getattr(anew, name), rtol=1e-12, atol=1e-12)
 
@@ -203,11 +204,7 @@ def test_bounds_change_no_verdict_of_the_checker(noise: str) -> None:
         for dstates in (1000, 9):
             ssh_map = seen(walk.trace, walk.truth, dstates)
             bounded = list(refused_returns(walk.trace, ssh_map, theory))
-            with patch.object(
-                displacements,
-                "_is_safe",
-                lambda share, squares, most: np.zeros_like(squares, dtype=bool),
-            ):
+            with patch.object(displacements, "MARGIN", math.inf):  # no bound is small enough
                 assert list(refused_returns(walk.trace, ssh_map, theory)) == bounded
             said += [len(refused.returns) for refused in bounded]
     assert said.count(2) > 2
