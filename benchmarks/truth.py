@@ -439,7 +439,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument(
         "--causal", action="store_true", help="use the causal theory, and judge only dstates"
     )
-    for name in ("displacement", "boundary", "prefer", "weigh", "prices"):
+    for name in ("displacement", "boundary", "prefer", "weigh"):
         parser.add_argument(f"--{name}", metavar="CHOICE", help=f"the theory's field {name}")
     for name, price in FAULTS.items():
         parser.add_argument(
@@ -491,7 +491,7 @@ def main() -> None:
     options = arguments().parse_args()
     choices = {
         name: value
-        for name in ("displacement", "boundary", "prefer", "weigh", "prices")
+        for name in ("displacement", "boundary", "prefer", "weigh")
         if (value := getattr(options, name))
     } | {name: price for name, price in FAULTS.items() if getattr(options, name)}
     if options.causal:

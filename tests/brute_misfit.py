@@ -8,21 +8,14 @@ each step, the scale and the drift. In maps without places, each dstate has a po
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Hashable, Sequence
 from functools import cache
-from itertools import combinations, product
 
-import networkx as nx
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.settle import settle
-from ssh_abduction.theory.theory import Theory
 
 STARTS = 4
 
@@ -32,8 +25,6 @@ class LeastSquares:
 
     def __init__(self, trace: Trace) -> None:
         self.trace = trace
-        # The position of each step, for the headings and positions that were fitted.
-        self.positions: dict[object, np.ndarray] = {}
         self.odometry = trace.odometry or Odometry()
         self.closures = [
             (closure, np.linalg.inv(np.array(closure.covariance))) for closure in trace.closures
@@ -111,40 +102,7 @@ class LeastSquares:
             for start in starts
         ]
         best = min(found, key=lambda one: one.cost)
-        self.positions[headings, positions] = best.x[: 2 * len(at)].reshape(-1, 2)[where]
         return float(2 * best.cost)
-
-    def crowding(self, headings: tuple[int, ...], positions: tuple[Hashable, ...]) -> float:
-        """How many pairs of places of different drives are at one position. A pair counts less the
-        farther apart the two are."""
-        moved = [t for t, action in enumerate(self.trace.actions, 1) if not action.starts]
-        ways = {t: math.hypot(*displacement[:2]) for t, displacement, _ in self.moved}
-        ways = {t: way for t, way in ways.items() if way > max(ways.values()) / 10}
-        self.misfit(headings, positions)
-        spots = self.positions[headings, positions]
-        places = [positions[heading] for heading in headings]
-        unit = groups_of_drives(self.trace, [])
-        if {*moved} - {t for t, *_ in self.moved} or not ways:
-            return 0.0
-        # A frame is fixed by a dstate, or by two places, that two groups of drives share.
-        tied = nx.Graph()
-        tied.add_nodes_from(unit)
-        for one, other in combinations(set(unit), 2):
-            dstates, at = (
-                {of[t] for t, u in enumerate(unit) if u == one}
-                & {of[t] for t, u in enumerate(unit) if u == other}
-                for of in (headings, places)
-            )
-            if dstates or len(at) > 1:
-                tied.add_edge(one, other)
-        count = 0.0
-        for p, q in combinations(set(places), 2):
-            saw = [{unit[t] for t, x in enumerate(places) if x == place} for place in (p, q)]
-            fixed = any(nx.has_path(tied, one, other) for one, other in product(*saw))
-            if fixed and not saw[0] & saw[1]:
-                away = math.dist(*(spots[places.index(place)] for place in (p, q)))
-                count += max(0.0, 1 - away / (0.4 * min(ways.values())))
-        return count
 
     def _reckoned(
         self, headings: Sequence[int], where: Sequence[int], places: int, size: int
@@ -167,40 +125,3 @@ class LeastSquares:
                 seen_headings.add(headings[t])
                 unknown[2 * places + headings[t]] = facing
         return unknown
-
-
-def layings(trace: Trace, positions: Sequence[Hashable]) -> int:
-    """Count how often drives are laid on others. Drives that closures join count as one.
-
-    Args:
-        trace: The trace.
-        positions: The position of each step.
-    """
-
-    equal = [
-        pair
-        for pair in combinations(range(len(trace)), 2)
-        if len({positions[t] for t in pair}) == 1
-    ]
-    return len({*groups_of_drives(trace, [])}) - len({*groups_of_drives(trace, equal)})
-
-
-def price_of_laying(trace: Trace, theory: Theory) -> float:
-    """The price of laying drives on each other, which is higher if few views and no stars help."""
-    told = settle(trace, theory).theory
-    group = groups_of_drives(replace(trace, closures=()), [])
-    pairs = [(t, u) for t, u in combinations(range(len(trace)), 2) if group[t] != group[u]]
-    alike = [pair for pair in pairs if len({trace.views[t] for t in pair}) == 1]
-    if told.star != "none" or not alike:
-        return told.price_of_laying
-    return told.price_of_laying * max(1.0, 3 / math.log((len(pairs) + 400) / len(alike)))
-
-
-def groups_of_drives(trace: Trace, equal: Iterable[tuple[int, int]]) -> list[int]:
-    """For each step, a number of its group of drives. Closures and equal steps join drives."""
-    ties = [(closure.first, closure.last) for closure in trace.closures]
-    whole = [t - 1 for t, action in enumerate(trace.actions, 1) if not action.starts]
-    ends = np.array([*((t, t + 1) for t in whole), *ties, *equal]).reshape(-1, 2).T
-    graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(trace), len(trace)))
-    found: list[int] = connected_components(graph, directed=False)[1].tolist()
-    return found

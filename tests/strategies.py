@@ -15,7 +15,7 @@ from ssh_abduction.data.odometry import moved as moved_pose
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.encodings import Rules
-from ssh_abduction.theory.fields import COUNTS, PRICES, Count
+from ssh_abduction.theory.fields import COUNTS, Count
 from ssh_abduction.theory.theory import Theory
 
 ACTIONS = (*STANDARD_ACTIONS.values(), Action("creep", "travel"), Action("veer", "turn", "right"))
@@ -235,7 +235,6 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "jumped": st.just(0.0),
         "changed": st.just(0.0),  # tests/test_changes.py has tests of its own
         "weigh": st.just("auto"),  # tests/test_weighing.py has tests of its own
-        "prices": st.just(PRICES),
         "unknown_views": st.just(False),  # the trace says it
         "several_drives": st.just(False),
         "lifts": st.just(False),

@@ -103,10 +103,8 @@ def test_weighed_maps_do_not_depend_on_the_search(
         theory = data.draw(theories(trace, fixed=("displacement",)), label="theory")
     if not trace.has_displacements:
         return
-    nats, expected = cheapest(trace, weighed(theory, (8.0, 8.0, 0.0)))
-    found = searched(
-        data, trace, weighed(theory, (8.0, 8.0, 0.0)), tmp_path_factory.mktemp("maps"), work
-    )
+    nats, expected = cheapest(trace, weighed(theory))
+    found = searched(data, trace, weighed(theory), tmp_path_factory.mktemp("maps"), work)
     is_right(found, expected)
     if found.weighed is not None:
         assert found.weighed.bound <= nats + EQUAL

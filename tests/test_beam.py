@@ -217,9 +217,8 @@ def test_beam_cost_with_floors_equals_the_cost_of_the_map(seed: int) -> None:
     problem = settle(known.trace, Theory())
     beam = Beam(problem, Log(known.trace, problem.theory, problem.pairs), 1)
     maps = list(beam.maps())
-    dstate, place, _ = problem.theory.prices
     misfit = Misfit(problem)
-    nats = [dstate * len(m.dstates) + place * len(m.places) + misfit.of_map(m) / 2 for m in maps]
+    nats = [misfit.nats_of(m) for m in maps]
     assert nats[0] == pytest.approx(beam.hypotheses[0].nats, abs=0.1)
     assert any(truth.is_true(m, known) for m in maps)
 

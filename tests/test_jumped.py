@@ -31,6 +31,7 @@ from ssh_abduction.solver.sources.metric.wrong_displacements import (
 )
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.evidence.displacement import jumped
+from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import SPEEDUPS
 
@@ -185,7 +186,7 @@ def test_annealing_with_a_jump_costs_at_most_the_true_cost() -> None:
     steps[jump] = replace(steps[jump], displacement=AWAY, covariance=None)
     search = Search(replace(walk.trace, steps=tuple(steps)), Theory(jumped=1))
     parts, found = search.parts, dict[tuple[int, ...], float]()
-    misfit, (dstate, place, _) = Misfit(parts.task.problem), search.theory.prices
+    misfit = Misfit(parts.task.problem)
 
     def add(ssh_map: SSHMap) -> float:
         assert not check(search.trace, ssh_map, search.theory)
@@ -197,8 +198,8 @@ def test_annealing_with_a_jump_costs_at_most_the_true_cost() -> None:
     dstates, places = walk.truth, [state[:2] for state in walk.truth]
     number = [[*dict.fromkeys(names)].index for names in (dstates, places)]
     course = [*map(number[0], dstates)], [*map(number[1], places)]
-    true = misfit.of_course(*course, [jump]) / 2 + dstate * (len({*dstates}) + search.theory.jumped)
-    assert min(found.values()) <= true + place * len({*places}) + 1e-6 < found[()]
+    true = misfit.nats_of_course(*course, [jump]) + FAULT * search.theory.jumped
+    assert min(found.values()) <= true + 1e-6 < found[()]
     assert parts.candidates.map_without((), most=true / 2) is None
 
 

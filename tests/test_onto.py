@@ -254,7 +254,7 @@ def test_onto_adds_a_drive_with_displacements_by_cost() -> None:
     assert solution.weighed is not None
     assert solution.maps == joint.maps
     assert solution.weighed.nats == pytest.approx(joint.weighed.nats)
-    assert solution.confidence == pytest.approx(joint.confidence, abs=0.01)
+    assert solution.confidence == pytest.approx(joint.confidence, abs=0.05)
     assert solution.by_minimality == ()
     for rival in solution.weighed.rivals:
         assert rival.dstates[:4] == standing.maps[0].dstate_at

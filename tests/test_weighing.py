@@ -1,4 +1,4 @@
-"""Maps compared by their cost in nats: prices and misfit."""
+"""Maps compared by their cost in nats, minus the logarithm of their marginal likelihood."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Literal
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 import truth
 from brute_force import Key, consistent_maps, key
-from brute_misfit import LeastSquares, layings, price_of_laying
+from brute_misfit import LeastSquares
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import TOYS, theories, traces
@@ -22,7 +23,7 @@ from strategies import TOYS, theories, traces
 from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker import cost_claims
 from ssh_abduction.checker.checker import check
-from ssh_abduction.checker.cost_claims import false_costs, misfit
+from ssh_abduction.checker.cost_claims import cost_of, false_costs, misfit
 from ssh_abduction.cli import main
 from ssh_abduction.data import Closure, MapError, Odometry, SolverError, TheoryError, together
 from ssh_abduction.data.drives import Drive
@@ -33,8 +34,10 @@ from ssh_abduction.solver.costs import beams, weighing
 from ssh_abduction.solver.costs.estimating import estimated, rivals_of
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import Poses, fit
-from ssh_abduction.solver.solution.weighed import FITTED, Rival, Weighed
+from ssh_abduction.solver.solution.weighed import Rival, Weighed
 from ssh_abduction.solver.values import Found
+from ssh_abduction.theory import prior as prior_module
+from ssh_abduction.theory.prior import _area as area
 from ssh_abduction.theory.settle import settle
 
 EQUAL = 1e-6
@@ -46,7 +49,7 @@ PLAUSIBLE = 300.0  # the chi-square of a map that may be true
 def cheapest(trace: Trace, theory: Theory) -> tuple[float, set[Key]]:
     """The least cost and the maps that have it. Of maps with the same dstates and places, take
     those with the fewest paths."""
-    squares, laying = LeastSquares(trace), price_of_laying(trace, theory)
+    settled = settle(trace, theory).theory
     found: dict[tuple[object, object], tuple[float, int, set[Key]]] = {}
     toys = [toy for toy in TOYS if toy.rules in theory.rules]
     for one, counts in consistent_maps(trace, theory):
@@ -54,12 +57,8 @@ def cheapest(trace: Trace, theory: Theory) -> tuple[float, set[Key]]:
             continue
         labels, places, _ = one
         positions = tuple(-1 - i if place is None else place for i, place in enumerate(places))
-        prices = zip(theory.prices, (counts.dstates, counts.places, counts.paths), strict=True)
-        nats = sum(price * count for price, count in prices)
-        nats += squares.misfit(labels, positions) / 2
-        nats += laying * layings(trace, [positions[s] for s in labels])
-        if theory.level == "topological":
-            nats += theory.price_of_laying * squares.crowding(labels, positions)
+        at = [positions[label] for label in labels]
+        nats, _ = cost_of(trace, settled, labels, at, ())
         known = found.get((labels, places))
         if known is None or counts.paths < known[1]:
             known = found[labels, places] = nats, counts.paths, set()
@@ -86,10 +85,10 @@ def agree(trace: Trace, theory: Theory) -> None:
         assert check(trace, ssh_map, theory) == ()
 
 
-def weighed(theory: Theory, prices: tuple[float, float, float]) -> Theory:
-    """A theory that compares maps by cost. Excuses have no price in nats."""
+def weighed(theory: Theory) -> Theory:
+    """A theory that compares maps by cost. Excuses have no cost in nats."""
     boundary = "strict" if theory.boundary == "defeasible" else theory.boundary
-    return theory.replace(weigh="cost", prices=prices, prefer=("auto",), boundary=boundary)
+    return theory.replace(weigh="cost", prefer=("auto",), boundary=boundary)
 
 
 def cheapest_with_faults(trace: Trace, theory: Theory) -> tuple[float, set[Told]]:
@@ -105,12 +104,10 @@ def cheapest_with_faults(trace: Trace, theory: Theory) -> tuple[float, set[Told]
                 {(t, "jumped") for t in wrong}
                 | {(t, "misread") for t, view in enumerate(seen) if view != trace.views[t]}
             )
-            tenths = sum(settled.fault_tenths(kind, trace.steps[t]) for t, kind in faults)
             corrected = trace.with_views(list(seen)).without_displacements_at(wrong)
             bare = settled.without_faults()
             if not corrected.has_displacements:
                 bare = bare.replace(displacement="none")
-            squares = LeastSquares(corrected)
             for one, counts in consistent_maps(corrected, bare):
                 labels, places, _ = one
                 if not all(
@@ -119,11 +116,9 @@ def cheapest_with_faults(trace: Trace, theory: Theory) -> tuple[float, set[Told]
                 ):
                     continue  # no step shows the view of the dstate
                 positions = tuple(-1 - i if p is None else p for i, p in enumerate(places))
-                prices = zip(
-                    theory.prices, (counts.dstates, counts.places, counts.paths), strict=True
-                )
-                nats = sum(price * count for price, count in prices)
-                nats += theory.prices[0] * tenths / 10 + squares.misfit(labels, positions) / 2
+                at = [positions[label] for label in labels]
+                told = [(kind, t) for t, kind in faults]
+                nats, _ = cost_of(trace, settled, labels, at, told)
                 course = labels, places, wrong
                 known = found.get(course)
                 if known is None or (nats, counts.paths) < (known[0] - EQUAL, known[1]):
@@ -154,7 +149,6 @@ def test_faults_and_misfit_are_weighed_together(data: st.DataObject) -> None:
         star="none",
         reject=1e-300,
         weigh="cost",
-        prices=data.draw(st.sampled_from(PRICES), label="prices"),
         **faults,
     )
     nats, expected = cheapest_with_faults(trace, theory)
@@ -173,63 +167,88 @@ def test_faults_and_misfit_are_weighed_together(data: st.DataObject) -> None:
     assert list(false_costs(trace, answer, solution.maps, solution.theory)) == []
 
 
-PRICES = [(8.0, 8.0, 0.0), (1.0, 2.0, 0.5), (3.0, 0.0, 0.0)]
-
-
 @settings(max_examples=5)
 @given(st.data())
-def test_cheapest_maps_equal_plain_least_squares(data: st.DataObject) -> None:
+def test_cheapest_maps_equal_those_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(
         traces(closures=True).filter(lambda trace: trace.has_displacements), label="trace"
     )
     theory = data.draw(theories(trace, fixed=("displacement",)), label="theory")
-    agree(trace, weighed(theory, data.draw(st.sampled_from(PRICES), label="prices")))
+    agree(trace, weighed(theory))
 
 
-def test_two_places_at_one_position_pay_the_more_the_nearer_they_are() -> None:
-    theory = Theory(star="alike", elsewhere=((0, 3),), weigh="cost", boundary="none")
-    found: dict[float, float] = {}
-    for way in (9.2, 10.5):  # the drives differ in how far the first place is off
-        drives = [
-            Trace.from_steps(
-                views,
-                ["travel"] * 2,
-                displacements=[(first, 0.0, 0.0), (5.0, 0.0, 0.0)],
-                stars=[(1, 0, 1, 0)] * 3,
-            )
-            for views, first in (("cba", 9.0), ("dba", way))
-        ]
-        trace = together(drives)
-        solution = solve(trace, theory, time_limit=100)
-        assert solution.weighed is not None
-        assert len(solution.maps[0].dstates) == 4
-        found[way] = solution.weighed.nats - 4 * 16 - solution.theory.price_of_laying
-        answer = solution.to_dict()
-        assert [*false_costs(trace, answer, solution.maps, solution.theory)] == []
-        answer["weighed"]["nats"] -= 1
-        assert [*false_costs(trace, answer, solution.maps, solution.theory)] != []
-    assert found == pytest.approx({9.2: 14.4, 10.5: 4.0}, abs=0.01)
-    for less in (replace(trace.steps[1], displacement=None), trace.steps[1]):
-        steps = (trace.steps[0], less, *trace.steps[2:])
-        problem = settle(replace(trace, steps=steps), theory)
-        assert (problem.overlap.near == 0) == (less.displacement is None)
+def likelihood(trace: Trace, wide: list[float], samples: int = 200_000) -> float:
+    """The probability density with which the last displacement leads back to the first pose.
+
+    It is a mean over random errors of all displacements but the last one, whose density is known.
+    """
+    random = np.random.default_rng(1)
+    odometry = trace.odometry or Odometry()
+    scale, bend = random.normal(0, [[odometry.scale], [odometry.bend]], (2, samples))
+    pose = np.zeros((3, samples))
+
+    def noise(t: int) -> np.ndarray:
+        known = trace.covariance(t)
+        return np.diag(wide) if known is None else np.array(known)
+
+    for t, step in enumerate(trace.steps[1:-1], 1):
+        dx, dy, turn = step.displacement or (0.0, 0.0, 0.0)
+        way = math.hypot(dx, dy)
+        off = np.linalg.cholesky(noise(t)) @ random.normal(size=(3, samples))
+        ahead, left = dx / (1 + scale) + off[0], dy / (1 + scale) + off[1]
+        facing = pose[2] - bend * way / 2
+        pose[0] += np.cos(facing) * ahead - np.sin(facing) * left
+        pose[1] += np.sin(facing) * ahead + np.cos(facing) * left
+        pose[2] += turn - bend * way + off[2]
+    dx, dy, turn = trace.steps[-1].displacement or (0.0, 0.0, 0.0)
+    way = math.hypot(dx, dy)
+    facing = pose[2] - bend * way / 2
+    ahead = -np.cos(facing) * pose[0] - np.sin(facing) * pose[1] - dx / (1 + scale)
+    left = np.sin(facing) * pose[0] - np.cos(facing) * pose[1] - dy / (1 + scale)
+    turned = -pose[2] - (turn - bend * way)
+    turned -= math.tau * np.round(turned / math.tau)
+    errors = np.array([ahead, left, turned])
+    spread = noise(len(trace) - 1)
+    square = np.einsum("in,ij,jn->n", errors, np.linalg.inv(spread), errors)
+    return float(np.exp(-square / 2).mean() / math.sqrt(np.linalg.det(math.tau * spread)))
 
 
-@pytest.mark.slow
-def test_two_places_at_one_position_cost_what_the_brute_force_says() -> None:
-    drives = [
-        Trace.from_steps(views, ["travel"] * 2, displacements=[(way, 0, 0), (5, 0, 0)])
-        for views, way in (("cba", 9.0), ("dba", 10.5))
-    ]
-    agree(together(drives), Theory(elsewhere=((0, 3),), weigh="cost", prices=(8.0, 1.0, 0.0)))
+@pytest.mark.parametrize("off", [(0.0, 0.0, 0.0), (0.4, -0.2, 0.02)])
+def test_cost_of_a_loop_is_its_marginal_likelihood(off: tuple[float, float, float]) -> None:
+    """Laplace's approximation and a random sample give the same density of a closed loop."""
+    bend = (8.0, 0.0, math.pi / 2)
+    last = tuple(a + b for a, b in zip(bend, off, strict=True))
+    trace = Trace.from_steps(
+        "abcda",
+        ["bend"] * 4,
+        displacements=[bend, bend, bend, last],
+        odometry=Odometry(along=0.03, across=0.01, turning=0.01, angle=0.02, position=0.1),
+    )
+    problem = settle(trace, Theory.causal())
+    prior, misfit = problem.prior, Misfit(problem)
+    loop, way = ((0, 1, 2, 3, 0), (0, 1, 2, 3, 4))
+    saved = misfit.nats_of_course(way, way) - misfit.nats_of_course(loop, loop)
+    # A new pose has the density 1 / (2 pi A), and there are as many as `crowd` says.
+    density = saved - float(prior.seen[0].sum()) + prior.crowd - math.log(math.tau * prior.area)
+    assert density == pytest.approx(math.log(likelihood(trace, prior.wide.tolist())), abs=0.05)
+    for course in (loop, way):
+        nats, _ = cost_of(trace, problem.theory, course, course, ())
+        assert misfit.nats_of_course(course, course) == pytest.approx(nats, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    "prices", [(-1, 8, 0), (math.nan, 8, 0), ("dear", 8, 0), ("8", 8, 0), (8, 8), 8, (0, 8, 0)]
-)
-def test_prices_must_be_three_numbers(prices: object) -> None:
-    with pytest.raises(TheoryError, match=r"prices: expected .*, got"):
-        Theory(prices=prices)  # type: ignore[arg-type]
+def test_twice_the_area_changes_no_choice_where_displacements_are_known(
+    route: truth.Known,
+) -> None:
+    problem = settle(route.trace, Theory())
+    dstates, places = truth.partition(route.dstates), truth.partition(route.places)
+    courses = [(dstates, places), (range(len(dstates)), range(len(dstates)))]
+    costs = []
+    for factor in (1.0, 2.0, 4.0):
+        with patch.object(prior_module, "_area", lambda trace, f=factor: f * area(trace)):
+            misfit = Misfit(settle(route.trace, problem.theory))
+            costs.append([misfit.nats_of_course(*course) for course in courses])
+    differences = [one - other for one, other in costs]
+    assert differences == pytest.approx([differences[1]] * 3, abs=0.1)
 
 
 def test_weigh_cost_without_displacements_counts_maps() -> None:
@@ -368,14 +387,17 @@ def test_check_computes_the_costs_of_all_rivals_or_counts_the_others(
     assert weighed_route.trace is not None
     data = weighed_route.to_dict()
     rivals = data["weighed"]["rivals"]
-    rivals += [dict(rivals[1]) for _ in range(3)]  # unlikely, so the confidence hardly changes
+    rivals += [dict(rivals[1]) for _ in range(3)]
     last = len(rivals) - 1
+    data["weighed"] = Weighed.from_dict(FieldReader("here"), data["weighed"], 20).to_dict()
+    rivals = data["weighed"]["rivals"]
     files = tmp_path / "maps.json", tmp_path / "trace.jsonl"
     files[0].write_text(json.dumps(data))
     weighed_route.trace.save(files[1])
     assert main(["check", *map(str, files)]) == 0
     assert f"costs in nats of map 1 and {last} rivals are right" in capsys.readouterr().out
     rivals[last]["nats"] += 1.0
+    data["weighed"] = Weighed.from_dict(FieldReader("here"), data["weighed"], 20).to_dict()
     files[0].write_text(json.dumps(data))
     assert main(["check", *map(str, files)]) == 20
     assert f"weighed.rivals[{last}]: expected" in capsys.readouterr().out
@@ -447,8 +469,8 @@ def test_misfit_equals_that_of_the_checker(data: st.DataObject) -> None:
     poses = Poses(known.trace, names, [where[name] for name in range(len(where))])
     square = misfit(known.trace, names, places)
     # A map that fits worse is no rival, and its misfit may have several local minima.
-    if min(square, poses.placed()[0]) < PLAUSIBLE:
-        assert square == pytest.approx(poses.placed()[0], rel=1e-5, abs=1e-5)
+    if min(square, poses.misfit()) < PLAUSIBLE:
+        assert square == pytest.approx(poses.misfit(), rel=1e-5, abs=1e-5)
 
 
 def test_misfit_of_the_checker_is_exact_if_the_robot_misses_dstates() -> None:
@@ -554,26 +576,10 @@ def test_doubted_costs_give_no_confidence() -> None:
         Weighed.from_dict(read, {**doubted.to_dict(), "doubt": 3}, 3)
 
 
-def test_drives_that_share_one_place_are_not_sure() -> None:
-    """A rival that lays drives otherwise, or lays fewer, is less improbable than its cost says."""
-    drives = (Drive("monday", 0, 2), Drive("tuesday", 2, 4))
-    joined, alike, otherwise, apart = (0, 1, 0, 1), (0, 1, 0, 2), (0, 1, 1, 2), (0, 1, 2, 3)
-    for rival in (alike, otherwise, apart):
-        rivals = (Rival(50.0, joined, joined), Rival(58.0, rival, rival, estimated=True))
-        sure = Weighed(50.0, 0.0, rivals, True, drives=drives)
-        assert (sure.confidence > 0.95) == (rival == alike)
-        # A missing displacement frees the part after it, as the start of a drive does.
-        alone = Weighed(50.0, 0.0, rivals, True, gaps=(2,))
-        assert alone.weights == sure.weights
-        assert Weighed.from_dict(FieldReader("here"), alone.to_dict(), 4) == alone
-    assert sure.confidence == pytest.approx(1 / (1 + math.exp(-0.8)))
-    assert sure.probability(0, 2) == sure.confidence
-
-
 def test_estimated_rivals_take_each_drive_apart() -> None:
     joined = Rival(0.0, (0, 1, 2, 0, 1, 2, 3, 1), (0, 1, 2, 0, 1, 2, 3, 1))
     drives = (Drive("one", 0, 3), Drive("two", 3, 6), Drive("three", 6, 8))
-    known = estimated(joined, range(8), drives, lambda dstates, _: 20.0 * len({*dstates}), 10.0)
+    known = estimated(joined, range(8), drives, lambda dstates, _: len({*dstates}), 10.0)
     found = [rival.dstates for rival in known]
     assert found[:3] == [
         (0, 1, 2, 3, 4, 5, 6, 4),
@@ -609,9 +615,31 @@ def test_estimated_rivals_of_causal_maps_are_deterministic() -> None:
         leads = {*zip(rival.dstates, actions, rival.dstates[1:], strict=False)}
         assert len({lead[:2] for lead in leads}) == len(leads)
     weighed = Weighed(0.0, 0.0, (Rival(50.0, best.dstate_at), *rivals), True)
-    assert weighed.weights[1] / weighed.weights[0] == pytest.approx(
-        math.exp(50.0 - rivals[0].nats - FITTED)
-    )
+    assert weighed.weights[1] / weighed.weights[0] == pytest.approx(math.exp(50.0 - rivals[0].nats))
+
+
+def test_misread_view_is_suspected(tmp_path: Path) -> None:
+    """Three rounds of a square, with one wrong view in the second round."""
+    views = [*"abcdefgh" * 3, "a"]
+    moved = [(10, 0, 0), (0, 0, math.pi / 2)] * 12
+    odometry = Odometry(along=0.01, scale=0.01, position=0.05)
+    found = []
+    for seen in (views, [*views[:11], "x", *views[12:]]):
+        trace = Trace.from_steps(
+            seen, ["travel", "left"] * 12, displacements=moved, odometry=odometry
+        )
+        found.append(solve(trace, time_limit=100))
+    sure, doubtful = found
+    assert sure.confidence > 0.95
+    assert "misread" not in sure.sureness
+    assert (doubtful.confidence or 0.0) < 0.1
+    said = "step 11 may be misread: with misread allowed the map has 8 dstates instead of"
+    assert said in doubtful.sureness
+    doubtful.save(tmp_path / "maps.json")
+    assert Solution.load(tmp_path / "maps.json").sureness == doubtful.sureness
+    assert doubtful.trace is not None
+    answer = doubtful.to_dict()
+    assert [*false_costs(doubtful.trace, answer, doubtful.maps, doubtful.theory)] == []
 
 
 def test_online_mapper_refuses_weigh_cost() -> None:
@@ -633,16 +661,12 @@ def test_maps_of_least_cost_are_listed_once() -> None:
 
 @pytest.mark.parametrize(
     ("views", "missing", "confirmed"),
-    [
-        ("abcdefgh" * 2 + "a", {5}, True),
-        ("ababababa", {*range(1, 7)}, False),
-        ("abcdefghab", {8}, False),
-    ],
+    [("abcdefgh" * 2 + "a", {5}, True), ("ababababa", {*range(1, 7)}, False)],
 )
 def test_joins_across_missing_displacements_need_others(
     views: str, missing: set[int], confirmed: bool
 ) -> None:
-    """One or two joins between two parts of a trace are too few, as no or one loop tests them."""
+    """Where many displacements are missing, a few equal views say little."""
     moved = ([(10.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2)] * len(views))[: len(views) - 1]
     said = [None if t in missing else move for t, move in enumerate(moved, 1)]
     actions = (["travel", "left"] * len(views))[: len(moved)]
@@ -651,36 +675,6 @@ def test_joins_across_missing_displacements_need_others(
     assert weighed is not None
     assert weighed.proven
     assert ((weighed.confidence or 0.0) > 0.95) is confirmed
-    assert ("across a missing displacement" in weighed.sentence) is not confirmed
-
-
-def test_other_ways_to_lay_parts_between_gaps_are_rivals() -> None:
-    trace = Trace.from_steps(
-        "abcab", ["go"] * 4, displacements=[(9.0, 0, 0), (9.0, 0, 0), None, None]
-    )
-    weighing = Search(trace, Theory.causal())._weighing
-    assert weighing is not None
-    for different in ([], [(0, 3)], [(0, 3), (1, 4)]):
-        weighing.add(solve(trace, Theory.causal().replace(different=different))[0])
-    weighed = weighing.weighed()
-    assert weighed is not None
-    assert {len({*rival.dstates}) for rival in weighed.rivals if not rival.estimated} == {3, 4, 5}
-
-
-@pytest.mark.parametrize(("views", "is_known"), [("abcd", True), ("aaab", False)])
-def test_views_that_are_alike_do_not_replace_a_missing_displacement(
-    views: str, is_known: bool
-) -> None:
-    """A square room is driven around twice. Closures or other views say where the robot is."""
-    laps = [(10.0, 0.0, math.pi / 2)] * 8
-    trace = Trace.from_steps(
-        (views * 3)[:9], ["bend"] * 8, displacements=[*laps[:3], None, *laps[4:]]
-    )
-    closure = Closure(3, 7, (0.0, 0.0, 0.0), ((0.01, 0, 0), (0, 0.01, 0), (0, 0, 0.01)))
-    for tried, known in [(trace, is_known), (replace(trace, closures=(closure,)), True)]:
-        weighed = solve(tried, Theory.causal().replace(star="none")).weighed
-        assert weighed is not None
-        assert ("too much alike to tell where the robot was" in weighed.sentence) is not known
 
 
 def test_checker_begins_near_closures_that_connect_parts() -> None:

@@ -18,9 +18,10 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
-from itertools import accumulate, combinations, pairwise, product
+from itertools import pairwise, product
+from statistics import median
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -55,9 +56,12 @@ LONGEST = 400
 # The time for the cost of a map grows with the third power of the steps. Costs of rivals are
 # checked for at most the time of five in the longest trace.
 WORK = 5 * LONGEST**3
-# Two places are at one position if they are nearer than CROWDED times the shortest travel. A move
-# is a travel if it is longer than TRAVEL of the longest one.
-CROWDED, TRAVEL = 0.4, 0.1
+# The building reaches this many metres beyond the poses of dead reckoning, on each side.
+MARGIN = 3.0
+# The nats of a fault that costs as much as a dstate.
+FAULT = 5.0
+# The nats of a misread view that only a rival has, as the theory forbids it.
+SUSPECTED = 3.5
 # The direction from one place to another is too uncertain to use if they are closer than this many
 # metres.
 NEAR = 1.0
@@ -71,28 +75,13 @@ _Frame: TypeAlias = tuple[complex, float]  # a position, and a heading in radian
 
 def misfit(trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> float:
     """Compute the misfit (the least chi-square) if each step is at a given dstate and place."""
-    return _least(trace, dstates, places, ())[0]
-
-
-def _least(
-    trace: Trace, dstates: Sequence[int], places: Sequence[int], faults: Faults
-) -> tuple[float, Array]:
-    """Compute the misfit, and the position of the dstate of each step, in metres, (n, 2).
-
-    Faults have a kind and a step. A displacement that jumped is ignored.
-    """
-    wrong = [step for kind, step in faults if kind == "jumped"]
-    errors = _Errors(trace.without_displacements_at(wrong), dstates, places)
     with threadpool_limits(1, user_api="blas"):  # more threads only wait for each other
-        return errors.least(), errors.position
+        return _Errors(trace, dstates, places).least()
 
 
-def count_checked_rivals(steps: int, rivals: int, theory: Theory) -> int:
-    """Count the rivals whose costs `false_costs` checks: the first ones, as far as time permits.
-
-    It is 0 if paths have a price, as the paths of rivals are not listed.
-    """
-    return 0 if steps > LONGEST or theory.prices[2] else min(rivals, WORK // steps**3)
+def count_checked_rivals(steps: int, rivals: int) -> int:
+    """Count the rivals whose costs `false_costs` checks: the first ones, as far as time permits."""
+    return 0 if steps > LONGEST else min(rivals, WORK // steps**3)
 
 
 def false_costs(
@@ -124,135 +113,120 @@ def false_costs(
     places = [maps[0].dstates[label].place for label in maps[0].dstate_at]
     here = [p if p is not None else s for p, s in zip(places, maps[0].dstate_at, strict=True)]
     of_map: Faults = [(fault.kind, fault.step) for fault in maps[0].faults]
-    courses = [("weighed.nats", nats, maps[0].dstate_at, here, len(maps[0].places), of_map)]
+    courses = [("weighed.nats", nats, maps[0].dstate_at, here, of_map)]
     rivals = rivals if isinstance(rivals, list) else []
-    for i in range(count_checked_rivals(len(trace), len(rivals), theory)):
+    for i in range(count_checked_rivals(len(trace), len(rivals))):
         rival = rivals[i]
         at = rival.get("places") or rival.get("dstates")
-        there = len(set(at)) if rival.get("places") else 0
         of_rival = rival.get("faults", [])
         name = f"weighed.rivals[{i}]"
-        courses.append((name, rival.get("nats"), rival["dstates"], at, there, of_rival))
-    paths = theory.prices[2] * len(maps[0].paths)
-    for name, claimed, dstates, at, count, faults in courses:
-        true, square = _nats(trace, theory, dstates, at, count, faults)
-        true += paths if name == "weighed.nats" else 0.0
+        courses.append((name, rival.get("nats"), rival["dstates"], at, of_rival))
+    for name, claimed, dstates, at, faults in courses:
+        true, square = cost_of(trace, theory, dstates, at, faults)
         if abs(true - claimed) > EXACT + SHARE * square:
             yield f"{name}: expected {true:.3f} nats, by the displacements, got {claimed}"
 
 
-def _nats(
-    trace: Trace,
-    theory: Theory,
-    dstates: Sequence[int],
-    at: Sequence[int],
-    places: int,
-    faults: Faults,
+def cost_of(
+    trace: Trace, theory: Theory, dstates: Sequence[int], at: Sequence[int], faults: Faults
 ) -> tuple[float, float]:
-    """Compute the cost of a map without its paths, in nats, and its misfit.
+    """Compute the cost of a map in nats, and its misfit, if steps are at these dstates and places.
 
-    Each step is at a given dstate and place (`at`). The map has this number of places.
+    The cost is the sum, over the steps, of what a new dstate and place would cost, and for each
+    return the logarithm of two densities: that of a new pose, and that of the loop to close as the
+    displacements predict it.
     """
-    square, position = _least(trace, dstates, at, faults)
-    nats = theory.prices[0] * len(set(dstates)) + theory.prices[1] * places + square / 2
-    tenths = [theory.fault_tenths(kind, trace.steps[step]) for kind, step in faults]
-    nats += theory.prices[0] * sum(tenths) / 10
-    factor = _laying_factor(trace) if theory.star == "none" else 1.0
-    nats += theory.price_of_laying * factor * _layings(trace, at)
-    if theory.level == "topological" and not theory.lifts and not theory.jumped:
-        nats += theory.price_of_laying * _crowding(trace, dstates, at, position)
+    wrong = [step for kind, step in faults if kind == "jumped"]
+    errors = _Errors(trace.without_displacements_at(wrong), dstates, at)
+    with threadpool_limits(1, user_api="blas"):  # more threads only wait for each other
+        square = errors.least()
+    model = _Occam(trace, theory)
+    nats = square / 2 + errors.volume(model.wide) + model.of_steps()
+    nats += model.crowd * (len(at) - len(set(at)))
+    for of, names in enumerate((dstates, at)):
+        for name in set(names):
+            nats += model.shown(of, [t for t, x in enumerate(names) if x == name])
+    for kind, step in faults:
+        tenths = theory.fault_tenths(kind, trace.steps[step])
+        nats += FAULT * tenths / 10 if tenths or kind != "misread" else SUSPECTED
     return nats, square
 
 
-def _layings(trace: Trace, places: Sequence[int]) -> int:
-    """Count how often common places connect drives that no closures connect.
+class _Occam:
+    """The prior probabilities of the poses, views and stars of a trace.
 
-    This is the number of groups of drives connected by closures, minus the number of groups
-    connected by closures or places.
+    Attributes:
+        wide: The covariance of a Gaussian that is as dense at its mean as the prior, (3, 3).
+        crowd: The logarithm of the number of new places: half of those of the building.
     """
-    drive = _drives(trace)
-    tied = [{drive[closure.first], drive[closure.last]} for closure in trace.closures]
-    shared = [{drive[t] for t, p in enumerate(places) if p == place} for place in set(places)]
-    return len(_groups(drive, tied)) - len(_groups(drive, tied + shared))
 
+    def __init__(self, trace: Trace, theory: Theory) -> None:
+        self._trace, self._theory = trace, theory
+        area, at, usual = 0.0, [0j], []
+        heading = 0.0
+        for t, step in enumerate([*trace.steps[1:], None], 1):
+            if step is None or step.displacement is None:  # a stretch of dead reckoning ends
+                x, y = np.array([[z.real, z.imag] for z in at]).T
+                area = max(area, float((np.ptp(x) + 2 * MARGIN) * (np.ptp(y) + 2 * MARGIN)))
+                at, heading = [0j], 0.0
+                continue
+            gone = complex(*step.displacement[:2])
+            at.append(at[-1] + cmath.rect(1, heading) * gone)
+            heading += step.displacement[2]
+            if trace.actions[t - 1].kind == "travel" and gone:
+                usual.append(abs(gone))
+        each = median(usual) ** 2 if usual else area
+        self.crowd = math.log(max(area / each / 2, 2))
+        self.wide: Array = np.diag([area / math.tau, area / math.tau, math.tau])
+        stars = [self._gateways(t) if theory.star != "none" else None for t in range(len(trace))]
+        views = self._rarity(trace.views)
+        if theory.level == "causal":
+            both = [a + b for a, b in zip(views, self._rarity(stars), strict=True)]
+            self._seen = both, [0.0] * len(trace)
+        else:
+            self._seen = views, self._rarity(stars)
 
-def _laying_factor(trace: Trace) -> float:
-    """Compute how many times as much laying drives costs if only views tell places apart.
+    def of_steps(self) -> float:
+        """Compute what all steps cost at new places."""
+        off, nats = _off_dstates(self._trace), 0.0
+        for t in range(1, len(self._trace)):
+            if (given := self._trace.covariance(t)) is None:
+                continue
+            spread = np.array(given) + (np.diag(off[t] ** 2) if len(off) else 0.0)
+            ratio = (np.linalg.solve(spread[:k, :k], self.wide[:k, :k]) for k in (2, 3))
+            dets = (np.linalg.slogdet(np.identity(len(some)) + some)[1] for some in ratio)
+            position, both = (float(det) / 2 for det in dets)
+            nats += max(position - self.crowd, 0.0) + both - position
+        return nats
 
-    Of the pairs of steps of different drives, and of 400 further pairs that differ, a share q has
-    equal views. The factor is 3 / log(1/q), at least 1.
-    """
-    views: dict[int, Counter[Hashable]] = defaultdict(Counter)
-    for drive, view in zip(_drives(trace), trace.views, strict=True):
-        views[drive][view] += 1
-    alike = pairs = 0
-    for one, other in combinations(views.values(), 2):
-        pairs += one.total() * other.total()
-        alike += sum(one[view] * other[view] for view in one)
-    return max(3 / -math.log(alike / (pairs + 400)), 1.0) if alike else 1.0
+    def shown(self, of: int, steps: Sequence[int]) -> float:
+        """Return the nats of what steps at one dstate (of=0) or place (of=1) see."""
+        pick = min if self._theory.misread or self._theory.changed else max
+        return pick(self._seen[of][t] for t in steps)
 
+    def _gateways(self, step: int) -> int | None:
+        """Count the gateways that a step sees; None if some are unknown."""
+        star = self._trace.steps[step].gateways
+        known = star is not None and all(gateway.open for gateway in star.gateways)
+        return len(star.gateways) if star is not None and known else None
 
-def _crowding(
-    trace: Trace, dstates: Sequence[int], places: Sequence[int], position: Array
-) -> float:
-    """Count the pairs of places at one position that no group of drives saw both.
-
-    Closures connect the drives of a group. A pair counts less the farther the two are apart. It
-    counts if common places or a common dstate fix how the drives lie.
-    """
-    drive = _drives(trace)
-    moves = [
-        step.displacement
-        for t, step in enumerate(trace.steps)
-        if t and not trace.actions[t - 1].starts
-    ]
-    if any(move is None for move in moves):
-        return 0.0
-    ways = [math.hypot(*move[:2]) for move in moves if move is not None]
-    near = CROWDED * min((way for way in ways if way > TRAVEL * max(ways)), default=0.0)
-    tied = [{drive[closure.first], drive[closure.last]} for closure in trace.closures]
-    groups = _groups(drive, tied)
-    group = [next(i for i, members in enumerate(groups) if number in members) for number in drive]
-    saw = {p: {group[t] for t, q in enumerate(places) if p == q} for p in places}
-    faced = [{group[t] for t, x in enumerate(dstates) if s == x} for s in set(dstates)]
-    twice = [one & other for one, other in combinations(saw.values(), 2) if len(one & other) > 1]
-    frames = _groups(group, [*faced, *twice])
-    count = 0.0
-    for p, q in combinations(saw, 2):
-        is_fixed = any(frame & saw[p] and frame & saw[q] for frame in frames)
-        if near and is_fixed and not saw[p] & saw[q]:
-            away = position[places.index(p)] - position[places.index(q)]
-            count += max(0.0, 1 - float(np.hypot(*away)) / near)
-    return count
-
-
-def _drives(trace: Trace) -> list[int]:
-    """Return the number of the drive of each step."""
-    return [0, *accumulate(int(action.starts) for action in trace.actions)]
-
-
-def _groups(members: Collection[int], ties: Sequence[set[int]]) -> list[set[int]]:
-    """Merge members that are in one set of `ties`, directly or by others."""
-    groups = [{member} for member in set(members)]
-    for some in ties:
-        apart = [group for group in groups if not group & some]
-        groups = [*apart, some.union(*(group for group in groups if group & some))]
-    return groups
+    @staticmethod
+    def _rarity(seen: Sequence[Hashable]) -> list[float]:
+        """For each step, -log of the share of the steps that see the same; 0 if it is unknown."""
+        count = Counter(seen)
+        known = len(seen) - count[None]
+        return [0.0 if name is None else math.log(known / count[name]) for name in seen]
 
 
 class _Errors:
-    """The errors of the displacements and closures that make the loops of a map close.
-
-    Attributes:
-        position: The position of the dstate of each step, after `least`.
-    """
+    """The errors of the displacements and closures that make the loops of a map close."""
 
     def __init__(self, trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> None:
         odometry = trace.odometry or Odometry()
         self._moved = np.zeros((len(trace), 3))
         self._root = np.tile(MISSING * np.identity(3), (len(trace), 1, 1))
         self._root[0] = 0.0
-        missing = []
+        self._missing = missing = list[int]()
         for t, step in enumerate(trace.steps[1:], 1):
             if step.displacement is None:
                 missing.append(t)
@@ -260,10 +234,12 @@ class _Errors:
                 self._moved[t] = step.displacement
                 self._root[t] = np.linalg.cholesky(np.array(trace.covariance(t)))
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
+        self._scaled = np.array([step.displacement is not None for step in trace.steps])
         # If a heading after a gap is too far off, Gauss-Newton fails. So begin near the solution.
         for t, likely in _likely_moves(self._moved, missing, dstates, places, trace.closures):
             self._moved[t] = likely
         self._sigma = np.array([odometry.scale, odometry.bend])
+        self._best: Array = np.zeros(0)
         self._off = _off_dstates(trace)
         covariances = np.array([c.covariance for c in trace.closures]).reshape(-1, 3, 3)
         self._doubt = np.linalg.cholesky(covariances)
@@ -282,7 +258,6 @@ class _Errors:
         self._loops = np.array(ends, dtype=int).reshape(-1, 2).T
         self._counts = np.array(counts, dtype=bool).reshape(-1, 3)
         self._closures = np.array([(c.first, c.last) for c in trace.closures], int).reshape(-1, 2).T
-        self.position: Array = np.zeros((len(trace), 2))
 
     def least(self) -> float:
         """Compute the least sum of squares of the errors, in standard deviations."""
@@ -295,8 +270,31 @@ class _Errors:
             moved, z = float(abs(new - z).max()), new
             if moved < STILL:
                 break
-        self.position = self._poses(z)[1][:, :2]
+        self._best = z
         return float(z @ z)
+
+    def volume(self, wide: Array) -> float:
+        """Compute by how much the loops are less surely predicted than by the prior, in nats.
+
+        `wide` is the covariance of the prior, (3, 3). It is that of a missing displacement, too.
+        """
+        if not self._loops.size + self._closures.size:
+            return 0.0
+        steps, z = len(self._moved), self._best
+        jacobian = self._derivatives(z)
+        # The errors of displacements are in metres of the world, so they do not have its scale.
+        stretch = np.diag([1 + self._sigma[0] * z[-2]] * 2 + [1.0])
+        for t in range(1, steps):
+            of = slice(3 * t, 3 * t + 3)
+            root = np.sqrt(wide) if t in self._missing else stretch @ self._root[t]
+            jacobian[:, of] = jacobian[:, of] @ np.linalg.solve(self._root[t], root)
+        counts = np.concatenate([self._counts, np.ones((len(self._doubt), 3), bool)])
+        free = [np.linalg.cholesky(wide)] * len(self._counts) + [*self._doubt]
+        expected = sum(
+            float(np.log(np.diag(root)[count]).sum())
+            for root, count in zip(free, counts, strict=True)
+        )
+        return float(np.linalg.slogdet(jacobian @ jacobian.T)[1]) / 2 - expected
 
     def _derivatives(self, z: Array) -> Array:
         """Compute the derivatives J of c(z), of shape (numbers in c, unknowns).
@@ -325,6 +323,7 @@ class _Errors:
         turned = moved[..., 2] - bend * self._way
         heading = np.cumsum(turned, axis=-1)
         middle = heading - turned - bend * self._way / 2
+        scale = scale * self._scaled  # a missing displacement is in metres of the world
         way = np.cumsum(_turned(moved, middle) / (1 + scale[..., None]), axis=-2)
         pose = np.concatenate([way, heading[..., None]], axis=-1)
         if not len(self._off):

@@ -121,7 +121,7 @@ class _Judgement:
         self.said += false
         self.holds &= not false
         rivals = len(data["weighed"]["rivals"])  # the first one is map 1
-        checked = max(count_checked_rivals(len(trace), rivals, theory), 1)
+        checked = max(count_checked_rivals(len(trace), rivals), 1)
         if len(trace) > LONGEST:
             why = f"as the trace has more than {LONGEST} steps"
             self.said.append(f"costs in nats are not checked, {why}")
@@ -132,9 +132,8 @@ class _Judgement:
                 f"the costs in nats of map 1{others} are right: they were computed anew"
             )
         if rivals > checked:
-            why = "as paths have a price" if theory.prices[2] else "as that would take long"
             more = counted(rivals - checked, "more rivals")
-            self.said.append(f"the costs of {more} are not checked, {why}")
+            self.said.append(f"the costs of {more} are not checked, as that would take long")
 
     def check_bound(self, doubt: str | None, solved: Theory, unproven: str | None) -> None:
         """Check the lower bound and the other claims in the file of maps.

@@ -65,7 +65,7 @@ def theory_rows(default: str = "topological") -> Rows:
     for name, text in ASSERTED.items():
         said = f"assume that steps I and J {text}"
         rows[f"--{name.replace('_', '-')} I,J"] = said, {"action": "append"}
-    values = {"rules": "FILE...", "prices": "DSTATE,PLACE,PATH"}
+    values = {"rules": "FILE..."}
     by_type = {bool: "true|false", int: "N", float: "NUMBER"}
     for field in fields(Theory):
         if field.name not in (*ASSERTIONS, *SETTLED):

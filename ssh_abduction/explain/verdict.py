@@ -168,29 +168,17 @@ class PairExplanation:
         assert lost.cost is not None and won.cost is not None  # noqa: PT018
         joining = self.verdict is Verdict.DIFFERENT_IN_MINIMAL
         pair = f"steps {self.first} and {self.second}"
-        names = ("dstates", "places", "paths", "faults")  # a fault costs dstates
-        prices = (*self.theory.prices, self.theory.prices[0])
+        names = ("dstates", "places", "faults")
         more = {name: getattr(lost.cost, name) - getattr(won.cost, name) for name in names}
-        price = sum(prices[i] * more[name] for i, name in enumerate(names))
-        misfit = lost.nats - won.nats - price
         what = f"joining {pair}" if joining else f"making {pair} different dstates"
         changed = [
-            (number, _counted(abs(number), name))
-            for i, (name, number) in enumerate(more.items())
-            if number and prices[i]
+            f"{_counted(abs(number), name)} {'more' if number > 0 else 'less'}"
+            for name, number in more.items()
+            if number
         ]
-        if not changed:
-            counts = "leaves the price of the parts as it is"
-        elif len({number > 0 for number, _ in changed}) == 1:  # all counts rise, or all fall
-            effect = "costs" if price > 0 else "saves"
-            counts = f"{effect} {', '.join(text for _, text in changed)} ({abs(price):.1f} nats)"
-        else:
-            priced = (f"{text} {'more' if number > 0 else 'less'}" for number, text in changed)
-            counts = f"{_effect(price)} for its parts ({', '.join(priced)})"
+        counts = f", with {' and '.join(changed)}" if changed else ""
         loop = f": {self.loop}" if self.loop else ""
-        laying = " and of laying drives on each other" if self.theory.several_drives else ""
-        effect = _effect(misfit) if abs(misfit) >= 0.05 else "0.0 nats"
-        return f"{what} {counts} and {effect} of misfit{laying}{loop}"
+        return f"{what} {_effect(lost.nats - won.nats)}{counts}{loop}"
 
     @property
     def assuming(self) -> dict[str, str]:

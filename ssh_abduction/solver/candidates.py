@@ -29,6 +29,7 @@ from ssh_abduction.solver.sources.symbolic.sketched import (
 )
 from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
 from ssh_abduction.solver.values import Found
+from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
@@ -109,7 +110,7 @@ class Candidates:
         mended = trace.without_displacements_at(wrong)
         problem = self._task.problem.changed(mended, theory.replace(jumped=0.0))
         jumps = faults_of(((t, "jumped") for t in wrong), {}, {}, trace, theory)
-        most -= theory.prices[0] * sum(fault.cost for fault in jumps)
+        most -= FAULT * sum(fault.cost for fault in jumps)
         for ssh_map in Beam(problem, self._task.log, 1).maps(most):
             whole = with_more_faults(ssh_map, jumps)
             if self._judging.accepts(whole):

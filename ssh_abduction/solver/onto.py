@@ -41,7 +41,6 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.limits import EARLY, LimitError, Stop, Watch
 from ssh_abduction.solver.board import Judging
-from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of
 from ssh_abduction.solver.costs.estimating import may_join_more, rival_of, rivals_of
 from ssh_abduction.solver.derived_regions import Deriving
 from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning
@@ -53,7 +52,7 @@ from ssh_abduction.solver.sources.exact.choosing import READABLE
 from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond
 from ssh_abduction.solver.sources.symbolic.sketched import first_contradiction
-from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status, nats_of
+from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -359,14 +358,14 @@ def laid(
     assert best.fit is not None
     known = [rival_of(m, nats) for nats, m in found]
     moved = rivals_of(problem, misfit, best, turn("estimated rivals").most, len(old))
+    at_least = problem.prior.at_least
     weighed = Weighed(
-        bound=max(nats_of(cost, theory) for cost in _costs(ssh_map)) + kept.chi2 / 2,
+        bound=max(at_least({"dstates": c.dstates, "places": c.places}) for c in _costs(ssh_map))
+        + kept.chi2 / 2,
         within=0.0,
         rivals=(known[0], *(replace(rival, estimated=True) for rival in known[1:]), *moved),
         searched=best.fit.p >= IMPROBABLE and not may_join_more(problem, known),
         broken=existing.broken,
-        doubt=doubt_of(problem, best),
-        gaps=gaps_of(problem),
         drives=drives_of(joint),
     )
     return best, weighed

@@ -83,12 +83,6 @@ class Found:
         return Found(ssh_map, Cost.of(ssh_map).preferred_by(theory))
 
 
-def nats_of(cost: Cost, theory: Theory) -> float:
-    """Return the price of dstates, places, paths and faults in nats, without the misfit."""
-    dstate, place, path = theory.prices
-    return dstate * (cost.dstates + cost.faults) + place * cost.places + path * cost.paths
-
-
 def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> Cost:
     """Return the cost of a map, with the counts that the theory minimises taken from clingo.
 

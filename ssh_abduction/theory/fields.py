@@ -23,19 +23,9 @@ COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
 AUTO: tuple[Count, ...] = ("auto",)
 PREFERRED: tuple[Count, ...] = ("dstates", "paths", "places")
 WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
-# The default prices of a dstate, a place and a path, in nats (docs/measurements/truth.md says how
-# they were chosen), and the highest price.
-PRICES = (8.0, 8.0, 0.0)
-# Laying a drive on others costs as much as LAID dstates and their places, because that many may
-# look alike by chance. With star=alike, which compares bearings, it costs as much as one dstate and
-# its place (docs/measurements/truth.md).
-LAID = 2
-# Without stars, only views tell places apart. If steps of two drives look alike with probability q,
-# each step tells log(1/q) nats. If these are fewer than TOLD, laying costs TOLD / log(1/q) times as
-# much. So that few steps do not mislead, q counts UNLIKE more pairs that differ
-# (docs/measurements/truth.md).
-TOLD, UNLIKE = 3.0, 400
-DEAREST_PRICE = 1e6
+# A fault that costs as much as one dstate has the probability exp(-FAULT), if maps are compared by
+# cost in nats.
+FAULT = 5.0
 # The axioms that a fault of each kind may break. Speed-ups cannot rely on them.
 EXCUSED = {
     "misread": {"functional_view", "star_pattern", "star_frame"},
@@ -95,7 +85,6 @@ class Choices:
     several_drives: bool = False
     lifts: bool = False
     weigh: Literal["auto", "cost", "count"] = "auto"
-    prices: tuple[float, float, float] = PRICES
 
     def __post_init__(self) -> None:
         for name, values in CHOICES.items():
@@ -105,7 +94,6 @@ class Choices:
                 flag = a_flag(field.name, getattr(self, field.name), TheoryError)
                 object.__setattr__(self, field.name, flag)
         _check_numbers(self)
-        _check_prices(self)
         _set_names(self, "prefer", (*COUNTS, *AUTO))
         _set_names(self, "without", [a.name for a in encodings.axioms()])
         object.__setattr__(self, "rules", Rules.all_of(self.rules))
@@ -143,7 +131,6 @@ SPOKEN_FOR = {
     "joint",
     "returns",
     "weigh",
-    "prices",
     "same",
     "different",
     "elsewhere",
@@ -298,29 +285,6 @@ def _check_numbers(theory: Choices) -> None:
         value = a_whole_number(name, value, TheoryError, least, most, mend=mend)
         object.__setattr__(theory, name, value)
     object.__setattr__(theory, "reject", float(theory.reject))
-
-
-def _check_prices(theory: Choices) -> None:
-    """Convert the prices to three floats. Raises TheoryError."""
-    given: Any = theory.prices
-    try:
-        if isinstance(given, str):
-            given = map(float, given.split(","))
-        prices = tuple(float(price) for price in given if not isinstance(price, bool | str))
-    except (TypeError, ValueError):
-        prices = ()
-    if len(prices) != 3 or not all(0 <= price <= DEAREST_PRICE for price in prices):
-        raise TheoryError(
-            f"prices: expected three numbers from 0 to {DEAREST_PRICE:g}, the nats that a dstate, "
-            f"a place and a path cost, got {brief(theory.prices)}; write prices=(8, 8, 0) "
-            "(--set prices=8,8,0)"
-        )
-    if prices[0] == 0:
-        raise TheoryError(
-            f"prices: expected a dstate to cost more than 0 nats, got {brief(theory.prices)}; "
-            "free dstates explain every trace; write prices=(8, 8, 0)"
-        )
-    object.__setattr__(theory, "prices", prices)
 
 
 def _set_names(theory: Choices, field: str, allowed: Iterable[str]) -> None:

@@ -11,16 +11,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Displacement, Evidence, evidence_of, pairs_of
 from ssh_abduction.theory.fields import AUTO, can_weigh, choice
-from ssh_abduction.theory.overlap import Overlap
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.theory import Theory, checked_theory
+
+if TYPE_CHECKING:
+    from ssh_abduction.theory.prior import Prior
 
 Star: TypeAlias = Literal["auto", "none", "alike", "pattern", "frame", "gateways"]
 
@@ -54,9 +56,11 @@ class Problem:
         return pairs_of(self.trace, self.theory, self.evidence)
 
     @cached_property
-    def overlap(self) -> Overlap:
-        """The price of laying drives on each other."""
-        return Overlap(self.trace, self.theory)
+    def prior(self) -> Prior:
+        """The prior probabilities of the cost of maps."""
+        from ssh_abduction.theory.prior import Prior  # loads numpy
+
+        return Prior(self.trace, self.theory)
 
     def changed(self, trace: Trace | None = None, theory: Theory | None = None) -> Problem:
         """Return this problem with another trace or theory; None keeps the old one.

@@ -30,7 +30,6 @@ from ssh_abduction.theory.fields import (
     AUTO,
     CAUSAL,
     EXCUSED,
-    LAID,
     PATHS,
     PREFERRED,
     SPOKEN_FOR,
@@ -103,12 +102,9 @@ class Theory(Choices):
         elsewhere: Pairs of steps known to be at different places.
         same_place: Pairs of steps known to be at one place.
         weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats:
-            the prices of their dstates, places, paths and faults, plus half of the chi-square of
-            their misfit to the displacements. auto: cost if displacements are used, dstates come
-            first in `prefer`, and there are no excuses.
-        prices: Three numbers: the prices of a dstate, a place and a path in nats (natural
-            logarithms of odds). A fault costs its `misread`, `slipped`, `jumped` or `changed`,
-            times the price of a dstate. Used only if maps are compared by cost.
+            minus the logarithm of their marginal likelihood, and FAULT nats for each fault times
+            its `misread`, `slipped`, `jumped` or `changed`. auto: cost if displacements are used,
+            dstates come first in `prefer`, and there are no excuses.
     """
 
     def __repr__(self) -> str:
@@ -173,16 +169,6 @@ class Theory(Choices):
         if self.boundary == "defeasible" and "excuses" not in prefer:
             return ("excuses", *prefer)
         return prefer
-
-    @property
-    def price_of_laying(self) -> float:
-        """The price in nats of the claim that a drive shares places with other drives.
-
-        Without stars, the price of a trace may be higher (`Overlap`).
-        """
-        dstate, place, _ = self.prices
-        number = 1 if self.star == "alike" else LAID
-        return number * (dstate + place if self.level == "topological" else dstate)
 
     def without_faults(self) -> Theory:
         """Return this theory without faults: a map may treat nothing as wrong."""

@@ -14,12 +14,12 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import StageTimeError
-from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.solution.weighed import EQUAL
 from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.solver.values import Status
+from ssh_abduction.theory.prior import spreads_of
 
 # The numbers of hypotheses of the beams, in their order.
 WIDTHS = (1, 4, 16)

@@ -9,21 +9,21 @@ one action leads to from one dstate stay together, because actions are determini
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, TypeAlias
 
 from ssh_abduction.data.drives import Drive, drive_of_steps, drives_of
-from ssh_abduction.data.groups import gathered, indices_of, numbered
+from ssh_abduction.data.groups import NodeClasses, gathered, indices_of, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.solution.weighed import CHANCE, Rival, groups_of_drives
+from ssh_abduction.solver.solution.weighed import Rival
 from ssh_abduction.solver.sources.metric.completing import completed
-from ssh_abduction.solver.values import Cost, nats_of
+from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory.evidence.displacement import jumped
-from ssh_abduction.theory.overlap import groups_of_each
+from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.pairs import pairs_in
 from ssh_abduction.theory.settle import Problem
 
@@ -34,6 +34,11 @@ if TYPE_CHECKING:
 Course: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
 # Computes the cost in nats of a map with these dstates and places.
 CostOf: TypeAlias = Callable[[Sequence[int], Sequence[int]], float]
+# If the theory forbids misread views, a view is still misread with the probability exp(-MISREAD):
+# one in 33.
+MISREAD = 3.5
+# Two dstates of a place face one way if their headings differ by less than this many radians.
+ONE_WAY = 0.4
 # Leave out rivals that cost CERTAIN nats more than the best map. Even a million of them together
 # have a probability of only 0.005.
 CERTAIN = 19.0
@@ -45,19 +50,14 @@ def rivals_of(
     """Yield estimated rivals that cost little more than the best map, each once.
 
     `seconds` is the time that this may take. The first `kept_steps` steps keep their dstates and
-    places. `estimated` says what the rivals are. Drives that closures connect to others do not
-    overlap by chance. They stay connected. So do steps that the user says are at one dstate or
-    place.
+    places. `estimated` says what the rivals are. Steps that the user says are at one dstate or
+    place stay so.
     """
     theory = problem.theory
     same, same_place = (theory.same, theory.same_place) if "asserted" in theory.axioms else ((), ())
-    dstate, place, _ = theory.prices
     rival = rival_of(best, misfit.nats_of(best))
     kept_labels = rival.dstates[:kept_steps], rival.places[:kept_steps]
-    kept = nats_of(replace(Cost.of(best), dstates=0, places=0), theory)
-    # Drives that no closure ties to others may lie otherwise.
-    drives = drives_of(problem.trace)
-    free = [drive for i, drive in enumerate(drives) if not problem.overlap.is_tied(i)]
+    kept, drives = FAULT * Cost.of(best).faults, drives_of(problem.trace)
 
     def cost_of(dstates: Sequence[int], places: Sequence[int]) -> float:
         if (
@@ -66,8 +66,7 @@ def rivals_of(
             or any(places[i] != places[j] for i, j in same_place)
         ):
             return math.inf
-        nats: float = kept + misfit.nats_of_course(dstates, places or dstates, jumped(best))
-        return nats + dstate * len(set(dstates)) + place * len(set(places))
+        return kept + misfit.nats_of_course(dstates, places or dstates, jumped(best))
 
     # For each step, the first step of its visit. Where the place changes, a visit begins, too. In a
     # causal map, the steps to which one action leads from one dstate are one visit.
@@ -80,7 +79,51 @@ def rivals_of(
         else:
             before = rival.dstates[t - 1], action.name
             begins.append(t if action.starts else first.setdefault(before, t))
-    return estimated(rival, begins, free, cost_of, seconds)
+    return estimated(rival, begins, drives, cost_of, seconds)
+
+
+def rivals_with_misread_views(problem: Problem, misfit: Misfit, best: SSHMap) -> Iterator[Rival]:
+    """Yield rivals in which some views are misread, although the theory forbids that.
+
+    Two dstates of one place that face one way are a sign of a misread view: in a rival, they are
+    one. One rival joins all such dstates, and one for each pair joins only this pair. A misread
+    view costs MISREAD nats.
+    """
+    if problem.theory.misread or not best.places:
+        return
+    from ssh_abduction.solver.geometry.fit import fit  # loads scipy
+
+    trace = problem.trace.without_displacements_at(jumped(best))
+    facing = [pose.heading for pose in fit(trace, best).poses]
+    at, rival = best.dstates, rival_of(best, 0.0)
+    pairs = [
+        (s, x)
+        for s, x in combinations(range(len(at)), 2)
+        if at[s].place == at[x].place
+        and None not in (at[s].view, at[x].view)
+        and at[s].view != at[x].view
+        and abs(math.remainder(facing[s] - facing[x], math.tau)) < ONE_WAY
+    ]
+    for some in [pairs, *([pair] for pair in pairs)] if len(pairs) > 1 else filter(None, [pairs]):
+        merged = NodeClasses[int]()
+        waiting = [*some]
+        while waiting:  # an action leads from one dstate to one dstate
+            for s, x in waiting:
+                merged.merge(s, x)
+            led: dict[tuple[int, str], int] = {}
+            ends = [(led.setdefault((merged.of(s), a), x), x) for s, a, x in best.links]
+            waiting = [pair for pair in ends if not merged.are_one(*pair)]
+        dstates = numbered(map(merged.of, best.dstate_at))
+        if len({*zip(dstates, rival.places, strict=True)}) > len({*dstates}):
+            continue  # a dstate would be at two places
+        views = gathered(zip(dstates, problem.trace.views, strict=True))
+        right = {s: Counter(filter(None, seen)).most_common(1)[0][0] for s, seen in views.items()}
+        seen = zip(dstates, problem.trace.views, strict=True)
+        wrong = [t for t, (s, view) in enumerate(seen) if view not in (None, right[s])]
+        nats = misfit.nats_of_course(dstates, rival.places, jumped(best))
+        nats += FAULT * Cost.of(best).faults + MISREAD * len(wrong)
+        faults = (*rival.faults, *(("misread", t) for t in wrong))
+        yield Rival(nats, tuple(dstates), rival.places, True, faults)
 
 
 def may_join_more(problem: Problem, rivals: Sequence[Rival]) -> bool:
@@ -88,12 +131,10 @@ def may_join_more(problem: Problem, rivals: Sequence[Rival]) -> bool:
 
     Without places, drives share no dstate if all their views or stars differ.
     """
-    at, drives = rivals[0].at, drives_of(problem.trace)
-    groups = min(groups_of_drives(rival.at, drives) for rival in rivals)
-    of_drive = drive_of_steps(drives)
-    of_group = groups_of_each(at, of_drive, range(len(drives)))
-    group = [of_group[i] for i in of_drive]
-    if len({*group}) == 1 or groups < len({*group}):
+    of_drive = drive_of_steps(drives_of(problem.trace))
+    group, *others = (groups_of_drives(rival.at, of_drive) for rival in rivals)
+    fewest = min((len({*other}) for other in others), default=math.inf)
+    if len({*group}) == 1 or fewest < len({*group}):
         return False
     theory = problem.theory
     if theory.level != "causal" or theory.misread or theory.unknown_views:
@@ -137,7 +178,7 @@ def estimated(
     """
     watch = Watch().part(seconds)
     tried: set[Course] = {(best.dstates, best.places)}
-    for moved, most in _moves(best, begins, drives):
+    for moved in _moves(best, begins, drives):
         dstates, places = (zip(of, moved, strict=False) for of in (best.dstates, best.places))
         course = tuple(numbered(dstates)), tuple(numbered(places))
         if course in tried:
@@ -149,22 +190,20 @@ def estimated(
                 nats = cost_of(*course)
         except LimitError:
             return
-        if nats < best.nats + most:
+        if nats < best.nats + CERTAIN:
             yield Rival(nats, *course, True, best.faults)
 
 
-def _moves(
-    best: Rival, begins: Sequence[int], drives: Sequence[Drive]
-) -> Iterator[tuple[list[bool], float]]:
-    """Yield for each rival which steps get a new place, and the most nats that it may cost more."""
+def _moves(best: Rival, begins: Sequence[int], drives: Sequence[Drive]) -> Iterator[list[bool]]:
+    """Yield for each rival which steps get a new place."""
     for drive in drives:
-        yield [drive.first <= t < drive.stop for t in range(len(begins))], CHANCE * CERTAIN
+        yield [drive.first <= t < drive.stop for t in range(len(begins))]
     visits = gathered((best.at[step], step) for step, begin in enumerate(begins) if begin == step)
     for firsts in visits.values():
         singly = [{begin} for begin in firsts[1:]]
         from_then_on = [set(firsts[i:]) for i in range(1, len(firsts) - 1)]
         for moved in (*singly, *from_then_on):
-            yield [begin in moved for begin in begins], CERTAIN
+            yield [begin in moved for begin in begins]
 
 
 def dstates_and_places(ssh_map: SSHMap) -> Course:
@@ -188,3 +227,11 @@ def least_places(problem: Problem) -> int:
 
     pairs = pairs_in(problem.pairs.elsewhere)
     return len(pairwise_distinct(sorted({0, *chain(*pairs)}), pairs))
+
+
+def groups_of_drives(at: Sequence[int], drive: Sequence[int]) -> list[int]:
+    """Return a number for each step. Drives with different numbers share no place (`at`)."""
+    group = NodeClasses[tuple[str, int]]()
+    for place, number in zip(at, drive, strict=True):
+        group.merge(("place", place), ("drive", number))
+    return numbered(group.of(("drive", number)) for number in drive)

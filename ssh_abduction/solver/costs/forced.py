@@ -2,11 +2,11 @@
 
 A join is two visits that a map puts at one place (without frames, two steps at one dstate). Let F
 be joins that every map of a cost below T has. At first F is empty. Each such map costs at least the
-misfit of F plus the prices of its dstates and places. Now take a further join. A map without it
-costs at least the misfit of F plus the prices of the dstates and places that are needed without it.
-If this sum is T or more, then every map of a cost below T has the join, and F gets it. Then the
-misfit of F is greater, and more dstates and places are needed without a further join. If the misfit
-of F plus the prices is T or more, then no map costs less than T.
+misfit of F plus what its dstates and places cost at least (`theory/prior.py`). Now take a further
+join. A map without it costs at least the misfit of F plus what the dstates and places that are
+needed without it cost. If this sum is T or more, then every map of a cost below T has the join, and
+F gets it. Then the misfit of F is greater, and more dstates and places are needed without a further
+join. If the misfit of F plus this cost is T or more, then no map costs less than T.
 
 Only joins of the best known map are tried. If F gets no further join, assume that a map lacks a
 certain join, and find what all cheap maps without this join have. If no map without it costs less
@@ -37,6 +37,7 @@ from ssh_abduction.solver.steps.apart import apart_classes, apart_matrix, clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.prior import Array
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 
@@ -124,11 +125,6 @@ class Visits:
         apart = self.apart.copy()
         apart[0, first, second] = apart[0, second, first] = True
         return replace(self, apart=apart)
-
-    def cut(self, side: Flags) -> Visits:
-        """Copy the visits, with flags that those in the mask `side` share no place with others."""
-        apart = self.apart | (side[:, None] != side)
-        return replace(self, apart=apart, away=None if self.away is None else apart[0])
 
     def joined(self, of: Ints, pairs: Iterable[tuple[int, int]]) -> Ints:
         """Merge the classes of pairs of visits, and the classes that one action leads to from both.
@@ -297,9 +293,7 @@ class Forcing:
 
         `ssh_map` is its best known map. Each map has at least `dstates` dstates.
         """
-        self._misfit, self._dstates, self._overlap = misfit, dstates, problem.overlap
-        dstate, place, _ = problem.theory.prices
-        self._prices = dstate, place if problem.theory.level == "topological" else 0.0
+        self._misfit, self._dstates, self._prior = misfit, dstates, problem.prior
         self.visits = Visits.of(problem, log, ssh_map)
         at: dict[int, list[int]] = indices_of(self.visits.place.tolist())
         most = max(PAIRS // len(self.visits.place), 1)
@@ -311,7 +305,7 @@ class Forcing:
         ]
         self.joins = self.visits.joined(np.arange(len(self.visits.place)), [])
         self.low = 0.0
-        self._laying = 0.0  # what every map of a cost below the present one pays for laying drives
+        self._least: tuple[bytes, tuple[Array, Array]] | None = None  # of the present classes
 
     @staticmethod
     def holds_for(problem: Problem) -> bool:
@@ -334,7 +328,6 @@ class Forcing:
             high = top
             while low < most and high - low > NEARLY * most:
                 middle = (low + high) / 2
-                self._laying = self._least_laying(middle)
                 # The copy of the visits keeps these joins from becoming `joins`.
                 if self._forced(replace(self.visits), self.joins, middle, branches):
                     low = middle
@@ -344,28 +337,22 @@ class Forcing:
 
     def force(self, most: float) -> None:
         """Find joins that every map of a cost below `most` has, until no more are found."""
-        self._laying = self._least_laying(most)
         self._forced(self.visits, self.joins, most, 1)
 
-    def _least_laying(self, most: float) -> float:
-        """Return what every map of a cost below `most` pays for drives that share places.
+    def _price(self, counts: tuple[int, int], joins: Ints) -> float:
+        """Return what at least this many dstates and places cost.
 
-        If a map in which a drive shares no place with the others costs `most` or more, the drive
-        shares one in each cheap map. Drives that closures tie count as one drive.
+        `joins` has the class of each visit. Only its first step may be the first one at a place.
         """
-        first, laid = np.unique(self.visits.visit, return_index=True)[1], 0
-        units = np.array(self._overlap.unit_of_step)[first]  # the group of drives of each visit
-        base = self._misfit.of_returns(self.returns) / 2
-        for one in {*units} if len({*units}) > 1 else ():
-            look_at_clock()
-            classes = _Joined(self.visits.cut(units == one), self.joins)
-            laid += classes.fails or self._price(classes.counts) + base >= most
-        # There are most groups of drives if those that must be laid on others form pairs.
-        return self._overlap.price * (laid - laid // 2)
-
-    def _price(self, counts: tuple[int, int]) -> float:
-        """Return the price of at least this many dstates and places."""
-        return max(counts[0], self._dstates) * self._prices[0] + counts[1] * self._prices[1]
+        key = joins.tobytes()
+        if self._least is None or self._least[0] != key:
+            at, facing = joins[self.visits.visit].tolist(), self.visits.direction.tolist()
+            steps = range(len(at))
+            dstates = [*firsts(zip(zip(at, facing, strict=True), steps, strict=True)).values()]
+            places = [*firsts(zip(at, steps, strict=True)).values()]
+            self._least = key, self._prior.least(dstates[1:], places[1:])
+        found = {"dstates": max(counts[0], self._dstates), "places": counts[1]}
+        return self._prior.at_least(found, self._least[1])
 
     def _forced(self, visits: Visits, joins: Ints, most: float, branches: int) -> bool:
         """Add joins that every map of a cost below `most` has. Return whether there is no such map.
@@ -400,9 +387,7 @@ class Forcing:
             if classes.fails:
                 return joins, math.inf, []
             misfit = self._misfit.of_returns(visits.returns(joins)) / 2
-            laid = self._overlap.nats(joins[visits.visit].tolist())
-            misfit += max(self._laying - laid, 0.0)
-            low = self._price(classes.counts) + misfit
+            low = self._price(classes.counts, joins) + misfit
             if low >= most:
                 return joins, low, []
             # Of each two classes that may join, try one pair of visits.
@@ -416,7 +401,7 @@ class Forcing:
             for (a, b), pair in left.items():
                 look_at_clock()
                 counts = classes.counts_lacking(a, b)
-                worth[pair] = math.inf if counts is None else self._price(counts) + misfit
+                worth[pair] = math.inf if counts is None else self._price(counts, joins) + misfit
             forced = [pair for pair, nats in worth.items() if nats >= most]
             if not forced:
                 return joins, low, sorted(worth, key=lambda pair: -worth[pair])

@@ -6,9 +6,10 @@ chi-square of the displacements and closures that these allow (`solver/geometry/
 returns leave less freedom. So a set of returns never has a smaller misfit than a part of the set,
 and a map never has a smaller misfit than a set of its returns.
 
-Places that drives have in common cost a price (`theory/overlap.py`), and more returns never lower
-it. So twice this price is a part of the misfit. Places at one position cost a price, too, but more
-returns may lower it. So only complete maps pay it.
+The cost of a complete map is -log of its marginal likelihood: half of its misfit, and the *volume*,
+which says how well the map predicts the displacements. A map with more returns predicts them
+better, and leaves fewer poses free. So the volume is only known for complete maps. It is never less
+than what the new dstates and places of the map cost (`theory/prior.py`).
 
 A visit to a place has several steps, as turns stay at their place. So these steps have one position
 in each topological map, also without a return. But if displacements may be wrong, the
@@ -24,10 +25,11 @@ from typing import TypeAlias
 from ssh_abduction.data.groups import NodeClasses, minimal_part, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.geometry.equations import Equations, visits_by_turns
-from ssh_abduction.solver.geometry.fit import Array, Poses
-from ssh_abduction.solver.values import Cost, nats_of
+from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
+from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.settle import Problem
 
 # The heading of each step and the position of each step, numbered in the order of first steps, such
@@ -44,11 +46,12 @@ class Misfit:
 
     def __init__(self, problem: Problem) -> None:
         """Find the visits of the trace. No misfit is computed yet."""
-        self.trace, self._overlap = problem.trace, problem.overlap
+        self.trace, self._prior = problem.trace, problem.prior
         self._theory = problem.theory
         self.visit = visits_by_turns(self.trace, self._theory)
         self._equations = Equations.of(self.trace)
-        self._known: dict[_Groups, tuple[float, Array]] = {}
+        self._known: dict[_Groups, float] = {}
+        self._likelihood: dict[_Groups, float] = {}
 
     def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
         """Return the misfit (a chi-square) of returns, ignoring displacements to `wrong` steps."""
@@ -64,29 +67,33 @@ class Misfit:
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
     ) -> float:
         """Return the misfit if steps are at these dstates and places, without `wrong` moves."""
-        return self._of_groups(_groups_of(dstates, places, wrong))[0]
+        groups = _groups_of(dstates, places, wrong)
+        if groups not in self._known:
+            self._known[groups] = self._poses(groups).misfit()
+        return self._known[groups]
 
     def of_map(self, ssh_map: SSHMap) -> float:
         """Compute the misfit (a chi-square) of a map of the whole trace."""
         return self.of_returns(self.returns_of(ssh_map), jumped(ssh_map))
 
     def nats_of(self, ssh_map: SSHMap) -> float:
-        """Compute the cost of a map of the whole trace in nats: its prices and half its misfit."""
+        """Compute the cost of a map of the whole trace in nats."""
         places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
         names = places if None not in places else ssh_map.dstate_at
-        nats = nats_of(Cost.of(ssh_map), self._theory)
+        nats = FAULT * Cost.of(ssh_map).faults
         return nats + self.nats_of_course(ssh_map.dstate_at, names, jumped(ssh_map))
 
     def nats_of_course(
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
     ) -> float:
-        """Return half the misfit of a whole course, and the price of two places at one position."""
-        headings, positions, _ = groups = _groups_of(dstates, places, wrong)
-        square, at = self._of_groups(groups)
-        if not self._overlap.near or not self._overlap.nats(positions):
-            return square / 2
-        places = _of_headings(headings, positions)
-        return square / 2 + self._overlap.crowding(dict(enumerate(headings)), places, at.tolist())
+        """Return -log of the marginal likelihood if steps are at these dstates and places."""
+        groups = _groups_of(dstates, places, wrong)
+        if groups not in self._likelihood:
+            prior, poses = self._prior, self._poses(groups)
+            self._known[groups], nats = poses.likelihood(prior.wide)
+            nats += float(prior.base[-1]) + prior.lost(wrong) + prior.shown(dstates, places)
+            self._likelihood[groups] = nats
+        return self._likelihood[groups]
 
     def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
         """List the returns of a map: each step with the last step at its dstate or place."""
@@ -120,14 +127,11 @@ class Misfit:
 
         return [] if suffices([]) else minimal_part(suffices, list(returns))
 
-    def _of_groups(self, groups: _Groups) -> tuple[float, Array]:
-        """Return the misfit and the positions if steps share headings and positions. Keep both."""
-        if groups not in self._known:
-            headings, positions, wrong = groups
-            said = self.trace.without_displacements_at(wrong) if wrong else self._equations
-            square, at = Poses(said, headings, _of_headings(headings, positions)).placed()
-            self._known[groups] = square + 2 * self._overlap.nats(positions), at
-        return self._known[groups]
+    def _poses(self, groups: _Groups) -> Poses:
+        """Collect the equations for the poses that steps share."""
+        headings, positions, wrong = groups
+        said = self.trace.without_displacements_at(wrong) if wrong else self._equations
+        return Poses(said, headings, _of_headings(headings, positions))
 
 
 def _groups_of(

@@ -1,15 +1,15 @@
 """Find the maps of least cost, and prove that none costs less.
 
-The cost of a map in nats has two parts: the prices of its dstates, places, paths and faults, and
-half of its misfit to the displacements, which is a chi-square (`misfit.py`). The price of a fault
-is a multiple of the price of a dstate.
+The cost of a map in nats is -log of its marginal likelihood (`misfit.py`). It is at least half of
+its misfit to the displacements, which is a chi-square, and what its dstates, places and faults cost
+at least (`theory/prior.py`).
 
 *The search* is a logic-based Benders decomposition (Hooker & Ottosson 2003). Clingo finds the map
 with the fewest dstates, and among these the fewest places and paths. Clingo does not compute the
 misfit. If the misfit of some returns of this map makes each map with these returns too expensive,
 clingo gets a rule that excludes maps with all of them. Then it finds the next map. The number of
-dstates never falls from map to map. So the prices of the last map are a lower bound on the cost of
-all maps that are left. The search ends when this bound reaches the cost of the best map. If
+dstates never falls from map to map. So what these dstates cost at least is a lower bound on the
+cost of all maps that are left. The search ends when this bound reaches the cost of the best map. If
 displacements may be wrong, a misfit excludes only maps that believe the displacements that cause
 it.
 
@@ -25,15 +25,14 @@ one: the size of a set of steps that are pairwise at different places.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from collections.abc import Callable, Collection, Generator, Hashable, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeAlias
 
 from scipy.special import gammaincc
 
-from ssh_abduction.data.drives import drives_of, starts_of
+from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.groups import first_index_of, firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -42,7 +41,6 @@ from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.costs.beams import Beams
-from ssh_abduction.solver.costs.distrust import doubt_of, gaps_of, misfit_of
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
     Course,
@@ -51,13 +49,13 @@ from ssh_abduction.solver.costs.estimating import (
     may_join_more,
     rival_of,
     rivals_of,
+    rivals_with_misread_views,
 )
 from ssh_abduction.solver.costs.forced import Forcing
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.geometry.equations import spreads_of
 from ssh_abduction.solver.parts import Parts, Priced
 from ssh_abduction.solver.schedule import Source, turn
-from ssh_abduction.solver.solution.weighed import CHANCE, EQUAL, IMPROBABLE, Rival, Weighed
+from ssh_abduction.solver.solution.weighed import EQUAL, IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
@@ -66,6 +64,7 @@ from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Found, Status
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
+from ssh_abduction.theory.prior import spreads_of
 from ssh_abduction.theory.settle import Problem, displacement_of
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
@@ -114,13 +113,11 @@ class Weighing:
         """Prepare the search, whose sources are those of `beams`, and `proofs`."""
         self._parts = parts
         self._misfit = Misfit(parts.task.problem)
-        # The price in nats of one unit of each count, that of the count minimised first in front.
-        # If faults are allowed, that count is the cost of dstates and faults in tenths of dstates.
-        dstate, place, path = parts.task.theory.prices
+        # The counts that cost something, the one minimised first in front. If faults are allowed,
+        # that one is the cost of dstates and faults in tenths of dstates.
         has_faults = parts.task.theory.has_faults
-        first = {"tenths": dstate / 10} if has_faults else {"dstates": dstate}
-        self._prices = {**first, "places": place, "paths": path}
-        # Every map has this many places, and pays this many nats besides its prices.
+        self._counts = "tenths" if has_faults else "dstates", "places"
+        # Every map has this many places, and this many nats of misfit.
         self._places = 0
         self._base = 0.0
         self._within = max(WITHIN, parts.limits.within)
@@ -131,12 +128,8 @@ class Weighing:
         self.beams = Beams(parts, self.add, lambda: bool(self.candidates or parts.known.best))
         self._task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         self._forced: list[tuple[int, int]] = []  # pairs of steps at one dstate in all cheap maps
-        # For each way to lay drives, or parts between gaps, on each other: the cheapest map.
-        self._of_laying: dict[Hashable, Candidate] = {}
-        problem = parts.task.problem
-        self._starts = sorted({*starts_of(problem.trace), *gaps_of(problem)})
         # Faults need the readable encodings, which take too much memory for a long trace.
-        self._is_long = has_faults and len(problem.trace) > READABLE
+        self._is_long = has_faults and len(parts.task.trace) > READABLE
         self._improved = 0.0  # the seconds on the clock when the best map was found
 
     @property
@@ -229,7 +222,7 @@ class Weighing:
         try:
             last = prefixes.minimise()
         finally:
-            if self.candidates and "dstates" in self._prices:
+            if self.candidates and "dstates" in self._counts:
                 # Clingo proved that each map left has at least this many dstates.
                 self._raise_bound(self._at_least({"dstates": prefixes.engine.bound or 0}))
         if last is None and not self.candidates:
@@ -250,7 +243,7 @@ class Weighing:
                 self.add(known.best)
         finally:
             if not self.proven:
-                first, dstates = next(iter(self._prices)), known.bound.dstates or 0
+                first, dstates = self._counts[0], known.bound.dstates or 0
                 tenths = max(known.bound.tenths or 0, 10 * dstates)
                 self._raise_bound(
                     self._at_least({first: dstates if first == "dstates" else tenths})
@@ -315,7 +308,6 @@ class Weighing:
         nats = self._misfit.nats_of(ssh_map)
         if nats < self._nats - EQUAL:
             self._improved = self._parts.watch.elapsed()
-        self._keep_for_laying(Candidate(ssh_map, nats))
         if all(known.map != ssh_map for known in self.candidates):
             self.candidates.append(Candidate(ssh_map, nats))
             self.candidates.sort(key=lambda candidate: candidate.nats)
@@ -323,21 +315,6 @@ class Weighing:
                 self._within = min(self._within, self.candidates[RIVALS].nats - self._nats)
             self.candidates = [c for c in self.candidates if c.nats < self._most][:RIVALS]
         return nats
-
-    def _keep_for_laying(self, candidate: Candidate) -> None:
-        """Keep a map if no known map costs less that lays drives on each other in the same way.
-
-        The first dstate that a drive shares with drives before it says how it lies.
-        """
-        drive = [bisect_right(self._starts, t) for t in range(len(candidate.map.dstate_at))]
-        first: dict[int, int] = {}
-        lies: dict[int, tuple[int, int]] = {}
-        for t, label in enumerate(candidate.map.dstate_at):
-            if drive[first.setdefault(label, t)] != drive[t]:
-                lies.setdefault(drive[t], (first[label], t))
-        laying = tuple(lies.items())
-        if laying not in self._of_laying or candidate.nats < self._of_laying[laying].nats:
-            self._of_laying[laying] = candidate
 
     def too_expensive(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
         """Add a map. Return equalities that exclude it; None if no map left is worth finding.
@@ -374,7 +351,7 @@ class Weighing:
         counts = Cost.of(ssh_map)
         found, known = list[float](), dict[str, int]()
         for name in self._task.theory.priorities:
-            if name in self._prices:
+            if name in self._counts:
                 number = getattr(counts, name)
                 found.append(self._at_least({**known, name: number + 1}))
                 known[name] = number
@@ -383,34 +360,34 @@ class Weighing:
     def _at_least(self, counts: Mapping[str, int]) -> float:
         """Return a lower bound on the cost of maps that have at least these counts, in nats."""
         counts = {"places": self._places, **counts}
-        return sum(price * counts.get(name, 0) for name, price in self._prices.items()) + self._base
+        return self._task.problem.prior.at_least(counts) + self._base
 
     def weighed(self) -> Weighed | None:
         """Collect what is known about the costs of maps; None if no map is known."""
         if not self.candidates:
             return None
         rivals: dict[Course, Rival] = {}
-        most = self._nats + CHANCE * CERTAIN
-        # Maps that lay drives otherwise are rivals, too, if they cost little more.
-        layings = sorted(self._of_laying.values(), key=lambda candidate: candidate.nats)[:RIVALS]
-        for candidate in (*self.candidates, *(c for c in layings if c.nats < most)):
+        for candidate in self.candidates:
             rival = rival_of(candidate.map, candidate.nats)
             rivals.setdefault((rival.dstates, rival.places), rival)
-        found, excess = list(rivals.values()), self._excess()
+        found, excess, doubt = list(rivals.values()), self._excess(), None
         problem = self._task.problem
         is_likely = excess < math.inf and not may_join_more(problem, found)
-        doubt = doubt_of(problem, self.candidates[0].map)
         if self.proven and not 1 < excess < math.inf:
-            doubt = doubt or misfit_of(problem, self.candidates[0].map)
+            doubt = _misfit_of(problem, self.candidates[0].map)
+        suspected = [
+            rival
+            for rival in rivals_with_misread_views(problem, self._misfit, self.candidates[0].map)
+            if rival.nats < found[0].nats + CERTAIN
+        ]
         return Weighed(
             bound=self.bound,
             within=self._within if self.proven else 0.0,
-            rivals=(*found, *self._estimated(found[0], set(rivals))),
+            rivals=(*found, *self._estimated(found[0], set(rivals)), *suspected),
             searched=is_likely and self.beams.found(self._nats),
             broken=self.beams.broken,
             excess=excess if excess < math.inf else 1.0,
             doubt=doubt,
-            gaps=gaps_of(problem),
             drives=drives_of(problem.trace),
         )
 
@@ -422,7 +399,6 @@ class Weighing:
         best = self.candidates[0].map
         returns = self._misfit.returns_of(best)
         square = self._misfit.of_map(best) - self._misfit.of_returns([], jumped(best))
-        square -= 2 * self._task.problem.overlap.of_map(best)
         freedom = sum(3 if found.of == "dstate" else 2 for found in returns)
         if not freedom or gammaincc(freedom / 2, max(square, 0.0) / 2) >= IMPROBABLE:
             return 1.0
@@ -441,6 +417,19 @@ class Weighing:
         for rival in rivals_of(problem, self._misfit, ssh_map, seconds):
             if rival.nats >= least and (rival.dstates, rival.places) not in known:
                 yield rival
+
+
+def _misfit_of(problem: Problem, best: SSHMap) -> str | None:
+    """Say that the best map contradicts the displacements, if it does; else None.
+
+    A map that costs least may still be false: the displacements, or the axioms, may be wrong.
+    """
+    from ssh_abduction.solver.geometry.fit import fit  # loads scipy
+
+    believed = problem.trace.without_displacements_at(jumped(best))
+    if fit(believed, best).p >= problem.theory.reject:
+        return None
+    return "the best map does not fit the displacements"
 
 
 def _exactly(ssh_map: SSHMap) -> list[Equality]:

@@ -17,13 +17,10 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.prior import spreads_of
 from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.float64]
-
-# If the odometry says that the robot may be off the poses of dstates, the standard deviation is at
-# least this, in metres and radians.
-LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,25 +97,6 @@ class Equations:
 def noises(trace: Trace, steps: Sequence[int]) -> Array:
     """Return the covariances of the displacements that lead to n steps, (n, 3, 3)."""
     return np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
-
-
-def spreads_of(trace: Trace) -> Array:
-    """Compute the variances of the pose of the robot at each step, relative to its dstate.
-
-    A dstate has one pose in a map, but the robot is not at exactly this pose on each visit. Turns
-    do not move it, so the k steps of a visit share one error of position. To count this error once,
-    each of the steps gets k times its variance. The result has variances of x, y and heading,
-    (steps, 3), in square metres and square radians. They are 0 if the odometry declares no such
-    errors.
-    """
-    odometry = trace.odometry or Odometry()
-    visit = np.cumsum([1, *(action.kind != "turn" for action in trace.actions)]) - 1
-    steps = np.bincount(visit)[visit].astype(float)
-    spreads = np.zeros((len(trace), 3))
-    if odometry.offset or odometry.facing:
-        spreads[:, :2] = (steps * max(odometry.offset, LEAST) ** 2)[:, None]
-        spreads[:, 2] = max(odometry.facing, LEAST) ** 2
-    return spreads
 
 
 def visits_by_turns(trace: Trace, theory: Theory) -> list[int]:

@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Sequence
 from contextlib import suppress
+from copy import copy
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -105,6 +106,10 @@ class Poses:
         # A group is the headings that displacements connect. A part of the map is the positions
         # that they connect.
         self._graph = _graph(self._from, self._to, self._headings)
+        # The poses on both sides of each missing displacement, and the pose of the first step.
+        steps = np.arange(self._dstates, self._headings) if said.spreads.any() else labels
+        missing = np.setdiff1d(range(1, len(labels)), of_steps.last[of_steps.scaled == 1])
+        self._missing, self._origin = (steps[missing - 1], steps[missing]), int(labels[0])
         self._group = connected_components(self._graph, directed=False)[1]
 
     @staticmethod
@@ -113,26 +118,30 @@ class Poses:
         places = [s.place if s.place is not None else -1 - s.id for s in ssh_map.dstates]
         return Poses(trace, ssh_map.dstate_at, places)
 
-    def placed(self) -> tuple[float, Array]:
-        """Compute the least chi-square, and the best position of each heading, in metres, (n, 2).
+    def misfit(self) -> float:
+        """Compute the least chi-square."""
+        return self._best()[1]
 
-        Headings are mostly those of dstates.
+    def likelihood(self, wide: Array) -> tuple[float, float]:
+        """Compute the least chi-square, and -log of the marginal likelihood of the displacements.
+
+        `wide` has the variances of x, y and heading of the prior (`Prior`).
         """
         unknown, square = self._best()
-        at: Array = self._positions_in(unknown)[self._place[: self._dstates]]
-        return square, at
+        return square, square / 2 + self._volume(unknown, wide)
 
     def settled(
-        self, start: Array | None, fixed: Sequence[int], wanted: Sequence[int]
+        self, start: Array, fixed: Sequence[int], wanted: Sequence[int], wide: Array
     ) -> tuple[float, Array, Array]:
         """Find the unknowns with the least chi-square, and the covariance of the wanted ones.
 
-        `start` has unknowns to begin with; None to compute some. `fixed` and `wanted` are indices
-        of unknowns: those whose values are known, and those whose covariance is wanted. The
-        chi-square is returned first.
+        `start` has unknowns to begin with. `fixed` and `wanted` are indices of unknowns: those
+        whose values are known, and those whose covariance is wanted. The likelihood is returned
+        first, as in `likelihood`.
         """
         unknown, square = self._best(start, NEARLY)
-        return square, unknown, self._covariance(unknown, fixed, wanted)
+        nats = square / 2 + self._volume(unknown, wide)
+        return nats, unknown, self._covariance(unknown, fixed, wanted)
 
     def gaussian(self) -> tuple[list[int], Array, Array, Array]:
         """Find the poses of the dstates and their covariance, relative to a dstate of each part.
@@ -299,11 +308,16 @@ class Poses:
         off[:, 2] -= math.tau * np.round(off[:, 2] / math.tau)
         return np.concatenate([np.einsum("nij,nj->ni", self._whitening, off).ravel(), unknown[-2:]])
 
-    def _jacobian(self, unknown: Array) -> Any:
-        """Compute the derivative of the residuals with respect to the unknowns."""
+    def _jacobian(self, unknown: Array, of_world: bool = False) -> Any:
+        """Compute the derivative of the residuals with respect to the unknowns.
+
+        If `of_world`, the errors of displacements are in metres of the world, without the scale.
+        """
         predicted, cos, sin = self._predicted(unknown)
         # Unknowns are the positions of places (two each), the headings of dstates, scale and drift.
         scale = 1 + unknown[-2] * self._sigma[0] * self._scaled
+        if of_world:
+            predicted[:, :2] /= scale[:, None]
         m, heading = len(self._moved), 2 * self._positions
         zero, turn = np.zeros(m), np.tile([0.0, 0.0, 1.0], (m, 1))
         ahead, left = predicted[:, 0], predicted[:, 1]
@@ -312,6 +326,8 @@ class Poses:
         by_facing = np.stack([left, -ahead, zero], 1)
         by_scale = np.stack([ahead, left, zero], 1)
         by_scale *= (self._sigma[0] * self._scaled / scale)[:, None]
+        if of_world:
+            by_x, by_y = by_x / scale[:, None], by_y / scale[:, None]
         by_bend = (-by_facing / 2 + turn) * self._way[:, None] * self._sigma[1]
         columns = [
             (2 * self._place[self._to], by_x),
@@ -329,6 +345,36 @@ class Poses:
         # Scale and drift have a prior each: a last row with a single 1.
         rows, of = np.append(rows, [3 * m, 3 * m + 1]), np.append(of, self._size - np.array([2, 1]))
         return csr_array((np.append(values, [1.0, 1.0]), (rows, of)), shape=(3 * m + 2, self._size))
+
+    def _volume(self, unknown: Array, wide: Array) -> float:
+        """Compute -log of the marginal likelihood without the misfit.
+
+        The result lacks what does not depend on the map (`Prior.base`).
+        By Laplace's approximation, the integral over the poses is a Gaussian around the best ones
+        (MacKay 2003, chapter 28). Where a displacement is missing, the prior connects the poses on
+        both sides. So the matrix is regular.
+        """
+        whole, missing = copy(self), self._missing
+        none = np.zeros(len(missing[0]))
+        whole._from = np.concatenate([self._from, missing[0]])
+        whole._to = np.concatenate([self._to, missing[1]])
+        whole._way = np.concatenate([self._way, none])
+        whole._scaled = np.concatenate([self._scaled, none])
+        roots = np.tile(np.diag(wide**-0.5), (len(none), 1, 1))
+        whole._whitening = np.concatenate([self._whitening, roots])
+        whole._moved = np.zeros((len(whole._from), 3))
+        jacobian = whole._jacobian(unknown, of_world=True)
+        first = np.zeros(self._size)
+        x = 2 * int(self._place[self._origin])
+        first[[x, x + 1, 2 * self._positions + self._origin]] = 1 / wide
+        factor = splu((jacobian.T @ jacobian + diags_array(first)).tocsc())
+        size = float(np.log(np.abs(factor.U.diagonal())).sum()) / 2
+        places, robots = (
+            len({*self._place[: self._dstates].tolist()}),
+            self._headings - self._dstates,
+        )
+        each = math.log(wide[0]), math.log(wide[2]) / 2, -1.5 * math.log(math.tau)
+        return size + places * each[0] + self._dstates * each[1] + robots * each[2]
 
     def _parts(self) -> NDArray[np.int_]:
         """For each position, find its part of the map. No displacement connects two parts."""

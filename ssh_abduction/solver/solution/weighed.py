@@ -1,25 +1,22 @@
 """Results of comparing the maps of a trace by cost: costs in nats, rivals, and probabilities.
 
-The cost of a map has two parts: the prices of its dstates, places and paths, and half of its misfit
-to the displacements, which is a chi-square. A nat is the unit of natural logarithms: of two maps,
+The cost of a map in nats is minus the natural logarithm of its marginal likelihood. Of two maps,
 one that costs 3 nats more is exp(3) = 20 times less probable.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
-from ssh_abduction.data.drives import Drive, drive_of_steps, named_steps
+from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.groups import indices_of
 from ssh_abduction.data.map_parts import FAULTS
 from ssh_abduction.data.schema import FieldReader
-from ssh_abduction.theory.overlap import groups_of
 
 EQUAL = 1e-6  # costs in nats that differ by less count as equal
 # Probabilities with the same digits are equally doubtful. A file has costs with fewer digits, and
@@ -30,13 +27,6 @@ TOLD = 4
 BROKEN, SAID = 12.0, 1.0
 # Mention that two steps may be at one place, too, if that is more probable than this.
 DOUBTED = 0.05
-# Drives look alike by chance more often than costs say. So the gain from laying drives on each
-# other is divided by this before it becomes a probability (docs/measurements/truth.md).
-CHANCE = 10.0
-# A dstate that a rival has besides those of a causal map gets the pose that fits best: three
-# numbers, which each lower the misfit by chance. So this many nats are added before the cost of an
-# estimated causal rival becomes a probability (Akaike 1974: one nat for each number fitted).
-FITTED = 3.0
 # A misfit is improbable if the true map has a larger one with less than this probability.
 IMPROBABLE = 0.01
 MOST = 700.0  # exp of more nats overflows
@@ -91,8 +81,6 @@ class Weighed:
         excess: The misfit of the best map, divided by the misfit that the standard deviations
             predict. Costs are divided by it before they become probabilities.
         doubt: Why the costs cannot be trusted, such as "the track is unreliable"; None if they can.
-        gaps: The steps to which no displacement leads. The part of a drive after each may lie
-            anywhere, as a drive may.
         drives: The drives of the trace, to call a step "monday:12"; empty if they are unknown.
     """
 
@@ -103,7 +91,6 @@ class Weighed:
     broken: float = -math.inf
     excess: float = 1.0
     doubt: str | None = None
-    gaps: tuple[int, ...] = ()
     drives: tuple[Drive, ...] = field(default=(), compare=False, repr=False)
 
     @property
@@ -113,34 +100,10 @@ class Weighed:
 
     @cached_property
     def weights(self) -> tuple[float, ...]:
-        """The probability of each rival, assuming that there are no other maps.
-
-        If a rival lays drives on each other in another way than the best map, the difference of the
-        two costs is divided by CHANCE. Else an estimated causal rival costs FITTED nats more.
-        """
-        less = [
-            self.nats - rival.nats - FITTED * (rival.estimated and not rival.places)
-            if self._lies_alike(rival)
-            else (self.nats - rival.nats) / CHANCE
-            for rival in self.rivals
-        ]
+        """The probability of each rival, assuming that there are no other maps."""
+        less = [self.nats - rival.nats for rival in self.rivals]
         likely = [math.exp(min(nats / self.excess, MOST)) for nats in less]
         return tuple(weight / sum(likely) for weight in likely)
-
-    def _lies_alike(self, rival: Rival) -> bool:
-        """Whether a rival lays drives, and parts between gaps, on each other as the best map does.
-
-        Parts that share places form groups. The groups are the same, and dstates that both maps
-        have in common connect as many parts as those of the best map do.
-        """
-        best, starts = self.rivals[0], sorted({*self.gaps, *(d.first for d in self.drives)})
-        part = [bisect_right(starts, t) for t in range(len(best.dstates))]
-        both = [*zip(best.dstates, rival.dstates, strict=True)]
-        named = (rival.at, best.at, both, best.dstates)
-        groups, of_best, common, dstates = (
-            groups_of(names, part, range(len(starts) + 1)) for names in named
-        )
-        return groups == of_best and common == dstates
 
     @property
     def proven(self) -> bool:
@@ -255,6 +218,7 @@ class Weighed:
         elif self.searched and not self.proven:
             least = math.floor(100 * self.bound / self.nats)
             text += f" (not proven: no map costs less than {least} % of this one)"
+        text += self._misread
         # Name one pair of steps: the one for which it is least sure whether they are one dstate.
         doubted = 1 - self.joins[0][2] if self.joins else 0.0
         if self.missed and self.missed[2] > max(doubted, DOUBTED):
@@ -273,6 +237,26 @@ class Weighed:
         steps, sure = _told(self.joins[0])
         return f"{text}; the most doubtful join, of {steps}, has probability {sure}{given}"
 
+    @property
+    def _misread(self) -> str:
+        """Which steps may be misread, by the most probable rival that says so; "" if none does."""
+        best, known = self.rivals[0], {*self.rivals[0].faults}
+        said = [
+            (weight, rival, [t for kind, t in rival.faults if (kind, t) not in known])
+            for weight, rival in zip(self.weights, self.rivals, strict=True)
+            if any(kind == "misread" and (kind, t) not in known for kind, t in rival.faults)
+        ]
+        weight, rival, wrong = max(said, key=lambda found: found[0], default=(0.0, best, []))
+        if weight < DOUBTED:
+            return ""
+        names = named_steps(self.drives, len(best.dstates))
+        *others, last = (str(names[t]) for t in sorted(wrong))
+        steps = f"steps {', '.join(others)} and {last}" if others else f"step {last}"
+        return (
+            f"; {steps} may be misread: with misread allowed the map has "
+            f"{len({*rival.dstates})} dstates instead of {len({*best.dstates})}"
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Return the costs as plain data."""
         names = ("nats", "bound", "within", "broken", "excess", "confidence", "place_confidence")
@@ -281,7 +265,6 @@ class Weighed:
             **{name: None if x is None else round(x, 6) for name, x in numbers.items()},
             "searched": self.searched,
             "doubt": self.doubt,
-            "gaps": list(self.gaps),
             "rivals": [rival.to_dict() for rival in self.rivals],
         }
         # These fields are left out if they would say nothing.
@@ -289,7 +272,6 @@ class Weighed:
             "broken": math.isfinite(self.broken),
             "excess": self.excess > 1,
             "doubt": self.doubt is not None,
-            "gaps": self.gaps,
         }
         return {name: value for name, value in written.items() if told.get(name, True)}
 
@@ -323,7 +305,6 @@ class Weighed:
             excess=read.number,
             doubt=read.maybe(read.text),
             searched=lambda value, _: value,
-            gaps=read.integers,
         )
         if found.excess < 1:
             raise read.wrong("weighed.excess", "a number of at least 1", found.excess)
@@ -340,12 +321,6 @@ def probability_in_words(probability: float) -> str:
     if probability < 0.005:
         return "below 0.01"
     return "above 0.99" if probability >= 0.995 else f"{probability:.2f}"
-
-
-def groups_of_drives(at: Sequence[int], drives: Sequence[Drive]) -> int:
-    """Count the groups of drives that share no dstate or place; `at` has that of each step."""
-    drive = drive_of_steps(drives)
-    return groups_of(at, drive, range(len(drives)))
 
 
 def _rival(read: FieldReader, steps: int, value: Any, name: str) -> Rival:

@@ -2,8 +2,8 @@
 
 A *hypothesis* says at which dstate and place each step so far is. It has the joint Gaussian
 distribution of the positions of its places, the headings of its dstates, and the errors that all
-displacements share (`hypothesis.py`). Its cost in nats is the prices of its dstates and places,
-plus half of the chi-square of its returns, nearly as for a map (`solver/costs/weighing.py`).
+displacements share (`hypothesis.py`). Its cost in nats is nearly that of a map
+(`solver/costs/misfit.py`).
 
 Each drive, and each stretch after a lift, begins a *piece* with a frame of its own. At any step,
 this piece may be joined to others.
@@ -47,6 +47,7 @@ from ssh_abduction.solver.sources.metric.hypothesis import (
 from ssh_abduction.solver.sources.metric.sights import DEAREST, Sights
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.settle import Problem
 
 # The checker checks the beam after each CHECKED_EVERY steps.
@@ -76,21 +77,21 @@ class Extension:
     """A way to extend a hypothesis by a step: to a known place and dstate, or to new ones (None).
 
     In the hypothesis `of`, the robot has moved already: the last three entries of its mean vector
-    are the pose at the new step.
+    are the pose at the new step. `square` is the chi-square of the return.
     """
 
     nats: float
     place: int | None
     dstate: int | None
     of: Hypothesis
+    square: float = 0.0
 
 
 class Extending:
     """Finds the ways to extend hypotheses by a step, and extends them.
 
     Attributes:
-        bare: The theory without faults, displacements and prices.
-        prices: The prices of a dstate and of a place, in nats.
+        bare: The theory without faults and displacements.
         fault: For each kind of fault that is allowed, its cost at each step in nats.
         sights: What each step shows.
         reckoning: Updates the poses of hypotheses.
@@ -106,37 +107,34 @@ class Extending:
         self._stays = self._has_places and "turn_stays" in theory.hard
         self._leaves = self._has_places and "travel_leaves" in theory.hard
         self._lands = "one_landing" in theory.hard
-        self.prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
-        self.reckoning, self._frames = HypothesisPoses(trace), frames_of(trace)
+        self._place, self._dstate = problem.prior.place.tolist(), problem.prior.dstate.tolist()
+        self.reckoning = HypothesisPoses(trace, problem.prior)
+        self._frames = frames_of(trace)
         self.sights = Sights(trace, self.bare, misreads=theory.misread > 0)
         self.fault = {
-            kind: [self.prices[0] * theory.fault_tenths(kind, step) / 10 for step in trace.steps]
+            kind: [FAULT * theory.fault_tenths(kind, step) / 10 for step in trace.steps]
             for kind in ("misread", "slipped", "jumped")
             if getattr(theory, kind)
         }
+        if "jumped" in self.fault:  # a wrong displacement predicts nothing
+            lost = [problem.prior.lost([t]) for t in range(len(trace))]
+            self.fault["jumped"] = [*map(sum, zip(self.fault["jumped"], lost, strict=True))]
 
     def first(self) -> Hypothesis:
         """Make the hypothesis of the first step: one dstate at one place."""
-        price = self.prices[0]
-        return self.extended(Extension(price, None, None, Hypothesis.empty(price)), 0)
+        nats = float(self._problem.prior.seen[0].sum())
+        return self.extended(Extension(nats, None, None, Hypothesis.empty(nats)), 0)
 
     def options_of(self, beam: Sequence[Hypothesis], t: int, joins: bool) -> list[Extension]:
         """List the ways to extend the hypotheses of a beam by step t, sorted by cost."""
         look_at_clock()
         options = [
-            self._laid(option) if option.of.pieces is not moved.pieces else option
+            option
             for found in beam
             for moved in self._moves(found, t)
             for option in self._options(moved, t, joins)
         ]
         return sorted(options, key=lambda option: option.nats)
-
-    def _laid(self, option: Extension) -> Extension:
-        """Return an option with the price for places that its drive shares with other drives."""
-        places = [option.of.places[s] for s in option.of.labels.values()]
-        nats = self._problem.overlap.nats
-        price = nats([*places, option.place]) - nats(places)
-        return replace(option, nats=option.nats + price)
 
     def _moves(self, found: Hypothesis, t: int) -> Iterator[Hypothesis]:
         """Yield a hypothesis after the move to step t, without and with a fault of the move."""
@@ -158,16 +156,16 @@ class Extending:
             return self._along_link(moved, known, t)
         stays = self._stays and self._trace.actions[t - 1].kind == "turn" and not slips
         landing = self._landing(moved, t)
-        dstate, new_place = self.prices if joins else (0.0, 0.0)
+        dstate, new_place = (self._dstate[t], self._place[t]) if joins else (0.0, 0.0)
         options = []
         if not stays and landing is None:
             options.append(Extension(moved.nats + dstate + new_place, None, None, moved))
         possible = [p for p in self._possible(moved, t, stays=stays) if landing in (None, p)]
-        for place, square, near in self._near(moved, t, possible):
+        for place, square, cost, near in self._near(moved, t, possible):
             if stays or square / 2 <= DEAREST:
                 nats = moved.nats + (0.0 if stays else self.sights.changes(moved.sights[place], t))
                 if self._has_places:
-                    options.append(Extension(nats + dstate + square / 2, place, None, near))
+                    options.append(Extension(nats + dstate + cost, place, None, near, square))
                 options += self._at_known_dstates(moved, nats, place, t)
         return self._cheapest(options, t)
 
@@ -180,8 +178,8 @@ class Extending:
             + self._misread(moved, dstate, t)
             + self.sights.changes(moved.sights[place], t)
         )
-        nats += float(self.reckoning.squares(moved, t, [place], dstate)[0]) / 2
-        option = Extension(nats, place, dstate, moved)
+        (square,), (cost,) = self.reckoning.squares(moved, t, [place], dstate)
+        option = Extension(nats + float(cost), place, dstate, moved, float(square))
         return [option] if nats < math.inf and self._is_allowed(option, t) else []
 
     def _possible(self, moved: Hypothesis, t: int, *, stays: bool) -> list[int]:
@@ -218,8 +216,8 @@ class Extending:
         for s, p in enumerate(moved.places):
             if p == place and (misread := self._misread(moved, s, t)) < math.inf:
                 facing = fitted(moved, place, s)
-                both = float(self.reckoning.squares(facing, t, [place], s)[0])
-                yield Extension(nats + misread + both / 2, place, s, facing)
+                (square,), (cost,) = self.reckoning.squares(facing, t, [place], s)
+                yield Extension(nats + misread + float(cost), place, s, facing, float(square))
 
     def _cheapest(self, options: Sequence[Extension], t: int) -> list[Extension]:
         """List the allowed options that cost little more than the cheapest one, by cost."""
@@ -233,19 +231,21 @@ class Extending:
 
     def _near(
         self, moved: Hypothesis, t: int, places: Sequence[int]
-    ) -> Iterator[tuple[int, float, Hypothesis]]:
-        """Yield the chi-square of the pose of the robot at each of some places at step t.
+    ) -> Iterator[tuple[int, float, float, Hypothesis]]:
+        """Yield the chi-square and the cost of the robot being at each of some places at step t.
 
-        Items are triples (place, chi-square, hypothesis). If a place is in another piece (in
+        Items are (place, chi-square, nats, hypothesis). If a place is in another piece (in
         another frame), the piece of the robot is turned to fit it.
         """
         own = [place for place in places if moved.pieces.of_place[place] == moved.pieces.here]
-        squares = self.reckoning.squares(moved, t, own).tolist() if own else []
-        yield from ((place, square, moved) for place, square in zip(own, squares, strict=True))
+        if own:
+            costs = (some.tolist() for some in self.reckoning.squares(moved, t, own))
+            yield from ((*of, moved) for of in zip(own, *costs, strict=True))
         for place in places:
             if moved.pieces.of_place[place] != moved.pieces.here:
                 turned = fitted(moved, place)
-                yield place, float(self.reckoning.squares(turned, t, [place])[0]), turned
+                (square,), (cost,) = self.reckoning.squares(turned, t, [place])
+                yield place, float(square), float(cost), turned
 
     def _is_allowed(self, option: Extension, t: int) -> bool:
         """Whether the option agrees with the evidence about pairs of steps."""
@@ -316,6 +316,7 @@ class Extending:
             mean=pose[0],
             covariance=pose[1],
             nats=option.nats,
+            square=moved.square + option.square,
             pieces=moved.pieces.grown(place=option.place is None, dstate=option.dstate is None),
         )
 
@@ -332,7 +333,7 @@ class Beam:
         """Prepare the search with this many hypotheses in the beam. `maps` runs it."""
         self._trace, self._width, self._problem = problem.trace, width, problem
         self._extending = ways = Extending(problem, log)
-        self._bare, self._fault, self._prices = ways.bare, ways.fault, ways.prices
+        self._bare, self._fault = ways.bare, ways.fault
         self._sights, self._reckoning = ways.sights, ways.reckoning
         self._has_frames = bool(frames_of(problem.trace))
         self.hypotheses: list[Hypothesis] = []
@@ -428,10 +429,8 @@ class Beam:
             if count[found.pieces.joins] >= width and (several or at in known):
                 continue
             child = self._extending.extended(option, t)
-            if several:
-                price = self._price_of(child) - self._price_of(found)
-                if child.nats > found.nats + price + STRAINED:
-                    child = self._settled([child])[0]
+            if several and child.square > found.square + 2 * STRAINED:
+                child = self._settled([child])[0]
             if checked and self._map(child, t) is None:
                 continue
             known.add(at)
@@ -462,16 +461,18 @@ class Beam:
         settled = []
         for found in beam:
             look_at_clock()
-            squares, better = self._reckoning.settled(found, self._believed(found))
-            settled.append(replace(better, nats=self._price_of(found) + squares / 2))
+            nats, better = self._reckoning.settled(found, self._believed(found))
+            settled.append(replace(better, nats=self._base_of(found) + nats))
         return sorted(settled, key=lambda found: found.nats)
 
-    def _price_of(self, found: Hypothesis) -> float:
-        """Return the price of the dstates, places and faults of a hypothesis, in nats."""
-        price = self._prices[0] * len(found.places) + self._prices[1] * len(found.position)
-        price += sum(map(self._sights.along, found.sights))
+    def _base_of(self, found: Hypothesis) -> float:
+        """Return the cost of a hypothesis besides its displacements, in nats."""
         labels = [*found.labels.values()]
-        price += self._problem.overlap.of_steps(labels, found.places)
+        places = [found.places[s] for s in labels]
+        price = self._problem.prior.shown(labels, places) + float(
+            self._problem.prior.base[len(labels) - 1]
+        )
+        price += sum(map(self._sights.along, found.sights))
         price += sum(self._fault[kind][t] for t, kind in found.faults)
         if "misread" in self._fault:
             price += sum(map(self._sights.misread, found.seen))
@@ -480,7 +481,7 @@ class Beam:
     def _checked(self, beam: list[Hypothesis], end: int, joins: bool = True) -> list[Hypothesis]:
         """Extend a beam to `end` steps, and check each hypothesis at each step.
 
-        If `joins`, new dstates and places cost their prices, so that returns are cheaper. If not,
+        If `joins`, new dstates and places have their costs, so that returns are cheaper. If not,
         they are free, and the robot returns to a place only if it has to.
         """
         for t in range(len(beam[0].labels) if beam else end, end):

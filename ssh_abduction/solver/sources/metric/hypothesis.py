@@ -33,11 +33,12 @@ from ssh_abduction.data.groups import gathered, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Closure, Displacement, Odometry
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.geometry.equations import noises, spreads_of
+from ssh_abduction.solver.geometry.equations import noises
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.sources.metric.completing import valid_map
 from ssh_abduction.solver.sources.metric.sights import Sight, Sights
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.prior import Prior, spreads_of
 from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.float64]
@@ -123,6 +124,7 @@ class Hypothesis:
             comes last.
         covariance: The covariance of the means.
         nats: The cost.
+        square: The chi-square of the returns and closures.
         faults: Pairs (step, kind): the steps at which an action "slipped" or a displacement
             "jumped".
         pieces: Which poses are in one frame.
@@ -142,6 +144,7 @@ class Hypothesis:
     faults: tuple[tuple[int, str], ...] = ()
     pieces: Pieces = field(default_factory=Pieces)
     kept: frozenset[tuple[int, int]] = frozenset()
+    square: float = 0.0
 
     @classmethod
     def empty(cls, nats: float) -> Hypothesis:
@@ -284,8 +287,8 @@ class HypothesisPoses:
             off them, and headings may err by ROUGH.
     """
 
-    def __init__(self, trace: Trace) -> None:
-        self._trace, self._frames = trace, frames_of(trace)
+    def __init__(self, trace: Trace, prior: Prior) -> None:
+        self._trace, self._frames, self._prior = trace, frames_of(trace), prior
         odometry = trace.odometry or Odometry()
         self._sigma = odometry.scale, odometry.bend
         steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
@@ -351,14 +354,22 @@ class HypothesisPoses:
         n, there = len(moved.mean) - 3, moved.labels[closure.first]
         first = moved.position[moved.places[there]], moved.heading[there]
         by, off = closure_equations(moved.mean, first, (n, n + 2), closure.displacement)
+        spread = by @ moved.covariance @ by.T + noise
         mean, covariance, square = updated(moved.mean, moved.covariance, by, off, noise)
-        return replace(moved, mean=mean, covariance=covariance, nats=moved.nats + square / 2)
+        gain = self._prior.gain(np.array([noise, spread]))
+        return replace(
+            moved,
+            mean=mean,
+            covariance=covariance,
+            nats=moved.nats + square / 2 + float(gain[0] - gain[1]),
+            square=moved.square + square,
+        )
 
     def settled(self, found: Hypothesis, trace: Trace) -> tuple[float, Hypothesis]:
         """Fit all poses of a hypothesis anew, as the equations are linear only near the means.
 
-        The trace lacks the displacements that the hypothesis treats as wrong. Returns the
-        chi-square, too.
+        The trace lacks the displacements that the hypothesis treats as wrong. Returns -log of the
+        marginal likelihood, too.
         """
         labels = np.array([*found.labels.values()])
         poses = Poses(trace, labels.tolist(), found.places)
@@ -378,18 +389,20 @@ class HypothesisPoses:
         order[-3:] = pose_at[-1]
         # Without poses of their own, the last step and its dstate share entries.
         wanted, entry = np.unique(order, return_inverse=True)
-        squares, unknown, covariance = poses.settled(start, pose_at[0].tolist(), wanted.tolist())
-        return squares, replace(
+        nats, unknown, covariance = poses.settled(
+            start, pose_at[0].tolist(), wanted.tolist(), self._prior.wide
+        )
+        return nats, replace(
             found, mean=unknown[order], covariance=covariance[np.ix_(entry, entry)]
         )
 
     def squares(
         self, moved: Hypothesis, t: int, places: Sequence[int], dstate: int | None = None
-    ) -> Array:
-        """Compute the chi-square of the robot being at each of some places at step t.
+    ) -> tuple[Array, Array]:
+        """Compute the chi-square and the cost of the robot being at each of some places at step t.
 
         `moved` is a hypothesis after the move to step t. If a dstate at these places is given, the
-        heading of the robot has to fit, too.
+        heading of the robot has to fit, too. The costs are in nats.
         """
         at = np.array([moved.position[p] for p in places])
         rows, last = np.stack([at, at + 1], 1), np.arange(-3, -1)
@@ -407,7 +420,8 @@ class HypothesisPoses:
             + np.diag(self._spreads[t, : len(last)])
         )
         squares: Array = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[..., None])[..., 0])
-        return squares
+        most = self._prior.predicted(t, len(last))
+        return squares, squares / 2 + most - self._prior.gain(spread)
 
     def square_ahead(self, moved: Hypothesis, t: int, dstate: int, actions: Sequence[int]) -> float:
         """Compute the largest chi-square of the next steps if step t is at a known dstate.
@@ -422,7 +436,8 @@ class HypothesisPoses:
             if there is None or self._trace.steps[k].displacement is None:
                 break
             moved, dstate = self.moved(moved, k), there
-            largest = max(largest, float(self.squares(moved, k, [moved.places[dstate]])[0]))
+            squares, _ = self.squares(moved, k, [moved.places[dstate]])
+            largest = max(largest, float(squares[0]))
         return largest
 
     def met(
@@ -439,7 +454,7 @@ class HypothesisPoses:
         old += [] if position is None or heading is None else [heading]
         mean, covariance = moved.mean, moved.covariance
         if old:
-            mean, covariance, _ = conditioned(
+            mean, covariance, *_ = conditioned(
                 mean, covariance, [*range(n, n + len(old))], old, self._spreads[t]
             )
         new = [*range(n + len(old), n + 3)]  # entries of the robot that become known
@@ -600,12 +615,12 @@ def updated(
 
 def conditioned(
     mean: Array, covariance: Array, first: Sequence[int], second: Sequence[int], spreads: Array
-) -> tuple[Array, Array, float]:
+) -> tuple[Array, Array, float, Array]:
     """Condition a Gaussian on the equality of some entries with others, up to some variance.
 
     `first` and `second` have the indices of entries that should be equal: of x and y, of a heading,
     or of all three. `spreads` has the variance of each difference, in square metres and square
-    radians. The chi-square of the differences comes last in the result.
+    radians. The chi-square of the differences, and their covariance, come last in the result.
     """
     off = mean[first] - mean[second]
     if len(off) % 2:
@@ -620,4 +635,5 @@ def conditioned(
     white = np.linalg.solve(root, across.T)
     misfit = np.linalg.solve(root, off)
     less = white.T @ white  # symmetric
-    return mean - misfit @ white, np.subtract(covariance, less, out=less), float(misfit @ misfit)
+    square, less = float(misfit @ misfit), np.subtract(covariance, less, out=less)
+    return mean - misfit @ white, less, square, spread

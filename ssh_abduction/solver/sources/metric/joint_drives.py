@@ -124,10 +124,10 @@ class Joining:
         # The first join decides which others fit. So begin with each of the best pairs.
         starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
         joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
-        best = min(joined, key=self._nats_of, default=alone)
+        best = min(joined, key=_nats_of, default=alone)
         others = {part: rest for part, *rest in found}
         while mended := [*self._joined_by_others(best, others)]:
-            best = min(mended, key=self._nats_of)
+            best = min(mended, key=_nats_of)
         if len(best) < len(alone):
             yield from self._beside(alone)
         # Rivals of the best map: two more pieces joined, and drives laid in other ways.
@@ -137,7 +137,7 @@ class Joining:
             if (both := self._joined(*pair, math.inf)) is not None:
                 dearer.append([*(part for part in best if part not in pair), both])
         if dearer:
-            yield from self._beside(min(dearer, key=self._nats_of))
+            yield from self._beside(min(dearer, key=_nats_of))
         for part in best:
             rest = [other for other in best if other is not part]
             for otherwise in self._otherwise(part):
@@ -154,7 +154,7 @@ class Joining:
         for both in smoothed(self._problem, self._log, self.sights, None):
             parts = [part for part in alone if part.labels.keys() <= both.labels.keys()]
             covers = sum(len(part.labels) for part in parts) == len(both.labels)
-            saves = covers and len(parts) > 1 and self._nats(both) < self._nats_of(parts)
+            saves = covers and len(parts) > 1 and both.nats < _nats_of(parts)
             if saves and self._map(both):
                 alone = [*(part for part in alone if part not in parts), both]
         return alone
@@ -166,7 +166,7 @@ class Joining:
         pair = start
         while anchors:
             del anchors[pair]
-            if (joined := self._joined(*pair, sum(map(self._nats, pair)))) is not None:
+            if (joined := self._joined(*pair, _nats_of(pair))) is not None:
                 parts = [part for part in parts if part not in pair]
                 anchors = {two: ways for two, ways in anchors.items() if not {*two} & {*pair}}
                 anchors |= {(joined, part): self._anchors(joined, part) for part in parts}
@@ -183,7 +183,7 @@ class Joining:
         one, which the drive alone does not tell.
         """
         for part, second in permutations(parts, 2):
-            most = self._nats_of([part, second])
+            most = _nats_of([part, second])
             for other in others.get(part, ()):
                 if (both := self._joined(second, other, most)) is not None:
                     yield [*(kept for kept in parts if kept not in (part, second)), both]
@@ -302,7 +302,7 @@ class Joining:
         overlay = Overlay(first, second, self._problem, self.sights)
         if (first, second) not in self._laid:
             laid = ((_laid(overlay, way), way) for way in self._anchors(first, second))
-            told = [(self._nats(part), way) for part, way in laid if part]
+            told = [(part.nats, way) for part, way in laid if part]
             self._laid[first, second] = sorted(told, key=lambda told: told[0])
         cheap = (way for nats, way in self._laid[first, second] if nats < most)
         joined = (_laid(overlay, way) for way in cheap)
@@ -325,15 +325,6 @@ class Joining:
                 if len(known) > OTHERS:
                     break
 
-    def _nats_of(self, parts: Sequence[Hypothesis]) -> float:
-        """Compute the cost of parts as separate pieces, in nats."""
-        return sum(map(self._nats, parts))
-
-    def _nats(self, part: Hypothesis) -> float:
-        """Compute the cost of a part in nats, with the price of places at one position."""
-        at = part.poses[0].tolist()
-        return part.nats + self._problem.overlap.crowding(part.labels, part.places, at)
-
     def _map(self, part: Hypothesis) -> SSHMap | None:
         """Make the map of a part; None if it breaks an axiom."""
         look_at_clock()
@@ -350,6 +341,11 @@ class Joining:
             kept[-1] = replace(kept[-1], action=None)
             trace = replace(trace, steps=tuple(kept), closures=())
         return trace
+
+
+def _nats_of(parts: Iterable[Hypothesis]) -> float:
+    """Compute the cost of parts as separate pieces, in nats."""
+    return sum(part.nats for part in parts)
 
 
 def _dstates(part: Hypothesis) -> list[int]:

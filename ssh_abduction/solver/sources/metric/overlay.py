@@ -24,10 +24,10 @@ from itertools import combinations
 
 import numpy as np
 
-from ssh_abduction.data.groups import gathered, numbered
+from ssh_abduction.data.groups import firsts, gathered, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.geometry.equations import spreads_of, visits_by_turns
+from ssh_abduction.solver.geometry.equations import visits_by_turns
 from ssh_abduction.solver.geometry.fit import Poses
 from ssh_abduction.solver.sources.metric.hypothesis import (
     BLUR,
@@ -40,6 +40,7 @@ from ssh_abduction.solver.sources.metric.hypothesis import (
 from ssh_abduction.solver.sources.metric.sights import Sight, Sights
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.pairs import pairs_in
+from ssh_abduction.theory.prior import spreads_of
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 
@@ -92,15 +93,17 @@ class Overlay:
         self, standing: Hypothesis, drive: Hypothesis | None, problem: Problem, sights: Sights
     ) -> None:
         """Prepare the merges. Without a second map, the first one is merged with itself."""
-        self._theory = theory = problem.theory
+        self._problem, theory = problem, problem.theory
         both = standing if drive is None else standing.beside(drive)
-        self._both, self._sights, self._overlap = both, sights, problem.overlap
+        self._both, self._sights = both, sights
         self._old = len(standing.places), len(standing.sights)
         self._position, self._heading = np.array(both.position), np.array(both.heading)
         self._step_at = both.step_at
-        self._prices = theory.prices[0], theory.prices[1] if self._has_places else 0.0
         slack = SLACK * both.usual_travel(problem.trace)
         self._spreads = spreads_of(problem.trace).max(axis=0) + np.array([slack, slack, SLACK]) ** 2
+        # What each dstate shows of itself, and of its place, in nats; and a dstate of each place.
+        self._shown = problem.prior.seen[[self._step_at[s] for s in range(len(both.places))]]
+        self._first = firsts(zip(both.places, range(len(both.places)), strict=True))
         links: list[dict[int, int]] = [{} for _ in both.places]
         for (s, action), x in both.links.items():
             links[s][action] = x
@@ -112,7 +115,7 @@ class Overlay:
             links,
             both.mean,
             both.covariance,
-            both.nats + (problem.overlap.between(standing.labels, drive.labels) if drive else 0.0),
+            both.nats,
         )
         at = {t: both.places[s] for t, s in both.labels.items()}
         self._dstates_apart = KeptApart(both.labels, pairs_in(problem.pairs.apart), both.kept)
@@ -131,11 +134,11 @@ class Overlay:
     @property
     def _is_forced(self) -> bool:
         """Whether a place has only one dstate for each direction of a path."""
-        return "one_dstate_per_course" not in self._theory.without
+        return "one_dstate_per_course" not in self._problem.theory.without
 
     @property
     def _has_places(self) -> bool:
-        return self._theory.level == "topological"
+        return self._problem.theory.level == "topological"
 
     def merge(self, old: int, new: int, turn: float | None = None) -> bool:
         """Merge a dstate of the old map with one of the drive, and then all that coincide.
@@ -150,7 +153,9 @@ class Overlay:
         at = both.mean[self._position[places[0]] :][:2]
         equal = float(both.mean[self._heading[old]] - both.mean[self._heading[new]])
         self._lay(new, at, equal if turn is None else turn, is_turn_known=turn is not None)
-        if not (self._tried([(old, new)]) if turn is None else self._tried([], places)):
+        # The first merge only fixes the frames. Whether it pays is seen from those that follow.
+        first = ([(old, new)], None) if turn is None else ([], places)
+        if not self._tried(first[0], first[1], most=math.inf):
             return False
         self.merge_all()
         return True
@@ -163,7 +168,8 @@ class Overlay:
             merged, self._changes = False, self._costs.copy()
             while pair := self._surest():
                 look_at_clock()
-                if self._tried([], pair):
+                # A place alone may gain too little. Its dstates and their views may gain more.
+                if self._tried([], pair) or self._tried([], pair, has_dstates=True):
                     merged = True
                 else:
                     self._changes[pair] = math.inf
@@ -237,8 +243,19 @@ class Overlay:
         i, j = np.unravel_index(np.argmin(unlikely), unlikely.shape)
         return None if math.isinf(unlikely[i, j]) else (int(places[i]), int(places[j]))
 
-    def _tried(self, dstates: list[tuple[int, int]], places: tuple[int, int] | None = None) -> bool:
-        """Merge dstates or places, and what follows, if that lowers the cost. Return if it did."""
+    def _tried(
+        self,
+        dstates: list[tuple[int, int]],
+        places: tuple[int, int] | None = None,
+        most: float = 0.0,
+        *,
+        has_dstates: bool = False,
+    ) -> bool:
+        """Merge dstates or places, and what follows, if that costs less than `most` nats more.
+
+        If `has_dstates`, the coinciding dstates of the places are merged, too. Return whether they
+        were merged.
+        """
         before = self._state
         self._state = before.copy()
         try:
@@ -249,20 +266,13 @@ class Overlay:
             elif places:
                 dstates = [(self._dstates_at(places[0])[0], self._dstates_at(places[1])[0])]
             touched |= self._merge_dstates(dstates)
-            if dstates or self._is_forced:
+            if dstates or has_dstates or self._is_forced:
                 self._merge_coinciding(touched)
         except _ClashError:
             self._state = before
-        if self._state.nats >= before.nats + self._relief(before, places):
+        if self._state.nats >= before.nats + most:
             self._state = before
         return self._state is not before
-
-    def _relief(self, before: _State, places: tuple[int, int] | None) -> float:
-        """Return the price of two places at one position. It is saved if they become one place."""
-        if not places or {*before.sights[places[0]]} & {*before.sights[places[1]]}:
-            return 0.0
-        here, there = (before.mean[k : k + 2].tolist() for k in self._position[[*places]])
-        return self._overlap.crowded_price * self._overlap.share(here, there)
 
     def _merge_coinciding(self, places: set[int]) -> None:
         """Merge the coinciding dstates at some places, unless some of them cannot be one.
@@ -303,8 +313,9 @@ class Overlay:
             state.dstate = [s if i == x else i for i in state.dstate]
             p, q = sorted(state.place[self._both.places[i]] for i in (s, x))
             headings = self._heading[s], self._heading[x]
+            state.nats -= float(self._shown[[s, x], 0].min())
             if p == q:
-                self._condition([headings], self._prices[0])
+                self._condition([headings])
             else:
                 self._merge_places(p, q, headings)
             places.add(p)
@@ -325,17 +336,15 @@ class Overlay:
         state.sights[p] = {**state.sights[p], **state.sights[q]}
         state.place = [p if i == q else i for i in state.place]
         same = [(position[p], position[q]), (position[p] + 1, position[q] + 1)]
-        if heading is None:
-            self._condition(same, self._prices[1] - changes)
-        else:
-            self._condition([*same, heading], sum(self._prices) - changes)
+        state.nats += changes - float(self._shown[[self._first[p], self._first[q]], 1].min())
+        self._condition(same if heading is None else [*same, heading])
 
     def _may_face(self, p: int, q: int) -> bool:
         """Whether the gateways of two places agree if each place is turned as its dstates face.
 
         This is unknown, and so True, if gateways may change between drives.
         """
-        if self._theory.changed:
+        if self._problem.theory.changed:
             return True
         (s, *_), (x, *_) = self._dstates_at(p), self._dstates_at(q)
         turns = self._sights.turns(self._step_at[s], self._step_at[x])
@@ -349,14 +358,15 @@ class Overlay:
         off = math.remainder(state.mean[i] + turn - state.mean[j], math.tau)
         return off, off * off / float(c[i, i] + c[j, j] - 2 * c[i, j] + self._spreads[2])
 
-    def _condition(self, same: list[tuple[int, int]], saved: float) -> None:
+    def _condition(self, same: list[tuple[int, int]]) -> None:
         """Condition the poses on the equality of pairs of entries. Update the cost in nats."""
         state, (first, second) = self._state, map(list, zip(*same, strict=True))
         spreads = self._spreads[-len(same) :] if len(same) % 2 else self._spreads[:2]
-        state.mean, state.covariance, square = conditioned(
+        state.mean, state.covariance, square, spread = conditioned(
             state.mean, state.covariance, first, second, spreads
         )
-        state.nats += square / 2 - saved
+        state.nats += square / 2 - float(self._problem.prior.gain(spread))
+        state.nats += self._problem.prior.crowd * (len(same) > 1)  # for a place
 
     def _dstates_at(self, place: int) -> list[int]:
         """List the dstates at a place, one of each merged group."""
@@ -381,7 +391,7 @@ class Overlay:
         found = []
         for s, x in combinations(self._dstates_at(place), 2):
             off, square = self._twist(s, x)
-            is_one_way = abs(off) < TURNED and square < 2 * self._prices[0]
+            is_one_way = abs(off) < TURNED and square < FAR
             if (
                 is_one_way
                 and self._look_alike(s, x)
@@ -402,10 +412,13 @@ def smoothed(problem: Problem, log: Log, sights: Sights, begin: SSHMap | None) -
     else:
         labels = [*begin.dstate_at]
         places = numbered(-1 - s.id if s.place is None else s.place for s in begin.dstates)
-    of_dstate, of_place = theory.prices[0], theory.prices[1] * (theory.level == "topological")
+    prior = problem.prior
     found = []
     for apart in parts_of(Poses(trace, labels, places).gaussian(), labels, places, log, sights):
-        price = of_dstate * len(apart.places) + of_place * len(apart.position)
+        new = firsts((label, t) for t, label in apart.labels.items()).values()
+        price = float(prior.dstate[[*new]].sum())
+        new = firsts((apart.places[label], t) for t, label in apart.labels.items()).values()
+        price += float(prior.place[[*new]].sum())
         overlay = Overlay(replace(apart, nats=apart.nats + price), None, problem, sights)
         overlay.merge_all()
         found.append(overlay.part())

@@ -17,6 +17,7 @@ from ssh_abduction.data.star import Frame, Star
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver.steps.frames import may_face, members, rotation_bits
 from ssh_abduction.solver.steps.log import observation
+from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.theory import Theory
 
 # What a step shows of its place.
@@ -44,8 +45,8 @@ class Sights:
     def __init__(self, trace: Trace, theory: Theory, *, misreads: bool) -> None:
         """Read the views and stars of all steps.
 
-        The theory's field `changed` is the price of a changed gateway, in dstates. With `misreads`,
-        stars may be wrong. Then any step may be at any place.
+        The theory's field `changed`, times FAULT nats, is the cost of a changed gateway. With
+        `misreads`, stars may be wrong. Then any step may be at any place.
         """
         starts = starts_of(trace)
         shows = [
@@ -60,7 +61,7 @@ class Sights:
         self.shown = [_shown(step, star) for step in trace.steps]
         self._steps, self._star = trace.steps, theory.star
         self.drive = [bisect_right(starts, t) for t in range(len(trace))]
-        self._misreads, self._price = misreads, theory.prices[0] * theory.changed
+        self._misreads, self._price = misreads, FAULT * theory.changed
         self.dearest = DEAREST + CHANGES * self._price
 
     def changes(self, seen: Mapping[int, Sight], t: int) -> float:
