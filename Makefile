@@ -31,7 +31,7 @@ test-all: style
 	@$(MAKE) --no-print-directory -j2 types unit
 
 quick: .venv/dev
-	$(BIN)/pytest -n auto --dist worksteal -m "not slow" $(QUICK)
+	$(BIN)/pytest -n $$(( $$(nproc) + 1 )) --dist worksteal -m "not slow" $(QUICK)
 
 lint: style types
 
@@ -44,7 +44,7 @@ types: .venv/dev
 	$(BIN)/mypy
 
 unit: .venv/dev
-	$(BIN)/pytest -n auto --dist worksteal $(WHICH)
+	$(BIN)/pytest -n $$(( $$(nproc) + 1 )) --dist worksteal $(WHICH)
 
 docs: .venv/dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -q
