@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -82,48 +83,57 @@ def rivals_of(
     return estimated(rival, begins, drives, cost_of, seconds)
 
 
-def rivals_with_misread_views(problem: Problem, misfit: Misfit, best: SSHMap) -> Iterator[Rival]:
-    """Yield rivals in which some views are misread, although the theory forbids that.
+def rivals_with_misread_views(
+    problem: Problem, misfit: Misfit, best: SSHMap, seconds: float
+) -> list[Rival]:
+    """List rivals in which some views are misread, although the theory forbids that.
 
     Two dstates of one place that face one way are a sign of a misread view: in a rival, they are
     one. One rival joins all such dstates, and one for each pair joins only this pair. A misread
-    view costs MISREAD nats.
+    view costs MISREAD nats. `seconds` is the time that this may take.
     """
+    found: list[Rival] = []
     if problem.theory.misread or not best.places:
-        return
+        return found
     from ssh_abduction.solver.geometry.fit import fit  # loads scipy
 
-    trace = problem.trace.without_displacements_at(jumped(best))
-    facing = [pose.heading for pose in fit(trace, best).poses]
-    at, rival = best.dstates, rival_of(best, 0.0)
-    pairs = [
-        (s, x)
-        for s, x in combinations(range(len(at)), 2)
-        if at[s].place == at[x].place
-        and None not in (at[s].view, at[x].view)
-        and at[s].view != at[x].view
-        and abs(math.remainder(facing[s] - facing[x], math.tau)) < ONE_WAY
-    ]
-    for some in [pairs, *([pair] for pair in pairs)] if len(pairs) > 1 else filter(None, [pairs]):
-        merged = NodeClasses[int]()
-        waiting = [*some]
-        while waiting:  # an action leads from one dstate to one dstate
-            for s, x in waiting:
-                merged.merge(s, x)
-            led: dict[tuple[int, str], int] = {}
-            ends = [(led.setdefault((merged.of(s), a), x), x) for s, a, x in best.links]
-            waiting = [pair for pair in ends if not merged.are_one(*pair)]
-        dstates = numbered(map(merged.of, best.dstate_at))
-        if len({*zip(dstates, rival.places, strict=True)}) > len({*dstates}):
-            continue  # a dstate would be at two places
-        views = gathered(zip(dstates, problem.trace.views, strict=True))
-        right = {s: Counter(filter(None, seen)).most_common(1)[0][0] for s, seen in views.items()}
-        seen = zip(dstates, problem.trace.views, strict=True)
-        wrong = [t for t, (s, view) in enumerate(seen) if view not in (None, right[s])]
-        nats = misfit.nats_of_course(dstates, rival.places, jumped(best))
-        nats += FAULT * Cost.of(best).faults + MISREAD * len(wrong)
-        faults = (*rival.faults, *(("misread", t) for t in wrong))
-        yield Rival(nats, tuple(dstates), rival.places, True, faults)
+    trace, wrong, places = problem.trace, jumped(best), rival_of(best, 0.0).places
+    with suppress(LimitError), heeding(Watch().part(seconds).check):
+        poses = fit(trace.without_displacements_at(wrong), best).poses
+        pairs = [
+            (s.id, x.id)
+            for s, x in combinations(best.dstates, 2)
+            if s.place == x.place
+            and None not in (s.view, x.view)
+            and s.view != x.view
+            and abs(math.remainder(poses[s.id].heading - poses[x.id].heading, math.tau)) < ONE_WAY
+        ]
+        for some in ([pairs] if pairs else []) + [[pair] for pair in pairs if len(pairs) > 1]:
+            dstates = _joined(best, some)
+            if len({*zip(dstates, places, strict=True)}) > len({*dstates}):
+                continue  # a dstate would be at two places
+            shown = [*zip(dstates, trace.views, strict=True)]
+            views = gathered((s, view) for s, view in shown if view is not None)
+            right = {s: Counter(seen).most_common(1)[0][0] for s, seen in views.items()}
+            misread = [t for t, (s, view) in enumerate(shown) if view not in (None, right.get(s))]
+            nats = misfit.nats_of_course(dstates, places, wrong)
+            nats += FAULT * Cost.of(best).faults + MISREAD * len(misread)
+            faults = ((fault.kind, fault.step) for fault in best.faults)
+            more = (*faults, *(("misread", t) for t in misread))
+            found.append(Rival(nats, dstates, places, True, more))
+    return found
+
+
+def _joined(ssh_map: SSHMap, pairs: Iterable[tuple[int, int]]) -> tuple[int, ...]:
+    """Join pairs of dstates, and what one action leads to from both. Return that of each step."""
+    merged, waiting = NodeClasses[int](), [*pairs]
+    while waiting:
+        for s, x in waiting:
+            merged.merge(s, x)
+        led: dict[tuple[int, str], int] = {}
+        ends = [(led.setdefault((merged.of(s), a), x), x) for s, a, x in ssh_map.links]
+        waiting = [pair for pair in ends if not merged.are_one(*pair)]
+    return tuple(numbered(map(merged.of, ssh_map.dstate_at)))
 
 
 def may_join_more(problem: Problem, rivals: Sequence[Rival]) -> bool:

@@ -375,11 +375,10 @@ class Weighing:
         is_likely = excess < math.inf and not may_join_more(problem, found)
         if self.proven and not 1 < excess < math.inf:
             doubt = _misfit_of(problem, self.candidates[0].map)
-        suspected = [
-            rival
-            for rival in rivals_with_misread_views(problem, self._misfit, self.candidates[0].map)
-            if rival.nats < found[0].nats + CERTAIN
-        ]
+        misread = rivals_with_misread_views(
+            problem, self._misfit, self.candidates[0].map, self._estimating
+        )
+        suspected = [rival for rival in misread if rival.nats < found[0].nats + CERTAIN]
         return Weighed(
             bound=self.bound,
             within=self._within if self.proven else 0.0,
@@ -405,16 +404,20 @@ class Weighing:
         is_off = spreads_of(self._task.trace).any()
         return square / freedom if is_off and square <= EXCESS * freedom else math.inf
 
+    @property
+    def _estimating(self) -> float:
+        """The seconds that estimating rivals may take."""
+        left = max(self._parts.watch.left() + OVERTIME, LEAST_ESTIMATING)
+        return min(left, turn("estimated rivals").most)
+
     def _estimated(self, best: Rival, known: Collection[Course]) -> Iterator[Rival]:
         """Yield estimated rivals that the search did not find.
 
         If it found all maps below a cost, estimated rivals below it break axioms: leave them out.
         """
         least = best.nats + self._within if self.proven else -math.inf
-        left = max(self._parts.watch.left() + OVERTIME, LEAST_ESTIMATING)
-        seconds = min(left, turn("estimated rivals").most)
         problem, ssh_map = self._task.problem, self.candidates[0].map
-        for rival in rivals_of(problem, self._misfit, ssh_map, seconds):
+        for rival in rivals_of(problem, self._misfit, ssh_map, self._estimating):
             if rival.nats >= least and (rival.dstates, rival.places) not in known:
                 yield rival
 
