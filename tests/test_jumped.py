@@ -184,7 +184,7 @@ def test_annealing_with_a_jump_costs_at_most_the_true_cost() -> None:
     walk, jump = maze(3, 3, steps=16, seed=12, stars=True, follow=True, odometry=NOISE), 6
     steps = list(walk.trace.steps)
     steps[jump] = replace(steps[jump], displacement=AWAY, covariance=None)
-    search = Search(replace(walk.trace, steps=tuple(steps)), Theory(jumped=1))
+    search = Search(replace(walk.trace, steps=tuple(steps)), Theory(jumped=0.5))
     parts, found = search.parts, dict[tuple[int, ...], float]()
     misfit = Misfit(parts.task.problem)
 
