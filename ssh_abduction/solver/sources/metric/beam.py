@@ -66,7 +66,7 @@ LOST, ALIKE, CROWDED = 32, 4, 16
 SPARE = 2
 # With several drives or floors, keep hypotheses that cost up to this many nats more than the best.
 # A false join to a place that looks alike saves some dstates until the drive leads on.
-UNSURE = 60.0
+UNSURE = 30.0
 # With several drives or floors, fit the poses anew if a step adds more than this many nats of
 # misfit. Then a return clearly turns or moves other poses.
 STRAINED = 1.0
