@@ -97,7 +97,7 @@ def rivals_with_misread_views(
         return found
     from ssh_abduction.solver.geometry.fit import fit  # loads scipy
 
-    trace, wrong, places = problem.trace, jumped(best), rival_of(best, 0.0).places
+    trace, wrong, known = problem.trace, jumped(best), rival_of(best, 0.0)
     with suppress(LimitError), heeding(Watch().part(seconds).check):
         poses = fit(trace.without_displacements_at(wrong), best).poses
         pairs = [
@@ -110,17 +110,16 @@ def rivals_with_misread_views(
         ]
         for some in ([pairs] if pairs else []) + [[pair] for pair in pairs if len(pairs) > 1]:
             dstates = _joined(best, some)
-            if len({*zip(dstates, places, strict=True)}) > len({*dstates}):
+            if len({*zip(dstates, known.places, strict=True)}) > len({*dstates}):
                 continue  # a dstate would be at two places
             shown = [*zip(dstates, trace.views, strict=True)]
             views = gathered((s, view) for s, view in shown if view is not None)
             right = {s: Counter(seen).most_common(1)[0][0] for s, seen in views.items()}
             misread = [t for t, (s, view) in enumerate(shown) if view not in (None, right.get(s))]
-            nats = misfit.nats_of_course(dstates, places, wrong)
+            nats = misfit.nats_of_course(dstates, known.places, wrong)
             nats += FAULT * Cost.of(best).faults + MISREAD * len(misread)
-            faults = ((fault.kind, fault.step) for fault in best.faults)
-            more = (*faults, *(("misread", t) for t in misread))
-            found.append(Rival(nats, dstates, places, True, more))
+            faults = (*known.faults, *(("misread", t) for t in misread))
+            found.append(Rival(nats, dstates, known.places, True, faults))
     return found
 
 

@@ -305,7 +305,6 @@ class Forcing:
         ]
         self.joins = self.visits.joined(np.arange(len(self.visits.place)), [])
         self.low = 0.0
-        self._least: tuple[bytes, tuple[Array, Array]] | None = None  # of the present classes
 
     @staticmethod
     def holds_for(problem: Problem) -> bool:
@@ -339,20 +338,21 @@ class Forcing:
         """Find joins that every map of a cost below `most` has, until no more are found."""
         self._forced(self.visits, self.joins, most, 1)
 
-    def _price(self, counts: tuple[int, int], joins: Ints) -> float:
-        """Return what at least this many dstates and places cost.
+    def _least(self, joins: Ints) -> tuple[Array, Array]:
+        """Return what 0, 1, 2, … dstates, and places, cost at least.
 
         `joins` has the class of each visit. Only its first step may be the first one at a place.
         """
-        key = joins.tobytes()
-        if self._least is None or self._least[0] != key:
-            at, facing = joins[self.visits.visit].tolist(), self.visits.direction.tolist()
-            steps = range(len(at))
-            dstates = [*firsts(zip(zip(at, facing, strict=True), steps, strict=True)).values()]
-            places = [*firsts(zip(at, steps, strict=True)).values()]
-            self._least = key, self._prior.least(dstates[1:], places[1:])
+        at, facing = joins[self.visits.visit].tolist(), self.visits.direction.tolist()
+        steps = range(len(at))
+        dstates = [*firsts(zip(zip(at, facing, strict=True), steps, strict=True)).values()]
+        places = [*firsts(zip(at, steps, strict=True)).values()]
+        return self._prior.least(dstates[1:], places[1:])
+
+    def _price(self, counts: tuple[int, int], least: tuple[Array, Array]) -> float:
+        """Return what at least this many dstates and places cost. `least` is that of `_least`."""
         found = {"dstates": max(counts[0], self._dstates), "places": counts[1]}
-        return self._prior.at_least(found, self._least[1])
+        return self._prior.at_least(found, least)
 
     def _forced(self, visits: Visits, joins: Ints, most: float, branches: int) -> bool:
         """Add joins that every map of a cost below `most` has. Return whether there is no such map.
@@ -387,7 +387,8 @@ class Forcing:
             if classes.fails:
                 return joins, math.inf, []
             misfit = self._misfit.of_returns(visits.returns(joins)) / 2
-            low = self._price(classes.counts, joins) + misfit
+            least = self._least(joins)
+            low = self._price(classes.counts, least) + misfit
             if low >= most:
                 return joins, low, []
             # Of each two classes that may join, try one pair of visits.
@@ -401,7 +402,7 @@ class Forcing:
             for (a, b), pair in left.items():
                 look_at_clock()
                 counts = classes.counts_lacking(a, b)
-                worth[pair] = math.inf if counts is None else self._price(counts, joins) + misfit
+                worth[pair] = math.inf if counts is None else self._price(counts, least) + misfit
             forced = [pair for pair, nats in worth.items() if nats >= most]
             if not forced:
                 return joins, low, sorted(worth, key=lambda pair: -worth[pair])

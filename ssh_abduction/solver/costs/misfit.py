@@ -47,8 +47,7 @@ class Misfit:
     def __init__(self, problem: Problem) -> None:
         """Find the visits of the trace. No misfit is computed yet."""
         self.trace, self._prior = problem.trace, problem.prior
-        self._theory = problem.theory
-        self.visit = visits_by_turns(self.trace, self._theory)
+        self.visit = visits_by_turns(self.trace, problem.theory)
         self._equations = Equations.of(self.trace)
         self._known: dict[_Groups, float] = {}
         self._likelihood: dict[_Groups, float] = {}

@@ -154,8 +154,8 @@ class Overlay:
         equal = float(both.mean[self._heading[old]] - both.mean[self._heading[new]])
         self._lay(new, at, equal if turn is None else turn, is_turn_known=turn is not None)
         # The first merge only fixes the frames. Whether it pays is seen from those that follow.
-        first = ([(old, new)], None) if turn is None else ([], places)
-        if not self._tried(first[0], first[1], most=math.inf):
+        dstates = [(old, new)] if turn is None else []
+        if not self._tried(dstates, None if dstates else places, most=math.inf):
             return False
         self.merge_all()
         return True
