@@ -170,7 +170,7 @@ def test_solve_prints_a_map_without_proof(
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 def test_ctrl_c_prints_the_maps_found_so_far(tmp_path: Path) -> None:
     path = saved(rectangle(12), tmp_path)
-    command = [sys.executable, "-m", "ssh_abduction", "solve", path, *ENDLESS, "--json"]
+    command = [sys.executable, "-m", "ssh_abduction", "solve", path, *ENDLESS, "--json", "-q"]
     with (
         (tmp_path / "out.json").open("w") as out,
         subprocess.Popen(command, stdout=out, stderr=subprocess.PIPE, text=True) as process,

@@ -636,7 +636,7 @@ def test_misread_view_is_suspected(tmp_path: Path) -> None:
         trace = Trace.from_steps(
             seen, ["travel", "left"] * 12, displacements=moved, odometry=odometry
         )
-        found.append(solve(trace, time_limit=100))
+        found.append(solve(trace, work_limit=3))
     sure, doubtful = found
     assert sure.confidence > 0.95
     assert "misread" not in sure.sureness
