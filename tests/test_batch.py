@@ -367,7 +367,7 @@ def test_missing_dask_is_a_clear_error(
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert main(["solve", "quick.jsonl", "--scheduler", "tcp://127.0.0.1:1"]) == 1
-    assert capsys.readouterr().err.endswith("; pip install 'ssh-abduction[cluster]'\n")
+    assert capsys.readouterr().err.endswith("; pip install '.[cluster]' in your clone\n")
 
 
 def test_unexpected_error_becomes_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

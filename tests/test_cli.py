@@ -140,7 +140,9 @@ def test_solve_without_time_prints_a_sketch_or_unknown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = saved(drive(*TOURS["comb"]), tmp_path)
-    assert main(["solve", path, "--time-limit", "1e-9"]) == 10
+    assert main(["solve", path, "--time-limit", "1e-9"]) == 0
+    capsys.readouterr()
+    assert main(["solve", path, "--time-limit", "1e-9", "--strict"]) == 10
     assert capsys.readouterr().out.startswith("feasible (time limit): ")
     no_time = ["solve", path, "--time-limit", "1e-9", "--set", "without_speedups=greedy"]
     assert main(no_time) == 30
@@ -157,7 +159,7 @@ def test_solve_prints_a_map_without_proof(
     from test_solver import too_hard
 
     path = saved(too_hard(), tmp_path)
-    assert main(["solve", path, "--theory", "causal", "--time-limit", "0.5", "--json"]) == 10
+    assert main(["solve", path, "--theory", "causal", "--time-limit", "0.5", "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert (data["status"], data["stopped"], data["count"], data["complete"]) == (
         "feasible",
@@ -672,3 +674,63 @@ def test_a_theory_is_read_from_a_file(
     toml.write_text("boundary = 3\n")
     assert main(["solve", room, "--theory", str(toml)]) == 1
     assert "mine.toml: boundary: expected none, strict or defeasible" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["map", "x.log", "-o", "x", "--set", "widht=0.4"], "did you mean --width?"),
+        (["map", "x.log", "-o", "x", "--set", "misraed=4"], "did you mean --set misread=VALUE?"),
+        (["map", "x.log", "-o", "x", "--misraed=4"], "did you mean --set misread=VALUE?"),
+        (["solve", "x", "--strcit"], "did you mean --strict?"),
+    ],
+)
+def test_misspelt_option_gets_the_way_to_write_it(
+    words: list[str], hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(words)
+    assert capsys.readouterr().err.endswith(f"; {hint}\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("simulate triangle -o x.svg", ".jsonl"),
+        ("simulate triangle --format carmen -o x.bag", ".log or .clf"),
+        ("export {maps} --to nav2 -o x.svg", ".geojson"),
+        ("view {maps} -o x.svg", ".html or .htm"),
+        ("solve {trace} -o x.jsonl", ".json"),
+    ],
+)
+def test_ending_of_another_format_is_refused(
+    words: str, expected: str, solved: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words.format(maps=solved, trace=ACES).split()) == 1
+    assert f"expected a name that ends in {expected}, " in capsys.readouterr().err
+    assert not Path("x.svg").exists()
+
+
+def test_simulate_writes_the_format_that_the_name_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", "triangle", "-o", str(tmp_path / "x.log")]) == 0
+    assert "scans along" in capsys.readouterr().out
+    assert (tmp_path / "x.log").read_text().count("\nROBOTLASER1 ") > 10
+
+
+@pytest.mark.parametrize("name", ["run.json", "report.html"])
+def test_map_keeps_the_files_of_another_program(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text("mine")
+    assert main(["map", "missing.log", "-o", str(tmp_path)]) == 1
+    assert f"got {name}, which is not of map; name another folder" in capsys.readouterr().err
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_map_asks_whether_it_can_write_before_it_reads(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["map", "missing.log", "-o", "/proc/there"]) == 1
+    assert "expected a folder that can be written, got " in capsys.readouterr().err

@@ -330,7 +330,7 @@ def test_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         to_pandas(ssh_map)
     with pytest.raises(
         MapError,
-        match=r"expected the package matplotlib, got none; pip install 'ssh-abduction\[plot\]'",
+        match=r"expected the package matplotlib, got none; pip install '\.\[plot\]'",
     ):
         plot(ssh_map)
 

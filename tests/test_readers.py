@@ -662,7 +662,7 @@ def test_missing_rosbags_is_named_with_the_install_command(
         lambda: read_log(tmp_path / "a.bag"),
         lambda: write_bag(tmp_path / "b.bag", drive(2)),
     ):
-        with pytest.raises(LogError, match=r"pip install 'ssh-abduction\[ros\]'"):
+        with pytest.raises(LogError, match=r"pip install '\.\[ros\]'"):
             act()
 
 

@@ -3,7 +3,6 @@ names, completions."""
 
 from __future__ import annotations
 
-import builtins
 import itertools
 import json
 import logging
@@ -12,7 +11,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -279,24 +277,6 @@ def test_bash_completion_completes_words(
         ["bash", "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.stdout.split() == completed
-
-
-def test_missing_shtab_is_named(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    imported = builtins.__import__
-
-    def without(name: str, *rest: Any, **more: Any) -> Any:
-        if name == "shtab":
-            raise ImportError(name)
-        return imported(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    _, told = lines(capsys, "completion", "bash", code=1)
-    assert told == [
-        "ssh-abduction: completion: expected the package shtab, got none; pip install "
-        "'ssh-abduction[completion]'"
-    ]
 
 
 def test_bootstrap_learner_logs_its_stages(caplog: pytest.LogCaptureFixture) -> None:

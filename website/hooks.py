@@ -1,7 +1,7 @@
 """Adds to the site of docs/ what mkdocs does not do by itself.
 
 The README becomes the first page, and each public name gets a page. GitHub shows the pages of
-docs/, too, so their links are relative. Links that leave docs/ become links to GitHub here.
+docs/, too, so their links are relative. Links that leave docs/ become plain text here.
 """
 
 from __future__ import annotations
@@ -21,8 +21,6 @@ import ssh_abduction
 from ssh_abduction import data
 
 ROOT = Path(__file__).parent.parent
-GITHUB = "https://github.com/ssh-abduction/ssh-abduction"
-RAW = "https://raw.githubusercontent.com/ssh-abduction/ssh-abduction"
 
 # The public names by theme: all that `ssh_abduction` exports, and what else the pages import, with
 # the module that has it.
@@ -154,9 +152,10 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 
 
 def home() -> str:
-    """The README as the first page. Its links to docs/ on GitHub lead to the site."""
+    """The README as the first page."""
     text = (ROOT / "README.md").read_text()
-    text = re.sub(rf"{GITHUB}/blob/main/docs/|{RAW}/main/docs/", "", text)
+    text = re.sub(r"\]\((?!\w+:)", "](../", text)
+    text = re.sub(r"\.\./docs/|(?<=src=\")docs/", "", text)
     return text.replace("# ssh-abduction\n", "---\nhide: [navigation]\n---\n\n# ssh-abduction\n", 1)
 
 
@@ -189,11 +188,11 @@ def reference() -> Iterator[tuple[str, str]]:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    return to_github(markdown, page.file.src_uri)
+    return for_the_site(markdown, page.file.src_uri)
 
 
-def to_github(markdown: str, uri: str) -> str:
-    """The text of a page, in which links to files outside docs/ lead to GitHub.
+def for_the_site(markdown: str, uri: str) -> str:
+    """The text of a page, in which links to files outside docs/ are plain text.
 
     Args:
         markdown: The text.
@@ -201,11 +200,7 @@ def to_github(markdown: str, uri: str) -> str:
     """
 
     def mended(link: re.Match[str]) -> str:
-        target = posixpath.normpath(posixpath.join("docs", posixpath.dirname(uri), link[1]))
-        if target == "docs" or target.startswith("docs/"):
-            return link[0]
-        return (
-            f"]({GITHUB}/{'tree' if (ROOT / target).is_dir() else 'blob'}/main/{target}{link[2]})"
-        )
+        target = posixpath.normpath(posixpath.join("docs", posixpath.dirname(uri), link[2]))
+        return link[0] if target == "docs" or target.startswith("docs/") else link[1]
 
-    return re.sub(r"\]\((\.\./[^)#\s]*)(#[^)\s]*|)\)", mended, markdown)
+    return re.sub(r"\[([^][]*)\]\((\.\./[^)#\s]*)(?:#[^)\s]*|)\)", mended, markdown)

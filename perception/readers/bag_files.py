@@ -375,7 +375,7 @@ class Bag:
             if zstd_module() is None:
                 raise LogError(
                     f"{source}: expected the package backports.zstd to unpack its messages with "
-                    "(zstd), got none; pip install 'ssh-abduction[ros]'"
+                    "(zstd), got none; pip install '.[ros]' in your clone"
                 )
             self.notes.append(f"The messages of {source} are packed with zstd: they are unpacked.")
 
@@ -463,7 +463,7 @@ def bag_opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
     except ImportError:
         raise LogError(
             f"{named(path)}: expected the package rosbags to read it with, got none; pip "
-            "install 'ssh-abduction[ros]'"
+            "install '.[ros]' in your clone"
         ) from None
     with ExitStack() as stack:
         try:

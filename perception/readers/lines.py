@@ -133,7 +133,7 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
         if (zstd := zstd_module()) is None:
             raise LogError(
                 f"{source}: expected the package backports.zstd to unpack it with (zstd), got "
-                "none; pip install 'ssh-abduction[ros]', or unpack it with zstd -d"
+                "none; pip install '.[ros]' in your clone, or unpack it with zstd -d"
             )
         openers["zstd"] = zstd.ZstdFile
     return cast(IO[bytes], openers[found](file))

@@ -176,7 +176,7 @@ def _write_bag(path: Path, scans: Iterable[Scan], covariances: Array | None) -> 
         from rosbags import rosbag1, rosbag2
     except ImportError:
         raise LogError(
-            "bag: expected the package rosbags, got none; pip install 'ssh-abduction[ros]'"
+            "bag: expected the package rosbags, got none; pip install '.[ros]' in your clone"
         ) from None
     is_ros1 = path.suffix == ".bag"
     store = typestore(is_ros1)

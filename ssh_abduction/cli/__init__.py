@@ -1,10 +1,10 @@
 """The command line, with a module for each verb or a few related verbs.
 
 Exit codes:
-    0: Success, or a map that is proven minimal.
+    0: Success.
     1: A known error, with one line on stderr.
     2: Wrong usage.
-    10: A map that is not proven minimal.
+    10: With --strict, a map or plan that is not proven best.
     20: No map satisfies the axioms, or a checked map breaks an axiom.
     30: No map was found in time.
     130: Interrupted by Ctrl-C.
@@ -37,7 +37,15 @@ from ssh_abduction.cli import (
     solve,
     use,
 )
-from ssh_abduction.cli.outcome import EXIT_ERROR, Guard, add_verbosity, telling, unwritten, warn
+from ssh_abduction.cli.outcome import (
+    EXIT_ERROR,
+    EXIT_UNPROVEN,
+    Guard,
+    add_verbosity,
+    telling,
+    unwritten,
+    warn,
+)
 from ssh_abduction.cli.parsing import Parser, Verb
 from ssh_abduction.cli.shared import check_inputs_are_kept
 from ssh_abduction.data.errors import AbductionError, printable
@@ -104,8 +112,8 @@ def parser() -> Parser:
         prog="ssh-abduction",
         description="Find the topological maps that explain what a robot saw and did.",
         epilog=(
-            f"Words: {WORDS}\n\nExit codes: 0 success, or a map that is proven minimal; 1 error; 2 "
-            "wrong usage; 10 a map that is not proven minimal; 20 no map exists, or a map breaks "
+            f"Words: {WORDS}\n\nExit codes: 0 success; 1 error; 2 wrong usage; 10 with "
+            "--strict, a map or plan that is not proven best; 20 no map exists, or a map breaks "
             "an axiom; 30 no map in time; 130 interrupted; 143 ended by SIGTERM."
         ),
     )
@@ -182,7 +190,9 @@ def _main(arguments: Sequence[str] | None) -> int:
                 check_inputs_are_kept(options)
                 guard = Guard(lambda: None)
                 with contextlib.redirect_stdout(output), guard:
+                    program.shown[EXIT_UNPROVEN] = EXIT_UNPROVEN * getattr(options, "strict", False)
                     code = int(options.act(options))
+                    code = program.shown.get(code, code)
             finally:
                 warn(dict.fromkeys(printable(str(warning.message)) for warning in caught))
         sys.stdout.flush()

@@ -9,7 +9,6 @@ import sys
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.shared import TRACE_SAID, theory_of, theory_rows
 from ssh_abduction.cli.text import table
-from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError, printable
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import facts as encoding
@@ -75,15 +74,14 @@ SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")
 def run_completion(options: argparse.Namespace) -> int:
     """Print completions for a shell.
 
-    Print the completion of verbs, options and files. Needs the package shtab:
-    pip install 'ssh-abduction[completion]'.
+    Print the completion of verbs, options and files.
 
     bash: eval "$(ssh-abduction completion bash)" in ~/.bashrc; zsh: write it to a file
     _ssh-abduction in a folder of $fpath; fish: write it to
     ~/.config/fish/completions/ssh-abduction.fish
     """
-    with needed("completion", "shtab", "'ssh-abduction[completion]'"):
-        import shtab
+    import shtab
+
     if options.shell not in shtab.SUPPORTED_SHELLS:
         raise AbductionError(
             f"completion: expected a shtab that knows {options.shell}, got {shtab.__version__}; "

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli import shared
-from ssh_abduction.cli.outcome import Guard, on_ctrl_c, warn
+from ssh_abduction.cli.outcome import EXIT_UNPROVEN, Guard, on_ctrl_c, warn
 from ssh_abduction.cli.parsing import maps_path, verb
 from ssh_abduction.cli.text import compared, counted, depending, table
 from ssh_abduction.data.errors import MapError, brief, named, printable, said_of
@@ -178,14 +178,14 @@ def _lines(found: Comparison) -> Iterator[str]:
 
 
 SHOWN_LINES = 40  # of a plan; --json prints all
-# Exit codes if a limit ended the search: with a plan that may not be the best, or without a plan.
-EXIT_CUT_SHORT, EXIT_NOTHING = 10, 30
+EXIT_NOTHING = 30  # the exit code if a limit ended the search without a plan
 
 
 @verb(
     {
         **shared.maps_and_trace(),
         **shared.limits("the best plan so far"),
+        **shared.STRICT,
         **shared.JSON,
         **shared.theory_rows("the theory in the file of maps"),
     }
@@ -202,8 +202,8 @@ def run_next(options: argparse.Namespace) -> int:
     the best one is PSPACE-complete (Lee & Yannakakis 1994). docs/reference/formats.md describes the
     JSON.
 
-    Exit codes: 0 done; 10 a limit ended the search, and a better plan may exist; 30 no plan in
-    time.
+    Exit codes: 0 done; 10 with --strict, if a limit ended the search and a better plan may exist;
+    30 no plan in time.
     """
     from ssh_abduction.rivals.explore import next_experiment  # loads numpy
 
@@ -240,7 +240,7 @@ def run_next(options: argparse.Namespace) -> int:
         return interrupted_code()
     if not experiment.stopped:
         return 0
-    return EXIT_CUT_SHORT if experiment.plan.branches else EXIT_NOTHING
+    return EXIT_UNPROVEN if experiment.plan.branches else EXIT_NOTHING
 
 
 def _plan_lines(experiment: Experiment) -> Iterator[str]:

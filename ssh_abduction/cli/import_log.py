@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import sys
+import tempfile
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c, unwritten, warn
 from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, verb
-from ssh_abduction.cli.shared import OUTPUT_TRACE, check_output, write_trace
+from ssh_abduction.cli.shared import OUTPUT_TRACE, check_ending, check_output, write_trace
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import write_file
@@ -164,6 +165,7 @@ def run_import(options: argparse.Namespace) -> int:
     the truth, which only the command 'evaluate' uses.
     """
     check_output(options.output, "the trace")
+    check_ending(options.output, ".jsonl")
     log, done = (_live if options.log == "-" else _whole)(options, lambda note: warn([note]))
     said = (
         f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: "
@@ -263,6 +265,7 @@ def named_after(path: str) -> str:
 
 # RUN is written last: it marks a run as finished.
 FILES = (TRACE, MAPS, "page.html", "report.html", RUN)
+OURS = (MAPS, RUN)  # the files whose content says that map wrote the folder
 LONGEST = 255  # the most bytes of the name of a folder
 DIGITS = 8  # of a log's digest, appended to its name if another log has the same name
 
@@ -300,10 +303,29 @@ def check_folder(folder: Path) -> None:
             f"{named(folder)}: expected a folder to write, got a file: {named(there)}; "
             "name another one"
         )
-    if not os.access(there, os.W_OK):
+    try:
+        with tempfile.TemporaryDirectory(dir=there):
+            pass
+    except OSError as error:
         raise AbductionError(
-            f"{named(folder)}: expected a folder that can be written, got no permission in "
+            f"{named(folder)}: expected a folder that can be written, got {error.strerror} in "
             f"{named(there)}; name another one"
+        ) from None
+
+
+def check_run_folder(folder: Path) -> None:
+    """Raise AbductionError before long work if a folder cannot take the files of a run.
+
+    A file of another program that has the name of such a file is kept.
+    """
+    check_folder(folder)
+    there = [folder / name for name in FILES if os.path.lexists(folder / name)]
+    is_ours = any(str(_record(folder / name).get("format")).startswith("ssh-") for name in OURS)
+    wrong = [file for file in there if not file.is_file() or not is_ours]
+    if wrong:
+        raise AbductionError(
+            f"{named(folder)}: expected a new folder, or one that map wrote, got "
+            f"{wrong[0].name}, which is not of map; name another folder"
         )
 
 
@@ -424,9 +446,14 @@ def _runs_in(folder: Path) -> dict[str, list[Path]]:
 
 def _run_in(folder: Path) -> dict[str, Any]:
     """Read run.json in a folder; an empty dict if it is missing or cannot be read."""
+    return _record(folder / RUN)
+
+
+def _record(file: Path) -> dict[str, Any]:
+    """Read an object from a file of JSON; an empty dict if it is missing or cannot be read."""
     with suppress(OSError, ValueError, RecursionError):
-        run = json.loads((folder / RUN).read_text(encoding="utf-8"))
-        return run if isinstance(run, dict) else {}
+        record = json.loads(file.read_text(encoding="utf-8"))
+        return record if isinstance(record, dict) else {}
     return {}
 
 

@@ -218,7 +218,7 @@ def answers_on_cluster(
     cores. The work ends early when `stop` is set. Raises AbductionError if the package
     `distributed`, the scheduler or its workers are missing.
     """
-    with needed("--scheduler", "distributed", "'ssh-abduction[cluster]'"):
+    with needed("--scheduler", "distributed", "'.[cluster]' in your clone"):
         from distributed import Client
     if not re.search(r"^inproc:|:\d+$", address):
         raise AbductionError(

@@ -273,6 +273,7 @@ class MapQuestion(jobs.FileQuestion):
             "then goes on for up to 64 times as long)"
         ),
         "--time-limit S": "end the search after S seconds in any case",
+        **shared.STRICT,
         "--set ladder true|false=true": (
             "whether to compute how much each kind of evidence helps; this takes up to a quarter "
             "of the work limit after the search, or a few units if that is more"
@@ -342,7 +343,7 @@ def _many(question: MapQuestion, options: argparse.Namespace, folders: dict[str,
     left = [*folders]
     for path, folder in folders.items():
         try:
-            import_log.check_folder(folder)
+            import_log.check_run_folder(folder)
             _check_alone(path, folder)
         except AbductionError as error:
             print(f"{named(path)}: error: {error}", flush=True)
@@ -394,7 +395,7 @@ def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
         _keep(answer, folder)
         warn([warning for warning in answer.warnings if warning not in printed])
 
-    import_log.check_folder(folder)
+    import_log.check_run_folder(folder)
     question = question.obeying(folder)
     try:
         return question.mapped(0, logs, keep=keep, tell=tell).code

@@ -62,7 +62,13 @@ EXPLAINING = 0.5
 LEAST_LEFT = 0.2  # seconds that must be left to solve the trace with the runner-up's views
 
 EXIT_ERROR = 1
-EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
+EXIT_UNPROVEN = 10  # 0 without --strict
+EXIT_CODES = {
+    Status.OPTIMAL: 0,
+    Status.FEASIBLE: EXIT_UNPROVEN,
+    Status.UNSATISFIABLE: 20,
+    Status.UNKNOWN: 30,
+}
 
 
 def exit_code(solution: Solution) -> int:
@@ -522,7 +528,7 @@ class Guard:
 
     def _leave(self, code: int) -> NoReturn:
         end_all()
-        os._exit(code)
+        os._exit(program.shown.get(code, code))
 
 
 class _Signals:

@@ -7,6 +7,7 @@ help text.
 from __future__ import annotations
 
 import argparse
+import difflib
 import inspect
 import re
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -130,7 +131,7 @@ class _Set(argparse.Action):
         setting = parser.settings.get(name.strip().replace("-", "_"))
         if setting is None or not equals:
             known = ", ".join(parser.settings)
-            hint = f"; write {name}=VALUE" if setting else meant(name, parser.settings)
+            hint = f"; write {name}=VALUE" if setting else parser.meant(f"--{name}")
             raise argparse.ArgumentError(
                 self, f"expected NAME=VALUE with a name out of {known}, got {values!r}{hint}"
             )
@@ -235,7 +236,7 @@ class Parser(argparse.ArgumentParser):
             wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
             flag = wrong.partition("=")[0]
             is_setting = (name := flag[2:].replace("-", "_")) in verb.settings
-            hint = f"; write --set {name}=VALUE" if is_setting else meant(flag, verb.names)
+            hint = f"; write --set {name}=VALUE" if is_setting else verb.meant(flag)
             # The values of an argument that takes many are one after the other.
             takes_many = any(a.nargs in ("*", "+") for a in verb._get_positional_actions())
             if not wrong.startswith("-") and takes_many:
@@ -253,6 +254,13 @@ class Parser(argparse.ArgumentParser):
     def names(self) -> list[str]:
         """The names of all options, such as "--json"."""
         return [name for action in self._actions for name in action.option_strings]
+
+    def meant(self, flag: str) -> str:
+        """Make a hint for a misspelt option such as "--widht": a similar option or setting."""
+        shown = {f"--{name.replace('_', '-')}": f"--set {name}=VALUE" for name in self.settings}
+        shown |= {name: name for name in self.names}
+        near = difflib.get_close_matches(flag.replace("_", "-"), shown, n=1)
+        return f"; did you mean {shown[near[0]]}?" if near else ""
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and a message, and exit with code 2."""

@@ -32,6 +32,8 @@ Step = TypeVar("Step")  # a step by its number or its name
 # The arguments that name files to read, and the options that name files to write.
 READ = ("trace", "traces", "log", "logs", "maps", "other", "world")
 WRITTEN = ("output", "joint_trace")
+# Endings that say what is in a file.
+ENDINGS = re.compile(r"\.(bag|mcap|log|clf|html?|png|pdf|svg|jsonl|ya?ml|geojson|graphml|dot|gv)")
 
 MAPS_SAID = (
     "file of maps that solve -o wrote, a file of a single map, or a folder that the command "
@@ -41,6 +43,7 @@ TRACE_SAID = "trace file (JSON Lines), or - for standard input"
 JSON: Rows = {"--json": "print the answer as JSON"}
 # One of the maps in a file.
 ONE_MAP: Rows = {"--map I=1": "the number of the map, from 1, or its id"}
+STRICT: Rows = {"--strict": "exit with code 10 if the answer is not proven to be the best"}
 MAP: Rows = {"--map I": "the number of the map, from 1, or its id (default: 1)"}
 OUTPUT_TRACE: Rows = {"-o --output TRACE!": "trace file to write, or - for standard output"}
 
@@ -162,6 +165,19 @@ def check_output(target: str, what: str) -> None:
         why = "its folder may not be written; name another one"
     if why:
         raise AbductionError(f"{named(target)}: cannot write {what}: {why}")
+
+
+def check_ending(target: str, *own: str) -> None:
+    """Raise AbductionError if the ending of a file names another format than will be written.
+
+    `own` are the endings of the format. Endings that name no format are allowed.
+    """
+    ending = Path(target.removesuffix(".gz")).suffix.lower()
+    if ENDINGS.fullmatch(ending) and ending not in own:
+        raise AbductionError(
+            f"{named(target)}: expected a name that ends in {' or '.join(own)}, as its content is "
+            f"of this format, got {ending}; rename it"
+        )
 
 
 def check_inputs_are_kept(options: argparse.Namespace) -> None:

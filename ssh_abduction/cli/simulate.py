@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import simulator
 from ssh_abduction.cli.parsing import verb
-from ssh_abduction.cli.shared import OUTPUT_TRACE, write_trace
+from ssh_abduction.cli.shared import OUTPUT_TRACE, check_ending, write_trace
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named, printable
 from ssh_abduction.data.files import save_file, shipped, write_file
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from simulator.panorama import Camera
     from simulator.robot import RecordedDrive
 
-ENDINGS = (".log", ".clf", ".bag", ".mcap")
+# The formats of logs, by the ending of a file.
+FORMATS = {".log": "carmen", ".clf": "carmen", ".bag": "bag", ".mcap": "bag"}
 SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").glob("*.json"))
 
 
@@ -35,7 +36,7 @@ SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").
         ),
         "--format {carmen,bag}": (
             "write a robot's log instead of a trace: a CARMEN log, or a ROS bag (.bag, .mcap, or "
-            "a folder)"
+            "a folder) (default: as the ending of the file says)"
         ),
         "--tours N=1": "drive the route N times",
         "--seed SEED=0": "random seed of all noise",
@@ -93,6 +94,10 @@ def run_simulate(options: argparse.Namespace) -> int:
     from simulator.tours import simulate
     from simulator.world import World
 
+    log = Path(options.output.removesuffix(".gz")).suffix.lower()
+    options.format = options.format or FORMATS.get(log)
+    own = [ending for ending, format in FORMATS.items() if format == options.format]
+    check_ending(options.output, *own or [".jsonl"])
     if options.format:
         return _write_log(options, _drive(options))
     if options.world.endswith(".xml"):
@@ -163,7 +168,7 @@ def _write_log(options: argparse.Namespace, drive: RecordedDrive) -> int:
     else:
         write_bag(target, scans_of(drive), drive.odometer.covariances(drive.odometry))
     name = Path(target.name.removesuffix(".gz"))
-    truth = target.with_name(f"{name.stem if name.suffix in ENDINGS else name}.truth.json")
+    truth = target.with_name(f"{name.stem if name.suffix in FORMATS else name}.truth.json")
     save_file(truth, json.dumps(drive.truth).encode() + b"\n", "truth", AbductionError)
     print(
         f"{counted(len(drive), 'scans')} along {drive.metres:.0f} m of {printable(drive.name)} in "

@@ -79,6 +79,7 @@ HELD_DSTATES = 500_000
             "beyond which further faults save few dstates"
         ),
         **shared.limits("the best answer so far", work=True),
+        **shared.STRICT,
         **shared.many(
             "solve",
             "traces",
@@ -108,6 +109,7 @@ def run_solve(options: argparse.Namespace) -> int:
     """
     if options.output is not None:
         shared.check_output(options.output, "the solution")
+        shared.check_ending(options.output, ".json")
     if options.onto is not None:
         shared.refuse(options, "--onto", "front", "jobs", "scheduler", "joint_trace")
         return _onto(options)
@@ -373,8 +375,8 @@ def _onto(options: argparse.Namespace) -> int:
 def _front(options: argparse.Namespace) -> int:
     """Print the front: the fewest dstates for each number of faults.
 
-    The exit code is 0 if the search was completed, 20 if no map has so few faults, and 10 if
-    the search was stopped.
+    The exit code is 0 if the search was completed, 20 if no map has so few faults, and
+    EXIT_UNPROVEN if the search was stopped.
     """
     front = fault_front(
         Trace.load(options.traces[0]),
@@ -387,4 +389,4 @@ def _front(options: argparse.Namespace) -> int:
         print(json_line(attributes_of(front, "knee", "prices") | {"front": points}))
     else:
         print(front_as_text(front, options.front))
-    return 10 if front.stopped else 0 if front.points else 20
+    return outcome.EXIT_UNPROVEN if front.stopped else 0 if front.points else 20

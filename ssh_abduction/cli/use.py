@@ -274,8 +274,16 @@ def _with_regions(ssh_map: SSHMap) -> str:
     return "\n".join([describe(ssh_map), *regions])
 
 
-# Repeats ssh_abduction.output.export, whose import of networkx would delay all verbs.
-FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
+# The formats of ssh_abduction.output.export, whose import of networkx would delay all verbs, with
+# the endings of their files.
+FORMATS = {
+    "nav2": (".geojson",),
+    "tmap2": (".yaml", ".yml"),
+    "graphml": (".graphml",),
+    "dot": (".dot", ".gv"),
+    "svg": (".svg",),
+    "networkx-json": (".json",),
+}
 
 
 @verb(
@@ -314,6 +322,7 @@ def run_export(options: argparse.Namespace) -> int:
     """
     from ssh_abduction.output.export import export_doubts, export_map  # loads networkx
 
+    shared.check_ending(options.output, *FORMATS[options.to])
     listing = Listing.load(options.maps)
     chosen = listing.maps[listing.number(options.map)]
     how: dict[str, Any] = {"level": options.level, "hide_undecided": options.hide_undecided}
@@ -405,6 +414,8 @@ def _check(options: argparse.Namespace, trace: Trace | None) -> None:
         raise AbductionError(
             "--serve: expected the trace that was mapped, got none; give it after the maps"
         )
+    if options.output:
+        shared.check_ending(options.output, ".html", ".htm")
     if options.serve and options.output:
         raise AbductionError(
             "--output: expected none with --serve, which writes no file; leave out one of the two"

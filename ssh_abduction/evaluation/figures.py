@@ -22,7 +22,7 @@ BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"
 def require_matplotlib() -> None:
     """Raise AbductionError if matplotlib cannot be loaded. Call this before hours of work."""
     try:
-        with needed("plot", "matplotlib", "'ssh-abduction[plot]'"):
+        with needed("plot", "matplotlib", "'.[plot]' in your clone"):
             importlib.import_module("matplotlib")
     except AbductionError:
         raise

@@ -146,7 +146,7 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
         )
     scene = scene_of(ssh_map, turns)
     left, lowest, right, highest = bounds(scene.marks, scene.scale)
-    with needed("plot", "matplotlib", "'ssh-abduction[plot]'", MapError):
+    with needed("plot", "matplotlib", "'.[plot]' in your clone", MapError):
         from matplotlib import pyplot
     # Texts and lines shrink with the axes, if the whole map would be too large.
     size = [(far * scene.scale / PIXELS + 1) for far in (right - left, highest - lowest)]

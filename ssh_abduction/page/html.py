@@ -69,7 +69,7 @@ class Page:
         Raises:
             MapError: The package anywidget is not installed.
         """
-        with needed("widget", "anywidget", "'ssh-abduction[notebook]'", MapError):
+        with needed("widget", "anywidget", "'.[notebook]' in your clone", MapError):
             import anywidget
             import traitlets
         html = traitlets.Unicode(self.html).tag(sync=True)

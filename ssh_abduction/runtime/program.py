@@ -22,6 +22,7 @@ AGAIN = 1.5
 
 heard: list[int] = []  # the signals that asked this process to end, in order
 raised: list[int] = []  # the signals that raised a KeyboardInterrupt
+shown: dict[int, int] = {}  # the exit code that stands for another one, as the user asked
 _heard_at: list[float] = []  # when the last signal came that asked for something new
 
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
