@@ -29,7 +29,7 @@ from ssh_abduction.solver import Status
 from ssh_abduction.solver.entry import fault_front
 from ssh_abduction.solver.sources.exact import choosing, faulty
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.symbolic.state_merging import Explainer
+from ssh_abduction.solver.sources.exact.viterbi import Explainer, PartialMachine
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import Problem
 
@@ -150,8 +150,9 @@ def test_few_names_and_short_prefixes_do_not_change_answers(data: st.DataObject)
     with (
         patch.multiple(
             faulty,
+            FIRST=data.draw(st.sampled_from([1, 2, 10])),
             LONG=data.draw(st.sampled_from([2, 3, 10])),
-            ASKED_FIRST=data.draw(st.sampled_from([0.0, 3.0])),
+            PATIENCE=data.draw(st.sampled_from([1, 1000])),
         ),
         patch.multiple(faulty, PLACES=1, AROUND=0, NAMES=1, MORE_NAMES=1),
         patch.object(choosing, "FEW_STEPS", 0),
@@ -237,14 +238,14 @@ def test_bounds_by_blocks_do_not_exceed_the_minimum(data: st.DataObject) -> None
         kind: [theory.fault_tenths(kind, step) for step in trace.steps]
         for kind in ("misread", "slipped")
     }
-    machine = Explainer(task.log.seen, task.log.actions, price).read_off(
-        data.draw(st.sampled_from([task.log.seen, range(len(trace))]))
-    )
-    known = Explainer(task.log.seen, task.log.actions, price).completed(machine)
+    seen, actions = task.log.seen, task.log.actions
+    labels = data.draw(st.sampled_from([seen, range(len(trace))]))
+    shows = dict(zip(labels, seen, strict=True))
+    goes = {(labels[t], action): labels[t + 1] for t, action in enumerate(actions)}
+    machine = PartialMachine([shows[s] for s in sorted(shows)], goes)
+    known = Explainer(seen, actions, price).completed(machine)
     dstates = len(set(known.labels))
-    blocks = faulty.Blocks(
-        task.log.seen, task.log.actions, price, sorted(known.faults), dstates, task.watch
-    )
+    blocks = faulty.Blocks(seen, actions, price, sorted(known.faults), dstates, task.watch)
     cost, _ = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))
     assert cost is not None
     assert blocks.bound(known.tenths) <= cost <= known.tenths

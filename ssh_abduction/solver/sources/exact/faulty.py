@@ -12,13 +12,12 @@ answer without rests would also be minimal if there were more names. If an answe
 view gets more names. At first a misread step is *lost*: it has no dstate, so no link leads to or
 from it. If a minimal answer loses a step, the step becomes *full*: it may be at any dstate.
 
-*Maps.* A Viterbi pass (Viterbi 1967) explains the whole trace by the links of an answer, with the
-cheapest faults. The explanation is a map of the whole trace, so it may be the new incumbent. Clingo
-gets the steps at fault and those around them. The first maps of a long trace are guessed
-(`sources/symbolic/state_merging.py`), and clingo is only asked for cheaper ones. For a short trace
-clingo is asked first, and maps are guessed if it does not end soon.
+*Maps.* A Viterbi pass explains the whole trace by the links of an answer, with the cheapest faults
+(`viterbi.py`). The explanation is a map of the whole trace, so it may be the new incumbent. Clingo
+begins with the first steps, and gets the steps at fault and those around them.
 
-*Blocks.* The lower bound of a long trace comes from disjoint blocks of its steps. Take a map of the
+*Blocks.* If clingo does not end soon, the lower bound of a long trace comes from disjoint blocks of
+its steps. Take a map of the
 whole trace with N dstates. Restricted to a block of steps, it is a map of that block with at most N
 dstates. So its faults in the block cost at least as much as the cheapest faults of any map of the
 block with at most N dstates. Blocks that share no step add up:
@@ -35,9 +34,8 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain, groupby, pairwise
+from itertools import groupby, pairwise
 from operator import itemgetter
 
 import clingo
@@ -46,33 +44,23 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import number_symbols, read_atom
-from ssh_abduction.solver.asp.limits import StageTimeError, Watch
+from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.sources.exact.engine import Task, in_fixed_order
-from ssh_abduction.solver.sources.symbolic.state_merging import (
-    Explained,
-    Explainer,
-    PartialMachine,
-    robust_maps,
-)
+from ssh_abduction.solver.sources.exact.viterbi import Explained, Explainer, PartialMachine
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.evidence import Equality
 
-# From this many steps on, maps are guessed, and blocks give a bound, before clingo is asked. Clingo
-# gets at most so many steps at once.
+FIRST = 64  # clingo begins with this many steps
+# From this many steps on, blocks may give a bound. Clingo gets at most so many steps at once.
 LONG = 1000
-# Guess maps of a shorter trace if clingo has not ended after this many seconds, or after this share
-# of the time left.
-ASKED_FIRST = 3.0
-ASKED_FIRST_SHARE = 0.2
-# Begin no start of EM after this many seconds, or after this share of the time left.
-GUESSING = 5.0
-GUESSING_SHARE = 0.1
+# If clingo has not ended after this many conflicts, blocks may give a bound, and clingo gets more
+# steps. Each time it may take twice as many.
+PATIENCE = 2000
 PLACES = 12  # after a Viterbi pass, clingo gets the steps around at most this many faults
 AROUND = 8  # clingo gets this many steps before and after a step that a map does not predict
 NAMES = 3  # names of each view at first
 MORE_NAMES = 2  # names added to a view whose rest is used
-SPARE = 3  # names of each view beyond those of the best guess; with 1, answers use the rests
 
 
 class FaultyEngine:
@@ -104,86 +92,58 @@ class FaultyEngine:
         """Take the whole trace as the prefix. Clingo gets only its first steps for now."""
         if size != self.size:
             self.size = size
-            self._control.given = set(range(min(size, LONG)))
+            self._control.given = set(range(min(size, FIRST)))
             for t, others in self._task.log.pairs.one.items():
                 self._control.given |= {t, *others}
                 self._control.full |= {t, *others}  # these equalities hold even for misread steps
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
-        best = self._best = self._known = None
-        for found in chain(self._asked_first(), self._guessed(), self._asked()):
-            if best is None or self._cost_of(found) < best:
-                best = self._best = self._cost_of(found)
-                self._known = found.map
-                yield found
-                if best <= (self.bound or 0):
-                    return
-
-    def _asked_first(self) -> Iterator[Found]:
-        """Yield maps of a short trace that clingo finds soon, before maps are guessed."""
-        watch = self._task.watch
-        if self.size >= LONG:
-            return
-        ends = watch.elapsed() + min(ASKED_FIRST, ASKED_FIRST_SHARE * watch.left())
-        with suppress(StageTimeError), watch.stage(ends):
-            yield from self._asked()
-            return
-        self._control.forget()
-        watch.check()
-
-    def _guessed(self) -> Iterator[Found]:
-        """Yield guessed maps of the whole trace, each cheaper than the one before.
-
-        There are none if the best map is proven minimal. Clingo gets the steps around the faults
-        of the best guess, and as many names as this guess has dstates.
-        """
-        is_proven = self._best is not None and self._best <= (self.bound or 0)
-        if is_proven or self._task.log.pairs.one or not self._price:
-            return
-        watch = self._task.watch
-        began, may_take = watch.elapsed(), min(GUESSING, GUESSING_SHARE * watch.left())
-        for guess in robust_maps(self._explainer):
-            found = None if guess is None else self._map_of(guess)
-            if guess is not None and found is not None:
-                used = Counter(guess.machine.shows[s] for s in set(guess.labels))
-                names = self._control.names
-                self._control.names = {view: used[view] + SPARE for view in names}
-                self._control.give_around(guess.faults)
-                yield found
-            if watch.elapsed() - began > may_take:
-                return
-
-    def _asked(self) -> Iterator[Found]:
-        """Yield maps made from clingo's answers. At the end, the cheapest map known is minimal."""
-        if self.size >= LONG and self._known is not None and self._most_faults is None:
-            known = self._known
-            places = sorted(fault.step for fault in known.faults if fault.kind in self._price)
-            cost = self._best or 0
-            blocks = Blocks(
-                self._seen, self._actions, self._price, places, len(known.dstates), self.asker.watch
-            )
-            self._raise_bound([blocks.bound(cost)])
+        self._best = self._known = None
+        patience = PATIENCE
         while self._best is None or self._best > (self.bound or 0):
             # 1. Explain the whole trace by each answer for the given steps.
             answer, doubted = None, list[int]()
-            for answer in self._control.answers(f"opt,{self._best - 1}" if self._best else "opt"):
+            mode = f"opt,{self._best - 1}" if self._best else "opt"
+            for answer in self._control.answers(mode, patience):
                 explained, doubted = self._explained(answer)
-                if explained is not None:
+                if explained is not None and self._is_better(explained):
                     yield explained
-            if answer is None:
-                self._raise_bound([self._best or 0], free=True)
-                return
-            self._raise_bound([answer.cost], free=True)
-            # 2. An answer for all steps is a minimal map. Otherwise clingo gets more steps.
-            has_all = self._control.has_all
-            if has_all and not answer.is_open:
-                yield self._found_in(answer)
-                return
-            self._control.learn_from(answer)
-            if doubted:
-                self._control.give_around(doubted)
-            elif not answer.is_open:
-                self._control.give_all()
+            # 2. An answer for all steps is a minimal map.
+            if self._control.is_done:
+                self._raise_bound([self._best or 0 if answer is None else answer.cost], free=True)
+                if answer is None:
+                    return
+                if self._control.has_all and not answer.is_open:
+                    if self._is_better(found := self._found_in(answer)):
+                        yield found
+                    return
+            else:
+                patience *= 2
+                self._bound_by_blocks()
+            # 3. Otherwise clingo gets more steps.
+            if answer is not None:
+                self._control.learn_from(answer)
+                if doubted:
+                    self._control.give_around(doubted)
+                elif not answer.is_open:
+                    self._control.give_all()
+
+    def _is_better(self, found: Found) -> bool:
+        """Make a map the incumbent if it costs less. Return whether it does."""
+        cost = self._cost_of(found)
+        if self._best is not None and cost >= self._best:
+            return False
+        self._best, self._known = cost, found.map
+        return True
+
+    def _bound_by_blocks(self) -> None:
+        """Raise the bound by blocks of a long trace, with the help of the incumbent."""
+        if self.size < LONG or self._known is None or self._most_faults is not None:
+            return
+        places = sorted(fault.step for fault in self._known.faults if fault.kind in self._price)
+        dstates, watch = len(self._known.dstates), self.asker.watch
+        blocks = Blocks(self._seen, self._actions, self._price, places, dstates, watch)
+        self._raise_bound([blocks.bound(self._best or 0)])
 
     def _cost_of(self, found: Found) -> int:
         """Return the cost of a map as clingo counts it, in tenths of dstates."""
@@ -325,6 +285,7 @@ class FaultyControl:
         given: The steps that clingo gets.
         full: The steps that may be at any dstate, even if their view is misread.
         forbidden: Sets of equalities of steps. In no answer do all equalities of one set hold.
+        is_done: Whether the last question was answered, before a limit of conflicts.
     """
 
     def __init__(
@@ -354,6 +315,7 @@ class FaultyControl:
         self._began: tuple[dict[int, int], set[int]] = {}, set()
         self._steps: list[int] = []
         self._batches = self._ruled_out = 0
+        self.is_done = True
 
     @property
     def has_all(self) -> bool:
@@ -382,17 +344,12 @@ class FaultyControl:
                 )
         self.full |= answer.lost
 
-    def forget(self) -> None:
-        """Use a new control for the next question. Clingo was stopped, and may lack rules."""
-        self._began, self._steps = ({}, set()), []
-        self._batches = self._ruled_out = 0
-
     def _prepare(self) -> None:
         """Bring the control up to date. Make a new one if names or full steps have changed."""
         with self._asker.grounding_timed():
             if self._began != (self.names, self.full):
-                self.forget()
                 self._began = dict(self.names), set(self.full)
+                self._steps, self._batches, self._ruled_out = [], 0, 0
                 check = self._asker.watch.check
                 self._asker.control = new_control(
                     "faulty", self._base(), ("--opt-strategy=usc,stratify",), check
@@ -444,10 +401,15 @@ class FaultyControl:
         self._steps += new
         self._batches += 1
 
-    def answers(self, mode: str) -> Iterator[FaultyAnswer]:
-        """Yield answers, each cheaper than the one before. The last one is minimal."""
+    def answers(self, mode: str, conflicts: int) -> Iterator[FaultyAnswer]:
+        """Yield answers, each cheaper than the one before. If `is_done`, the last one is minimal.
+
+        Clingo ends after some conflicts.
+        """
         self._prepare()
-        yield from self._asker.answers(self._read, mode, 0, on_bound=self._on_bound)
+        self.is_done = yield from self._asker.answers(
+            self._read, mode, 0, conflicts=conflicts, on_bound=self._on_bound
+        )
 
     def answers_of_cost(self, cost: int, enough: int) -> Iterator[FaultyAnswer]:
         """Yield answers of the least cost, in tenths of dstates; at most `enough`, or all if 0."""
