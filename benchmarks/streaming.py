@@ -25,7 +25,8 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
-from perception.places.importing import import_live, import_log
+from perception.places.importing import import_log
+from perception.places.live import import_live
 from perception.readers.logs import read_log
 from perception.readers.scans import LaserScanner, Scan
 from perception.readers.writers import write_carmen

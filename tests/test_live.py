@@ -22,7 +22,8 @@ from test_log_checks import (
 )
 
 from perception.errors import LogError
-from perception.places.importing import LOOKS, import_live, import_log, stream_visits
+from perception.places.importing import import_log
+from perception.places.live import LOOKS, LiveLog, LivePlace, import_live, stream_visits
 from perception.readers.logs import SURVEYED, live_log, read_log
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_carmen
@@ -201,3 +202,40 @@ def test_restarted_clock_does_not_cut_a_matching_drive(
 def test_import_of_an_empty_pipe_is_refused() -> None:
     with pytest.raises(LogError, match="expected scans, got none"):
         import_live([])
+
+
+def test_a_log_that_grew_is_imported_as_a_whole(scans: tuple[Scan, ...]) -> None:
+    """Also if the odometry jumps, and if the log is looked at while it grows."""
+    far = [
+        replace(scan, odometry=(scan.odometry[0] + 30 * (i >= 70), *scan.odometry[1:]))
+        for i, scan in enumerate(scans)
+    ]
+    for drive in (scans[:90], far[:90]):
+        live, seen = LiveLog(), []
+        for i, scan in enumerate(drive):
+            seen += live.add(scan)[1]
+            if i == 60:
+                live.places()
+        whole = import_log(RobotLog(tuple(drive)))
+        done = live.finish()
+        assert done.trace.steps == whole.trace.steps
+        assert done.trace.closures == whole.trace.closures
+        assert done.notes == whole.notes
+        assert done.poses.tolist() == whole.poses.tolist()
+        assert [visit.scan for visit in seen] == [visit.scan for visit in live.visits]
+
+
+def test_places_are_known_soon_and_stay(scans: tuple[Scan, ...]) -> None:
+    live, early = LiveLog(), list[LivePlace]()
+    for scan in scans[:120]:
+        live.add(scan)
+    early = live.places()
+    assert any(place.final for place in early)
+    assert not all(place.final for place in early)
+    for scan in scans[120:]:
+        live.add(scan)
+    late = live.places()
+    assert len(late) >= len(early)
+    for place in early:
+        if place.final:
+            assert min(math.dist(place.middle, other.middle) for other in late) < 0.5

@@ -95,8 +95,8 @@ def rounds() -> tuple[RobotLog, Track, tuple[Visit, ...], list[PackedPatch]]:
 
 
 def test_visits_to_one_fork_have_a_closure() -> None:
-    _, track, visits, patches = rounds()
-    found = find_closures(track, visits, patches, 2 * WINDOW)
+    _, track, visits, _ = rounds()
+    found = find_closures(track, visits, 2 * WINDOW)
     assert found
     for closing in found:
         first, last = visits[closing.first], visits[closing.last]
@@ -108,32 +108,29 @@ def test_visits_to_one_fork_have_a_closure() -> None:
 def test_closure_that_contradicts_the_track_is_dropped() -> None:
     """The later visits are 4 m aside by a track that is sure of itself."""
     _, track, visits, patches = rounds()
-    late = find_closures(track, visits, patches, 2 * WINDOW)[0].last
+    late = find_closures(track, visits, 2 * WINDOW)[0].last
     aside = np.array([0.0, 4.0])
+    shifted = [replace(patch, corner=patch.corner + aside) for patch in patches]
     moved = [
-        replace(visit, middle=visit.middle + aside) if k >= late else visit
-        for k, visit in enumerate(visits)
-    ]
-    shifted = [
-        replace(patch, corner=patch.corner + aside) if k >= late else patch
-        for k, patch in enumerate(patches)
+        replace(visit, middle=visit.middle + aside, patch=patch) if k >= late else visit
+        for k, (visit, patch) in enumerate(zip(visits, shifted, strict=True))
     ]
     sure = replace(track, covariances=track.covariances / 100)
-    found = find_closures(sure, moved, shifted, 2 * WINDOW)
+    found = find_closures(sure, moved, 2 * WINDOW)
     assert all(not closing.first < late <= closing.last for closing in found)
 
 
 def test_closures_do_not_cross_a_cut() -> None:
-    _, track, visits, patches = rounds()
-    (closing, *_) = find_closures(track, visits, patches, 2 * WINDOW)
+    _, track, visits, _patches = rounds()
+    (closing, *_) = find_closures(track, visits, 2 * WINDOW)
     cut = replace(track, cuts=(visits[closing.last].scan,))
-    found = find_closures(cut, visits, patches, 2 * WINDOW)
+    found = find_closures(cut, visits, 2 * WINDOW)
     assert all(not c.first < closing.last <= c.last for c in found)
 
 
 def test_trace_has_the_closures_of_its_visits() -> None:
-    log, track, visits, patches = rounds()
-    expected = find_closures(track, visits, patches, 2 * WINDOW)
+    log, track, visits, _patches = rounds()
+    expected = find_closures(track, visits, 2 * WINDOW)
     trace = to_trace(log, track, visits, expected)
     assert len(trace.closures) == len(expected) > 0
     for closure, closing in zip(trace.closures, expected, strict=True):
@@ -216,8 +213,8 @@ def test_visit_is_matched_with_a_limited_number_of_earlier_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """If each visit is matched once, then with the nearest one: another pass of the same fork."""
-    _, track, visits, patches = rounds()
-    every = find_closures(track, visits, patches, 2 * WINDOW)
+    _, track, visits, _patches = rounds()
+    every = find_closures(track, visits, 2 * WINDOW)
     asked: list[LocalScene] = []
 
     def counted(first: LocalScene, second: Turned) -> Match | None:
@@ -226,7 +223,7 @@ def test_visit_is_matched_with_a_limited_number_of_earlier_ones(
 
     monkeypatch.setattr(closures, "match", counted)
     monkeypatch.setattr(closures, "MATCHES", 1)
-    found = find_closures(track, visits, patches, 2 * WINDOW)
+    found = find_closures(track, visits, 2 * WINDOW)
     assert len(asked) == len(set(map(id, asked))) <= len(visits)
     assert {closing.last for closing in found} == {closing.last for closing in every}
 

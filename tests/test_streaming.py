@@ -14,7 +14,7 @@ from test_distinctive import BEARINGS, FORK, log_of
 from perception.errors import LogError
 from perception.places.distinctive import DELAY, Visit, find_visits
 from perception.places.following import follow
-from perception.places.importing import stream_visits
+from perception.places.live import stream_visits
 from perception.places.track import Track
 from perception.readers.scans import Damage, LaserScanner, RobotLog, Scan
 from simulator.robot import meetings

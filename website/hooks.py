@@ -90,7 +90,7 @@ THEMES: dict[str, tuple[str, ...]] = {
         "page.Page",
         "perception.views.ViewClusterer",
         "perception.recognition.recogniser",
-        "perception.places.importing.stream_visits",
+        "perception.places.live.stream_visits",
         "simulator.tours.simulate",
         "simulator.world.World",
         "simulator.panorama.Camera",

@@ -28,11 +28,11 @@ Reference:
 
 from __future__ import annotations
 
+import copy
 import math
 from bisect import bisect, bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import accumulate, combinations, pairwise
 from statistics import median
 from typing import Any
@@ -43,7 +43,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
 from perception.places.distinctive import Visit, patches_of
-from perception.places.local_map import MOST, LocalScene, Match, PackedPatch, Turned, match
+from perception.places.local_map import MOST, LocalScene, Match, Turned, match
 from perception.places.track import (
     Array,
     Track,
@@ -114,36 +114,43 @@ class VisitMatch:
     match: Match
 
 
-def find_closures(
-    track: Track, visits: Sequence[Visit], patches: Sequence[PackedPatch], apart: float
-) -> list[VisitMatch]:
-    """Find the closures between the visits of a log.
+class ClosureFinder:
+    """Finds the closures of each visit of a drive with earlier ones, while visits come.
 
     Each visit is matched with at most MATCHES earlier ones, so the time grows with the number of
     visits, not with its square. These are the nearest ones by the track. Each closure that is found
-    corrects the later positions for this choice. `patches` has the local map of each visit. Two
-    visits are matched if the robot drove at least `apart` metres between them, so that their local
-    maps share no scans.
+    corrects the later positions for this choice. Two visits are matched if the robot drove at least
+    `apart` metres between them, so that their local maps share no scans.
     """
 
-    @lru_cache(SCENES)
-    def scene(visit: int) -> LocalScene:
-        return LocalScene.of(patches[visit], visits[visit].middle)
+    def __init__(self, apart: float) -> None:
+        self._apart = apart
+        self._visits: list[Visit] = []
+        self._placed: list[Pose] = []  # the visits by the track. Each closure corrects later ones.
+        self.found: list[VisitMatch] = []  # the closures so far
+        self._scenes: dict[int, LocalScene] = {}  # of the visits that were matched last
 
-    scans = [visit.scan for visit in visits]
-    way, middles = track.way[scans], np.array([visit.middle for visit in visits]).reshape(-1, 2)
-    poses = np.array([without_drift(middles, way, drift) for drift in DRIFTS])
-    placed: list[Pose] = []  # the visits by the track. Each closure corrects later visits.
-    found: list[VisitMatch] = []
-    for last, (x, y) in enumerate(np.diff(middles, axis=0, prepend=0.0).tolist()):
+    def __len__(self) -> int:
+        """The number of visits."""
+        return len(self._visits)
+
+    def add(self, track: Track, visit: Visit) -> None:
+        """Add the next visit, which has its local map. The track may end anywhere after it."""
+        self._visits.append(visit)
+        last, visits = len(self._visits) - 1, self._visits
+        scans = [one.scan for one in visits]
+        way, middles = track.way[scans], np.array([one.middle for one in visits])
+        x, y = (middles[-1] - middles[-2] if last else middles[-1]).tolist()
+        placed = self._placed
         placed.append(moved(placed[-1], (x, y, 0.0)) if last else (x, y, 0.0))
         # 1. The earlier visits are far enough before. The motion across a cut is unknown.
         cuts = bisect(track.cuts, scans[last])
         begin = bisect_left(scans, track.cuts[cuts - 1]) if cuts else 0
-        earlier = range(begin, int(np.searchsorted(way, way[last] - apart)))
+        earlier = range(begin, int(np.searchsorted(way, way[last] - self._apart)))
         # 2. Take the nearest of them, and match those that the track allows to be near.
         far = [math.dist(placed[k][:2], placed[last][:2]) for k in earlier]
         nearest = sorted((np.argsort(far, kind="stable")[:MATCHES] + begin).tolist())
+        poses = np.array([without_drift(middles, way, drift) for drift in DRIFTS if nearest])
         gates = [
             _Gate(
                 k,
@@ -153,13 +160,38 @@ def find_closures(
             for k in nearest
         ]
         asked = [gate for gate in gates if gate.is_near]
-        here = sorted(_closings(scene, asked, last), key=lambda closing: -closing.match.score)
-        found += here[:KEPT]
+        here = sorted(_closings(self._scene, asked, last), key=lambda one: -one.match.score)
+        self.found += here[:KEPT]
         # 3. The best closure corrects the position.
         if here:
             best = here[0].match
             placed[last] = moved(placed[here[0].first], (*best.shift.tolist(), best.turn))
-    return found
+
+    def copy(self) -> ClosureFinder:
+        """A copy to which visits can be added alone."""
+        other = copy.copy(self)
+        other._visits, other._placed = [*self._visits], [*self._placed]
+        other.found, other._scenes = [*self.found], {**self._scenes}
+        return other
+
+    def _scene(self, number: int) -> LocalScene:
+        """The local map of a visit, prepared for matching."""
+        if (scene := self._scenes.pop(number, None)) is None:
+            visit = self._visits[number]
+            (patch,) = patches_of([visit])
+            scene = LocalScene.of(patch, visit.middle)
+        self._scenes[number] = scene  # the last one
+        if len(self._scenes) > SCENES:
+            del self._scenes[next(iter(self._scenes))]
+        return scene
+
+
+def find_closures(track: Track, visits: Sequence[Visit], apart: float) -> list[VisitMatch]:
+    """Find the closures between the visits of a log, as `ClosureFinder` does."""
+    closures = ClosureFinder(apart)
+    for visit in visits:
+        closures.add(track, visit)
+    return closures.found
 
 
 def _closings(
@@ -294,7 +326,7 @@ class _ClosureGraph:
         ]
         noise = np.array([*spreads, *[np.diag(NOISE) ** 2] * len(found)]).reshape(-1, 3, 3)
         self._whitening = np.linalg.inv(np.linalg.cholesky(noise))
-        # Closures have no way, as no drift turns a match.
+        # ClosureFinder have no way, as no drift turns a match.
         way = np.abs(np.diff(track.way[scans])) if len(visits) > 1 else np.zeros(0)
         self._way = np.array([*(way[k - 1] for k in moves), *[0.0] * len(found)])
         self._moves = len(moves)

@@ -17,11 +17,11 @@ kept.
 
 from __future__ import annotations
 
+import copy
 import math
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import count
 
 import numpy as np
 
@@ -176,24 +176,36 @@ def find_visits(log: RobotLog, track: Track, width: float = WIDTH) -> tuple[Visi
 
     The width of the robot is in metres.
     """
-    breaks = set(track.breaks)
+    breaks, finder = set(track.breaks), VisitFinder(width)
     posed = (Followed(scan, track.pose(i), broken=i in breaks) for i, scan in enumerate(log.scans))
-    return tuple(visits_of(posed, width))
+    return tuple(visit for one in (*posed, None) for visit in finder.add(one))
 
 
-def visits_of(posed: Iterable[Followed], width: float = WIDTH) -> Iterator[Visit]:
-    """Find the visits to distinctive places while a robot drives. Yield each when it is final.
+class VisitFinder:
+    """Finds the visits to distinctive places while a robot drives.
 
-    Each unbroken part of the track is searched separately. The scans of a visit are counted
-    from 0 over all of `posed`. The width of the robot is in metres.
+    Each unbroken part of the track is searched separately. The scans of a visit are counted from 0
+    over all that were added. The width of the robot is in metres.
     """
-    detector, begin = _Detector(width), 0
-    for number, one in enumerate(posed):
-        if one.broken:
-            yield from (visit.later(begin) for visit in detector.finish())
-            detector, begin = _Detector(width), number
-        yield from (visit.later(begin) for visit in detector.add(one.scan, one.pose))
-    yield from (visit.later(begin) for visit in detector.finish())
+
+    def __init__(self, width: float = WIDTH) -> None:
+        self._width, self._detector = width, _Detector(width)
+        self._begin = self._count = 0  # the first scan of this part, and the number of all
+
+    def add(self, one: Followed | None) -> list[Visit]:
+        """Add the next scan, and return the visits that are final now. None ends the drive."""
+        found: list[Visit] = []
+        if one is None or one.broken:
+            found += (visit.later(self._begin) for visit in self._detector.finish())
+            self._detector, self._begin = _Detector(self._width), self._count
+        if one is not None:
+            found += (visit.later(self._begin) for visit in self._detector.add(one.scan, one.pose))
+            self._count += 1
+        return found
+
+    def expected(self) -> list[Visit]:
+        """The visits that would follow if the drive ended now. Nothing is changed."""
+        return copy.deepcopy(self).add(None)
 
 
 class _Detector:
@@ -207,7 +219,7 @@ class _Detector:
         self._milestones: list[int] = []  # scans
         self._seen = 0  # the number of the next milestone, which has no local map yet
         self._open: list[_Chain] = []
-        self._numbers = count()
+        self._chains = 0  # how many chains there were
         self._found: list[tuple[int, int, int, Visit]] = []  # by scan, chain and pass
 
     def add(self, scan: Scan, pose: Pose) -> Iterator[Visit]:
@@ -259,7 +271,7 @@ class _Detector:
             if near:
                 continued[min(near)[1]][0].sightings.append(sighting)
             else:
-                self._open.append(_Chain(next(self._numbers), [sighting]))
+                self._open_chain([sighting])
         # A chain ends when its junction is out of sight, or when it is too long to wait for.
         for chain in list(self._open):
             if milestone - chain.last >= GAP:
@@ -268,7 +280,11 @@ class _Detector:
                 self._end(chain)
                 late = [one for one in chain.sightings if one.way >= way - 2 * BESIDE]
                 if late:
-                    self._open.append(_Chain(next(self._numbers), late))
+                    self._open_chain(late)
+
+    def _open_chain(self, sightings: list[_Sighting]) -> None:
+        self._open.append(_Chain(self._chains, sightings))
+        self._chains += 1
 
     def _junctions_at(self, scan: int) -> list[Junction]:
         """The junctions near the robot in the local map of a scan, the largest first."""

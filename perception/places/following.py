@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -95,13 +95,14 @@ ALIKE = 0.03
 ROW = 3 + 9 + 1
 
 
-def follow(log: RobotLog) -> Track:
+def follow(log: RobotLog, known: tuple[Mapping[int, Doubt], Track] | None = None) -> Track:
     """Compute the trajectory of a robot from its log, by odometry and scan matching.
 
-    Corrected poses are not read.
+    Corrected poses are not read. `known` is a track of these scans that a `Follower` made, with its
+    doubts; it saves time.
     """
     doubts, still = doubts_of(log)
-    track = _track_of(log, doubts)
+    track = known[1] if known and _is_of(log, *known, doubts) else _track_of(log, doubts)
     # People or an arm of the robot can change what the laser sees while the robot stands.
     standing = {
         k
@@ -117,6 +118,20 @@ def follow(log: RobotLog) -> Track:
     if share_failing(track) <= FAILING and (more := scans_after_a_carry(log, track)):
         track = _track_of(log, {**doubts, **dict.fromkeys(more, Doubt.CARRIED)})
     return track
+
+
+def _is_of(
+    log: RobotLog, used: Mapping[int, Doubt], track: Track, doubts: Mapping[int, Doubt]
+) -> bool:
+    """Whether a track that used some doubts is the track of others."""
+    weak = {Doubt.NONE, Doubt.DOUBTFUL, Doubt.SEAM}  # they matter only where a scan matches badly
+    return all(
+        {used.get(k, Doubt.NONE), doubts.get(k, Doubt.NONE)} <= weak
+        and track.shares[k] >= POOR
+        and log.scans[k].laser.mount == log.scans[k - 1].laser.mount
+        for k in used.keys() | doubts.keys()
+        if used.get(k) != doubts.get(k)
+    )
 
 
 def _stands(log: RobotLog, track: Track, first: int, last: int) -> bool:
@@ -145,9 +160,9 @@ def _stands(log: RobotLog, track: Track, first: int, last: int) -> bool:
 
 def _track_of(log: RobotLog, doubts: Mapping[int, Doubt]) -> Track:
     """Make the track, which is broken before each scan to which the robot was carried."""
-    done = GrowingTrack()
-    for one in poses_of_scans(log.scans, lambda i, _: doubts.get(i, Doubt.NONE)):
-        done.add(one)
+    done, follower = GrowingTrack(), Follower(lambda i, _: doubts.get(i, Doubt.NONE))
+    for scan in log.scans:
+        done.add(follower.add(scan))
     return done.track
 
 
@@ -192,42 +207,48 @@ class GrowingTrack:
         return Track(rows[:, :3], covariances, shares, tuple(self.cuts), tuple(self._breaks))
 
 
-def poses_of_scans(
-    scans: Iterable[Scan], doubt_of: Callable[[int, Pose], Doubt]
-) -> Iterator[Followed]:
-    """Compute the pose of each scan from the scans before it, and yield it before the next is read.
+class Follower:
+    """Computes the pose of each scan from the scans before it, while they come."""
 
-    `doubt_of` takes the index of a scan and the motion from the previous scan by odometry. It says
-    how far this motion can be trusted.
-    """
-    recent: deque[Surfaces] = deque(maxlen=RECENT)
-    last: Followed | None = None
-    before: Pose = (0.0, 0.0, 0.0)
-    mounts: set[Pose] = set()  # of the lasers whose scans came since the last break
-    for i, scan in enumerate(scans):
-        seen = surfaces_in(scan)
+    def __init__(self, doubt_of: Callable[[int, Pose], Doubt]) -> None:
+        """Begin a track.
+
+        `doubt_of` takes the index of a scan and the motion from the previous scan by odometry. It
+        says how far this motion can be trusted.
+        """
+        self.doubts: dict[int, Doubt] = {}  # of the scans whose odometry was doubted
+        self._doubt_of, self._count = doubt_of, 0
+        self._recent: deque[Surfaces] = deque(maxlen=RECENT)
+        self._last: Followed | None = None
+        self._before: Pose = (0.0, 0.0, 0.0)
+        self._mounts: set[Pose] = set()  # of the lasers whose scans came since the last break
+
+    def add(self, scan: Scan) -> Followed:
+        """Add the next scan, and return it with its pose."""
+        seen, last, recent = surfaces_in(scan), self._last, self._recent
         if last is None:
             one = Followed(scan, (0.0, 0.0, 0.0))
         else:
             onward = displacement_between(last.scan.odometry, scan.odometry)
-            step = ScanMotion(scan, seen, recent, last.pose, onward, before)
-            doubt = doubt_of(i, onward)
-            if doubt is Doubt.NONE and scan.laser.mount not in mounts:
+            step = ScanMotion(scan, seen, recent, last.pose, onward, self._before)
+            doubt = self._doubt_of(self._count, onward)
+            if doubt is Doubt.NONE and scan.laser.mount not in self._mounts:
                 # The first scan of another laser may show none of the known walls.
                 one = Followed(scan, moved(last.pose, onward), odometer_covariance(onward))
             else:
                 one = step.judged(doubt)
+            self.doubts |= {} if doubt is Doubt.NONE else {self._count: doubt}
             one = one if in_sight(scan).any() else replace(one, share=math.nan)
-            before = displacement_between(last.pose, one.pose)
+            self._before = displacement_between(last.pose, one.pose)
         if one.broken:
             recent.clear()
-            mounts.clear()
-        mounts.add(scan.laser.mount)
+            self._mounts.clear()
+        self._mounts.add(scan.laser.mount)
         # Walls are remembered while the laser sees none.
         if len(seen) or not recent:
             recent.append(seen.moved(one.pose))
-        last = one
-        yield one
+        self._last, self._count = one, self._count + 1
+        return one
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,6 @@ measure how far the track of this robot is really off. So its covariances are mu
 factor that makes the errors at the closures most probable. A steady drift of the heading is
 estimated at the same time and removed from these errors, as the covariances do not include it.
 
-A log may also be imported while it is read or recorded (`LiveLog`). Then the scans are processed
-one at a time. The track, the visits with their local maps, and about 600 bytes per scan are kept in
-memory, and ranges in temporary files. The first scans wait until the units of the odometry are
-recognised. Then the scans get the checks of a whole log, but in stretches of 1,600 scans. Each
-stretch is checked four times: when it has 200, 400, 800 and 1,600 scans.
-
 `join_logs` joins the logs of several drives through one building to one log. The scans are listed
 one drive after the other. How the frames of two drives relate is unknown. So the track of each
 drive begins where the previous track ends, which has no meaning. Closures between drives say how
@@ -24,10 +18,9 @@ visits of two drives lie relative to each other.
 from __future__ import annotations
 
 import math
-import re
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, chain
@@ -37,27 +30,18 @@ import numpy as np
 from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning, LogError
 from perception.places import closures, following, log_checks, odometers
-from perception.places.distinctive import WIDTH, WINDOW, Visit, find_visits, patches_of, visits_of
+from perception.places.distinctive import WIDTH, WINDOW, Visit, find_visits
 from perception.places.partings import with_partings
 from perception.places.tracing import closure_of, starts_of_drives, to_trace
 from perception.places.track import Array, Track
-from perception.readers.scans import Damage, RobotLog, Scan, ScanTable
+from perception.readers.scans import RobotLog
 from perception.views import ViewClusterer
-from ssh_abduction.data.checks import a_function, a_number
+from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.drives import together
-from ssh_abduction.data.errors import brief, named
+from ssh_abduction.data.errors import named
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.loggers import log_of
 
-# The number of first scans over which the track is compared with the odometry.
-COMPARED = 400
-# The first SAID notes on cuts of the track are given at once. The others come at the end.
-SAID = 3
-# Units are recognised when the robot has moved in MOVES steps and by LEAST_WAY metres, or when MOST
-# scans wait.
-MOVES, MOST = 100, 2000
-# Numbers of scans of a stretch at which it is checked. It is complete at the last number.
-LOOKS = (200, 400, 800, 1600)
 _log = log_of("ssh_abduction.perception.places")
 
 # Each view is seen at least this many times on average. With few images of many places, most views
@@ -95,15 +79,31 @@ class Imported:
     poses: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
+@dataclass(frozen=True, eq=False)
+class Grown:
+    """What was computed of a drive while its scans came: see `live.LiveLog`."""
+
+    doubts: Mapping[int, odometers.Doubt]  # the scans whose odometry was doubted
+    track: Track
+    visits: tuple[Visit, ...]  # all visits, before `partings` changes them
+    closings: list[closures.VisitMatch]  # their closures, before `agreeing` drops some
+
+
 def import_log(
-    log: RobotLog, width: float = WIDTH, name: str | None = None, tell: Tell = tell_nobody
+    log: RobotLog,
+    width: float = WIDTH,
+    name: str | None = None,
+    tell: Tell = tell_nobody,
+    known: Grown | None = None,
 ) -> Imported:
     """Import a log as a trace.
 
     Corrected poses become the truth for evaluation; nothing else reads them. The width of the
     robot is in metres. It cannot pass narrower parts of the free space. `tell` takes each note
-    on suspicious odometry as soon as it is known. Raises LogError if the robot passed no
-    distinctive place or hardly moved, the scans do not match, or the width is no positive number.
+    on suspicious odometry as soon as it is known. `known` was computed while the scans came. It is
+    used where the whole log leads to the same, so it only saves time. Raises LogError if the robot
+    passed no distinctive place or hardly moved, the scans do not match, or the width is no positive
+    number.
     """
     a_number("width", width, LogError, above=0, what="metres", mend="give the width of the robot")
     seconds: Seconds = {}
@@ -114,53 +114,13 @@ def import_log(
         )
     # Each stage is timed.
     with _timed(seconds, "track"):
-        log, track, notes = tracked(log, tell)
+        log, track, notes = tracked(log, tell, known)
     _refuse_bad(log, track, notes)
+    is_known = known is not None and track.poses is known.track.poses
     with _timed(seconds, "places"):
-        visits = find_visits(log, track, width)
-    return _imported((log, track, notes), visits, width, name, seconds)
-
-
-def import_live(
-    items: Iterable[Scan | Damage],
-    width: float = WIDTH,
-    name: str | None = None,
-    tell: Tell = tell_nobody,
-    show: Callable[[Visit], None] = tell_nobody,
-    source: str = "",
-) -> tuple[RobotLog, Imported]:
-    """Import a log as a trace while it is read or recorded.
-
-    Memory hardly grows: each scan leaves about 600 bytes, and each visit its local map. The ranges
-    are kept in temporary files. If the odometry is good, the trace is that of `import_log`. They
-    can differ because each step of the odometer is judged by earlier steps only.
-
-    Args:
-        items: The scans with odometry, in order, for example those of `stream_log` or `live_log`.
-        width: Width of the robot in metres.
-        name: Name of the trace; None for a trace without a name.
-        tell: A function that gets each note on suspicious scans and odometry, at once.
-        show: A function that gets each visit when it is final, before `partings` moves, joins and
-            adds visits.
-        source: Name of the log, for errors.
-
-    Returns:
-        The log, and the result of the import, with the trace.
-
-    Raises:
-        LogError: As `import_log`, or an item is no scan.
-    """
-    seconds: Seconds = {}
-    live = LiveLog(items, width, tell, source)
-    visits: list[Visit] = []
-    with _timed(seconds, "places"):
-        for visit in live.visits():
-            visits.append(visit)
-            show(visit)
-        log, track, notes = live.result()
-    del live  # It has a copy of the track.
-    _refuse_bad(log, track, notes)
-    return log, _imported((log, track, notes), tuple(visits), width, name, seconds)
+        visits = known.visits if known and is_known else find_visits(log, track, width)
+    found = known.closings if known and is_known else None
+    return _imported((log, track, notes), visits, width, name, seconds, found)
 
 
 def _refuse_bad(
@@ -197,16 +157,20 @@ def _refuse_bad(
 
 
 def _imported(
-    found: Tracked, visits: tuple[Visit, ...], width: float, name: str | None, seconds: Seconds
+    tracked: Tracked,
+    visits: tuple[Visit, ...],
+    width: float,
+    name: str | None,
+    seconds: Seconds,
+    closings: list[closures.VisitMatch] | None,
 ) -> Imported:
     """Make the trace of the visits, and gather the result of an import. Raises LogError."""
-    log, track, notes = found
+    log, track, notes = tracked
     _refuse_bad(log, track, notes, visits)
     with _timed(seconds, "trace"):
-        closings = closures.find_closures(track, visits, patches_of(visits), 2 * WINDOW)
-        closings = closures.agreeing(track, visits, closings)
-        track = replace(track, factor=closures.factor_of(track, visits, closings))
-        visits, closings = with_partings(track, visits, closings)
+        if closings is None:
+            closings = closures.find_closures(track, visits, 2 * WINDOW)
+        track, visits, closings = placed(track, visits, closings)
         poses = closures.fitted_poses(track, visits, closings)
         closings += closures.closures_across_cuts(track, visits, poses)
         trace = to_trace(log, track, visits, closings, name)
@@ -216,45 +180,21 @@ def _imported(
     return Imported(trace, track, width, visits, seconds, notes, starts, poses)
 
 
-def stream_visits(
-    scans: Iterable[Scan | Damage], width: float = WIDTH, tell: Tell = tell_nobody
-) -> Iterator[Visit]:
-    """Find the distinctive places that a robot passes, while it drives.
-
-    A visit is final, and yielded, when the robot is at most 125 m of trajectory beyond the last
-    scan of the stay, if scans are at most 0.5 m apart. Usually this is after 30 to 40 m. At the end
-    of the scans, the other visits follow. No visit is yielded before the units of the odometry are
-    recognised, which takes about 100 scans of a moving robot.
-
-    If the odometry is good, the visits are those of `import_log` before `partings` moves, joins and
-    adds visits. A jump of the odometer is judged by earlier steps only.
-
-    Args:
-        scans: The scans with odometry, in order, for example those of `stream_log`. Damaged parts
-            are skipped.
-        width: Width of the robot in metres. It cannot pass narrower parts of the free space.
-        tell: A function that gets each note on suspicious scans and odometry, at once.
-
-    Yields:
-        Each visit with its local map. Scans are counted from 0.
-
-    Raises:
-        LogError: The width is no positive number, an item is no scan, the scans are in random
-            order, or the odometry has several sources.
-
-    Example:
-        >>> [visit.scan for visit in stream_visits([])]
-        []
-    """
-    return LiveLog(scans, width, tell).visits()
+def placed(
+    track: Track, visits: Sequence[Visit], closings: Sequence[closures.VisitMatch]
+) -> tuple[Track, tuple[Visit, ...], list[closures.VisitMatch]]:
+    """Drop closures that do not agree, correct the track's covariances, and add the partings."""
+    closings = closures.agreeing(track, visits, closings)
+    track = replace(track, factor=closures.factor_of(track, visits, closings))
+    return track, *with_partings(track, visits, closings)
 
 
-def tracked(log: RobotLog, tell: Tell = tell_nobody) -> Tracked:
+def tracked(log: RobotLog, tell: Tell = tell_nobody, known: Grown | None = None) -> Tracked:
     """Compute the trajectory of a robot from its log.
 
     Return the log with the odometry of a single source, in metres and radians; its track; and
-    notes on suspicious odometry, which `tell` takes as soon as they are known. Raises LogError
-    if the scans are in random order.
+    notes on suspicious odometry, which `tell` takes as soon as they are known. `known` is as in
+    `import_log`. Raises LogError if the scans are in random order.
     """
     notes: list[str] = []
 
@@ -267,7 +207,7 @@ def tracked(log: RobotLog, tell: Tell = tell_nobody) -> Tracked:
     logged = log
     log, corrected, whole = log_checks.checked(log)
     say([*corrected, *whole])
-    track = following.follow(log)
+    track = following.follow(log, (known.doubts, known.track) if known and log is logged else None)
     if lag := odometers.lag_of(log, track):
         log, *_ = log_checks.checked(odometers.with_lag(logged, lag))
         track = following.follow(log)
@@ -310,167 +250,6 @@ def _timed(seconds: Seconds, stage: str) -> Iterator[None]:
     begin = time.process_time()
     yield
     seconds[stage] = round(time.process_time() - begin, 3)
-
-
-class LiveLog:
-    """The track and the visits of a drive, found while its scans come.
-
-    The arguments are those of `importing.import_live`. Raises LogError if one is invalid.
-    """
-
-    def __init__(
-        self,
-        items: Iterable[Scan | Damage],
-        width: float = WIDTH,
-        tell: Tell = tell_nobody,
-        source: str = "",
-    ) -> None:
-        mend = "give the width of the robot"
-        a_number("width", width, LogError, above=0, what="metres", mend=mend)
-        if not isinstance(items, Iterable) or isinstance(items, str | bytes):
-            raise LogError(
-                f"scans: expected scans, got {brief(items)}; pass the scans of stream_log"
-            )
-        a_function("tell", tell, LogError, what="a function that takes a text")
-        self._items, self._width, self._source = items, width, source
-        self._tell = Teller(tell)
-        self._damaged: list[Damage] = []
-        self._scans = ScanTable()
-        self._done = following.GrowingTrack()
-
-    def visits(self) -> Iterator[Visit]:
-        """Yield each visit with its local map, in order, when it is final."""
-        return visits_of(self._followed(), self._width)
-
-    def result(self) -> Tracked:
-        """Return the log, its track and notes. Call this after `visits` has yielded all visits.
-
-        Raises LogError if there is no scan.
-        """
-        log, track = self._log, self._done.track
-        if not len(log):
-            raise LogError(f"{named(self._source)}: expected scans, got none; record the laser")
-        explained = bool(self._tell.notes)
-        self._tell(odometers.describe_cuts(log, track, following.turned_wrongly(log, track)))
-        track, doubts = log_checks.judged(log, track, explained)
-        self._tell(doubts)
-        return log, track, tuple(self._tell.notes)
-
-    def _followed(self) -> Iterator[following.Followed]:
-        """Follow the robot, and keep its scans and its track."""
-        scans = watched(self._scans_of(), self._tell, self._source)
-        for one in following.poses_of_scans(scans, odometers.LiveJumps()):
-            self._scans.append(one.scan)
-            self._done.add(one)
-            if one.cut and len(self._done.cuts) <= SAID:
-                self._tell(odometers.describe_cuts(self._log, self._done.track, []))
-            if len(self._scans) == COMPARED:
-                self._compare()
-            yield one
-        if len(self._scans) < COMPARED:
-            self._compare()
-
-    def _scans_of(self) -> Iterator[Scan]:
-        """Yield the scans among the items, and note the damaged parts. Raises LogError."""
-        for number, item in enumerate(self._items):
-            if isinstance(item, Scan):
-                yield item
-            elif isinstance(item, Damage):
-                self._damaged.append(item)
-            else:
-                raise LogError(
-                    f"scans: expected scans, got {brief(item)} as item {number}"
-                    "; take the scans of stream_log"
-                )
-
-    def _compare(self) -> None:
-        """Compare the track with the odometry over the first scans."""
-        if len(self._scans) > 1 and not self._tell.notes:
-            begun = replace(self._log, scans=self._scans[:COMPARED])
-            note = odometers.disagreement(begun, self._done.track)
-            self._tell([note] if note else [])
-
-    @property
-    def _log(self) -> RobotLog:
-        return RobotLog(self._scans, tuple(self._damaged), source=self._source)
-
-
-class Teller:
-    """Tells each kind of note once to a function `tell`, as soon as it is known."""
-
-    def __init__(self, tell: Tell) -> None:
-        self._tell = tell
-        self.notes: list[str] = []  # the notes so far
-        self._kinds: set[str] = set()
-
-    def __call__(self, notes: Iterable[str]) -> None:
-        """Tell each note, unless an earlier note begins with the same words up to a number."""
-        for note in notes:
-            kind = re.split(r"\d", note)[0]
-            if kind not in self._kinds:
-                self._kinds.add(kind)
-                self.notes.append(note)
-                self._tell(note)
-
-
-def watched(scans: Iterable[Scan], tell: Teller, source: str = "") -> Iterator[Scan]:
-    """Check scans while they come, and yield them with odometry in metres and radians.
-
-    Raises LogError if the scans are in random order, their ranges are not in metres, or the
-    odometry has several sources.
-    """
-    coming = iter(scans)
-    first = _first_of(coming)
-    if not first:
-        return
-    units = _units_of(RobotLog(tuple(first), source=source), tell)
-    stretch: list[Scan] = []
-    begin = 0
-    for number, scan in enumerate(map(units.converted, chain(first, coming))):
-        # Checks look at a stretch of scans several times as it grows. Then a new one begins.
-        if len(stretch) == LOOKS[-1]:
-            stretch, begin = stretch[-1:], number - 1
-        stretch.append(scan)
-        if len(stretch) in LOOKS:
-            tell(_checked(stretch, begin, source))
-        yield scan
-    if len(stretch) > 1 and len(stretch) not in LOOKS:
-        tell(_checked(stretch, begin, source))
-
-
-def _first_of(coming: Iterator[Scan]) -> list[Scan]:
-    """Take the first scans of a drive, until they show the units of the odometry."""
-    first: list[Scan] = []
-    moves, way = 0, 0.0
-    for scan in coming:
-        if first:
-            far = math.dist(first[-1].odometry[:2], scan.odometry[:2])
-            moves, way = moves + (far > 0), way + far
-        first.append(scan)
-        if (moves >= MOVES and way >= log_checks.LEAST_WAY) or len(first) == MOST:
-            break
-    return first
-
-
-def _units_of(log: RobotLog, tell: Teller) -> log_checks.Units:
-    """Recognise the units of the odometry of the first scans of a drive. Raises LogError."""
-    log_checks.refuse_lengths(log)
-    log_checks.refuse_shuffled(log)
-    if odometers.keep_one_source(log)[1]:
-        raise LogError(
-            f"{named(log.source)}: expected odometry of one source, got poses of several sources "
-            "in turn; let only one source publish odometry, or import the log from a file"
-        )
-    units, notes = log_checks.units_of(log)
-    tell(notes)
-    return units
-
-
-def _checked(scans: Sequence[Scan], begin: int, source: str) -> list[str]:
-    """Check a stretch of scans. Raises LogError for a random order."""
-    log = RobotLog(tuple(scans), source=source)
-    log_checks.refuse_shuffled(log)
-    return log_checks.describe_drive(log, begin)
 
 
 def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[RobotLog, Imported]:

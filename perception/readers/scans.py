@@ -106,6 +106,10 @@ class Scan:
     time: float | None = None
     line: int = 0
 
+    def __deepcopy__(self, memo: object) -> Scan:
+        """Return the scan itself, as it never changes."""
+        return self
+
 
 class Damaged(Exception):  # noqa: N818 - becomes a Damage
     """A line or message of a known kind that cannot be read."""

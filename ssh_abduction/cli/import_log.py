@@ -192,7 +192,7 @@ def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Rob
 
     Ctrl-C ends the log: the trace is that of the drive so far.
     """
-    from perception.places.importing import import_live
+    from perception.places.live import import_live
     from perception.readers.logs import live_log
 
     if options.format not in (None, "carmen") or options.scan_topic or options.odom_topic:
