@@ -71,7 +71,6 @@ def main() -> None:
         done = map_log(
             parts_of(read_log(str(path)), options.drives),
             time_limit=options.limit,
-            with_ladder=False,
         )
         maps = done.solution.maps
         within, between = counts(done.imported.trace, maps[0] if maps else None)

@@ -113,8 +113,6 @@ def mapped(log: Path, runs: Path) -> tuple[Trace, SSHMap | None]:
             str(log),
             "-o",
             str(folder),
-            "--set",
-            "ladder=false",
         ]
         done = subprocess.run(
             command, check=False, capture_output=True

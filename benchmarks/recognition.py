@@ -110,7 +110,7 @@ def main() -> None:
         first, second = halves(first)
     else:
         second = read(options.second)
-    done = map_log(first, time_limit=options.time_limit, with_ladder=False)
+    done = map_log(first, time_limit=options.time_limit)
     labels = np.array(done.solution.maps[0].dstate_at)
     cost = done.solution.cost
     print(f"{cost.places} places, {cost.dstates} dstates; {done.solution.status.value}")

@@ -5,16 +5,15 @@
 
 The sweep maps several drives through each world or floor plan, under each theory. Each drive is
 simulated once, as a log. For each theory, one call of `ssh-abduction map` maps all logs. The call
-also solves a ladder for each log: a series of theories with more and more evidence. A theory of the
-ladder is a rung. The call can use the workers of a Dask cluster, and it does not repeat finished
-runs. So a sweep that was stopped can be started again.
+can use the workers of a Dask cluster, and it does not repeat finished runs. So a sweep that was
+stopped can be started again.
 
-The file rows.jsonl gets a line for each solve: one for the maps of a log, and one for each rung.
-Then a table is printed. It counts the drives that have a map, and those that have a single minimal
-map. It gives precision and recall of the pairs of visits that the first map has at one place.
+The file rows.jsonl gets a line for each run. Then a table is printed. It counts the drives that
+have a map, and those that have a single minimal map. It gives precision and recall of the pairs of
+visits that the first map has at one place.
 
 *A hundred machines* can share a sweep. Nobody has done this yet, so this is an estimate. 17 floor
-plans, 5 drives through each and 9 theories are 765 runs. With 5 rungs each, these are 3,825 solves.
+plans, 5 drives through each and 9 theories are 765 runs.
 Mapping a drive of 200 m through a plan took 28 s of CPU time, nearly all of it for perception (8
 runs, two plans; a log has 1.0 to 1.7 MB). It takes two minutes if all solves use their time limit.
 So the sweep takes 6 to 25 hours on one processor, and two to eight minutes on a hundred machines
@@ -43,8 +42,6 @@ from ssh_abduction.solver import Solution
 
 Row = dict[str, Any]
 
-# The solve of a row: the maps, or a rung of the ladder; None if the drive could not be mapped.
-RUNGS = ("maps", "views", "+ star", "+ pairs", "+ geometry", "+ planarity", None)
 INTERRUPTED = 130  # the exit code after Ctrl-C
 # The options of each theory. Without --theory they change the default theory of the verb `map`.
 THEORIES = {
@@ -114,7 +111,7 @@ def main() -> None:
         )
         if code == INTERRUPTED:
             parser.exit(code, "stopped; the same command goes on from here\n")
-        rows += [row for log in logs for row in rows_of(theory, runs / log.stem)]
+        rows += [row_of(theory, runs / log.stem) for log in logs]
     text = "".join(json.dumps(row) + "\n" for row in rows)
     (options.folder / "rows.jsonl").write_text(text, encoding="utf-8")
     failed = (
@@ -122,7 +119,7 @@ def main() -> None:
         if len(logs) < len(tours)
         else ""
     )
-    print(f"{len(rows)} solves in {options.folder / 'rows.jsonl'}{failed}")
+    print(f"{len(rows)} runs in {options.folder / 'rows.jsonl'}{failed}")
     print("\n".join(table(rows)))
 
 
@@ -144,35 +141,22 @@ def drive(world: str, seed: int, folder: Path) -> Path:
     return log
 
 
-def rows_of(theory: str, run: Path) -> list[Row]:
-    """Make a row for the maps of a run, and one for each rung of its ladder.
+def row_of(theory: str, run: Path) -> Row:
+    """Make the row of a run.
 
     Args:
         theory: Name of the theory.
         run: Folder of the run of a log.
 
     Returns:
-        Rows with log, theory, rung and results. A run that failed has a single row, with the status
-        "error".
+        A row with log, theory and results. A run that failed has the status "error".
     """
+    row = {"log": run.name, "theory": theory}
     if not (run / "run.json").exists():
-        return [{"log": run.name, "theory": theory, "rung": None, "status": "error"}]
+        return {**row, "status": "error"}
     told = json.loads((run / "run.json").read_text(encoding="utf-8"))
-    whole = {
-        "name": "maps",
-        **{name: told[name] for name in ("status", "complete", "count", "cost")},
-        "pairs": pairs_of(run),
-    }
-    return [
-        {
-            "log": run.name,
-            "theory": theory,
-            "rung": solve["name"],
-            **{name: solve[name] for name in ("status", "complete", "count", "cost")},
-            **({"pairs": solve["pairs"]} if "pairs" in solve else {}),
-        }
-        for solve in (whole, *told["ladder"])
-    ]
+    results = {name: told[name] for name in ("status", "complete", "count", "cost")}
+    return {**row, **results, "pairs": pairs_of(run)}
 
 
 def pairs_of(run: Path) -> dict[str, int] | None:
@@ -190,16 +174,12 @@ def pairs_of(run: Path) -> dict[str, int] | None:
 
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
-    """Make the lines of the table: a head, and a line for each theory and rung."""
+    """Make the lines of the table: a head, and a line for each theory."""
     yield (
-        f"{'theory':<22}{'rung':<14}{'drives':>7}{'mapped':>8}{'unique':>8}{'places':>8}{'precision':>11}{'recall':>8}"
+        f"{'theory':<22}{'drives':>7}{'mapped':>8}{'unique':>8}{'places':>8}{'precision':>11}{'recall':>8}"
     )
-    theories = [*dict.fromkeys(row["theory"] for row in rows)]
-    for theory, rung in sorted(
-        {(row["theory"], row["rung"]) for row in rows},
-        key=lambda pair: (theories.index(pair[0]), RUNGS.index(pair[1])),
-    ):
-        some = [row for row in rows if (row["theory"], row["rung"]) == (theory, rung)]
+    for theory in dict.fromkeys(row["theory"] for row in rows):
+        some = [row for row in rows if row["theory"] == theory]
         costs = [row["cost"] for row in some if row.get("cost")]
         unique = sum(
             row.get("status") == "optimal" and row.get("complete") and row.get("count") == 1
@@ -212,7 +192,7 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
         )
         precision, recall = (f"{right / n:.2f}" if n else "" for n in (joined, returns))
         yield (
-            f"{theory!s:<22}{rung or 'error':<14}{len(some):>7}{len(costs):>8}{unique:>8}"
+            f"{theory!s:<22}{len(some):>7}{len(costs):>8}{unique:>8}"
             f"{places:>8}{precision:>11}{recall:>8}"
         )
 

@@ -478,7 +478,7 @@ def test_all_logs_are_mapped_once_after_a_worker_is_killed(
     monkeypatch.setattr(mapping, "MapQuestion", KilledOnce)
     write_carmen(quick, hall()[:80])
     shutil.copy(quick, deadly)
-    command = ["map", quick, deadly, "-o", str(tmp_path / "runs"), "--set", "ladder=false"]
+    command = ["map", quick, deadly, "-o", str(tmp_path / "runs")]
     command += ["--time-limit", "1000", "--scheduler", scheduler, "--jobs", "1"]
     capsys.readouterr()
     for said in ("4 places", "done already"):

@@ -293,7 +293,7 @@ def test_import_and_map_share_notes_and_options(
     out = [
         "-o",
         str(tmp_path / "out"),
-        *(["--set", "ladder=false", "--time-limit", "1"] if verb == "map" else []),
+        *(["--time-limit", "1"] if verb == "map" else []),
     ]
     main([verb, str(path), *out])
     said = capsys.readouterr().err

@@ -81,7 +81,6 @@ def test_demo_prints_maps_and_writes_a_report(tmp_path: Path) -> None:
     assert "what tells them apart" in out
     assert "optimal, the best map has probability" in out
     assert (tmp_path / "house" / "report.html").exists()
-    assert len(json.loads((tmp_path / "house" / "run.json").read_text())["ladder"]) > 3
     assert (tmp_path / "aces3-map.svg").read_text().startswith("<svg ")
 
 

@@ -222,7 +222,7 @@ def test_maps_of_logs_name_doubtful_joins() -> None:
         joined="",
         files=lambda: dict(files),
     )
-    question = MapQuestion(None, {}, {}, 0.5, None, 0, ladder=False)
+    question = MapQuestion(None, {}, {}, 0.5, None, 0)
     line = question._answer(0, ["a.log"], done, None, time.monotonic() - 60).line
     assert told in line
     assert line.endswith("; 60.0 s")

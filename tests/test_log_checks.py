@@ -302,7 +302,7 @@ def test_error_does_not_repeat_the_notes(scans: Scans, monkeypatch: pytest.Monke
         import_log(log, tell=told.append)
     assert told == refused.value.__notes__ != []
     assert told[0] not in str(refused.value)
-    answer = MapQuestion(None, {}, {}, 0.5, None, 1, ladder=False).failed(0, "drive", refused.value)
+    answer = MapQuestion(None, {}, {}, 0.5, None, 1).failed(0, "drive", refused.value)
     assert answer.warnings == tuple(told)
 
 

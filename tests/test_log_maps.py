@@ -72,7 +72,7 @@ def runs(hall: Path, in_this_process: Callable[[], AbstractContextManager[object
     """The output of `map` for it, and for a log that cannot be read."""
     bad = hall.with_name("bad.log")
     bad.write_text("nothing\n")
-    words = ["-o", str(hall.parent / "runs"), "--set", "ladder=false", "--time-limit", "1000"]
+    words = ["-o", str(hall.parent / "runs"), "--time-limit", "1000"]
     with in_this_process():
         assert main(["map", str(hall), str(bad), *words]) == 1
     return hall.parent / "runs"
@@ -264,7 +264,7 @@ def test_finished_run_is_skipped_and_bad_logs_do_not_stop_others(
     hall: Path, runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad = hall.with_name("bad.log")
-    assert main(f"map {hall} {bad} -o {runs} --set ladder=false --time-limit 1000".split()) == 1
+    assert main(f"map {hall} {bad} -o {runs} --time-limit 1000".split()) == 1
     told = capsys.readouterr()
     assert f"{hall}: done already, in {runs / 'hall'}" in told.out
     assert f"{bad}: expected a robot's log" in told.out
@@ -341,7 +341,7 @@ def test_map_on_an_unreliable_track_has_no_probability(
     track = replace(imported_hall.track, is_reliable=False)
     imported = replace(imported_hall, track=track)
     monkeypatch.setattr(log_maps, "import_log", lambda *_: imported)
-    doubtful = map_log(read_log(hall), time_limit=1, max_maps=1, with_ladder=False).solution
+    doubtful = map_log(read_log(hall), time_limit=1, max_maps=1).solution
     reliable = Solution.load(runs / "hall" / "maps.json")
     for solution, is_reliable in ((doubtful, False), (reliable, True)):
         said = "no probability is given, as the track is unreliable" in solution.sureness
@@ -355,7 +355,7 @@ def test_map_has_poses_if_the_search_left_no_time_to_fit_them(
     without = replace(known, maps=tuple(replace(one, fit=None) for one in known.maps))
     monkeypatch.setattr(log_maps, "import_log", lambda *_: imported_hall)
     monkeypatch.setattr(log_maps.LogMapping, "solve", lambda *_, **__: without)
-    found, expected = map_log(read_log(hall), with_ladder=False).solution.maps[0], known.maps[0]
+    found, expected = map_log(read_log(hall)).solution.maps[0], known.maps[0]
     assert found.fit
     assert expected.fit
     for pose, other in zip(found.fit.poses, expected.fit.poses, strict=True):
@@ -383,7 +383,7 @@ def test_search_without_a_limit_continues_until_it_has_a_map(
 
     monkeypatch.setattr(LogMapping, "solve", late)
     told: list[str] = []
-    done = map_log(read_log(hall), work_limit=limit, with_ladder=False, tell=told.append)
+    done = map_log(read_log(hall), work_limit=limit, tell=told.append)
     assert asked == [asked[0] * 4**k for k in range(searches)]
     if limit is None:
         assert done.solution.maps
@@ -396,33 +396,6 @@ def test_search_without_a_limit_continues_until_it_has_a_map(
             "The search ended after 5 units of work without a map. To search longer, give a "
             "limit: --work-limit 20."
         )
-
-
-@pytest.mark.parametrize(
-    ("limit", "rung"),
-    [
-        pytest.param(3.0, 1.0, marks=pytest.mark.slow),
-        (80.0, 5.0),
-        pytest.param(1000.0, 10.0, marks=pytest.mark.slow),
-    ],
-)
-def test_ladder_takes_a_quarter_of_the_limit(
-    limit: float,
-    rung: float,
-    runs: Path,
-    hall: Path,
-    imported_hall: Imported,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """There are four rungs, each with at least one unit of work and at most ten."""
-    found, asked = Solution.load(runs / "hall" / "maps.json"), list[float]()
-    monkeypatch.setattr(log_maps, "import_log", lambda *_: imported_hall)
-    monkeypatch.setattr(LogMapping, "solve", lambda *args, **given: found)
-    monkeypatch.setattr(
-        log_maps, "ladder", lambda *args, **given: asked.append(given["work_limit"]) or []
-    )
-    map_log(read_log(hall), work_limit=limit)
-    assert asked == [rung]
 
 
 def test_report_says_why_there_is_no_map_or_proof() -> None:
@@ -528,6 +501,6 @@ def test_map_of_four_rooms_has_perfect_place_precision(tmp_path: Path) -> None:
         plan_of(tmp_path, xml(DOORS[:4], middles=middles)), seed=1, metres=36, every=0.5
     )
     log = RobotLog(tuple(scans_of(drive)), source="ring")
-    done = map_log(log, max_maps=1, time_limit=60, with_ladder=False)
+    done = map_log(log, max_maps=1, time_limit=60)
     (judged,) = evaluate_visits(done.solution.maps[:1], done.imported.trace).maps
     assert judged.places.precision == 1.0

@@ -37,7 +37,7 @@ def house() -> LogMap:
     scans = every_second_beam(scans_of(record(World.named("doors"), every=1.0)))
     scans = scans[: len(scans) * 7 // 10]
     with patch.object(time, "perf_counter", time.process_time):
-        return map_log(RobotLog(scans, source="house"), time_limit=1, with_ladder=False)
+        return map_log(RobotLog(scans, source="house"), time_limit=1)
 
 
 def along(*places: int) -> SSHMap:
@@ -146,7 +146,7 @@ def test_report_shows_paths_only_if_the_theory_has_axioms_on_them(house: LogMap)
     planar = solve(house.imported.trace, with_paths, time_limit=20)
     planar = replace(planar, theory=with_paths.replace(planar=True))
     for one, shows in ((solution, False), (planar, True)):
-        page = report(house.log, house.imported, one, (), house.to_dict())
+        page = report(house.log, house.imported, one, house.to_dict())
         assert ("Colours are paths" in page) == shows
         assert one.cost is not None
         assert (f"places, {one.cost.paths} paths, " in page) == shows
@@ -158,7 +158,7 @@ def test_report_shows_paths_only_if_the_theory_has_axioms_on_them(house: LogMap)
 def test_report_names_rival_maps_only_if_they_were_sought(house: LogMap) -> None:
     for status, sought in ((Status.OPTIMAL, True), (Status.FEASIBLE, False)):
         solution = replace(house.solution, status=status)
-        page = report(house.log, house.imported, solution, (), house.to_dict())
+        page = report(house.log, house.imported, solution, house.to_dict())
         assert ("<h2>Rival maps</h2>" in page) == sought
 
 
@@ -168,7 +168,7 @@ def test_report_calls_no_join_sure_if_the_search_ended_early(house: LogMap) -> N
     for searched, told in ((True, "None: "), (False, "Unknown: a map that costs less")):
         found = replace(weighed, bound=0.0, searched=searched)
         solution = replace(house.solution, support=replace(house.solution.support, weighed=found))
-        page = report(house.log, house.imported, solution, (), house.to_dict())
+        page = report(house.log, house.imported, solution, house.to_dict())
         assert f"<h2>Doubtful joins</h2><p>{told}" in page
 
 
@@ -181,7 +181,7 @@ def test_picture_shows_probabilities_of_doubtful_joins(
     joined = {places[second] for _, second, _ in house.solution.weighed.joins}
     picture = figure(house.log, house.imported, house.solution)
     assert picture.count("<title>a join at place") == len(joined) > 0
-    page = report(house.log, house.imported, house.solution, (), house.to_dict())
+    page = report(house.log, house.imported, house.solution, house.to_dict())
     assert "<h2>Doubtful joins</h2><table>" in page
 
 

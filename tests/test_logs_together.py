@@ -75,7 +75,7 @@ def mapping(
     # The limit is of processor time, so that other processes do not shorten the search.
     processor = patch.object(time, "perf_counter", time.process_time)
     with processor, patch.object(log_maps, "import_log", kept):
-        main([*command, "--set", "ladder=false"])
+        main([*command])
     return folder / "building", parts
 
 
@@ -273,7 +273,7 @@ def test_joint_run_of_the_same_logs_is_skipped(
 ) -> None:
     logs = [str(folder.parent / f"{name}.log") for name in ("monday", "tuesday")]
     command = ["map", *logs, "--together", "-o", str(folder), "--time-limit", "2"]
-    assert main([*command, "--set", "ladder=false"]) == 0
+    assert main([*command]) == 0
     assert "2 logs: done already" in capsys.readouterr().out
     assert digest(logs) != digest(logs[::-1])
 
@@ -294,7 +294,7 @@ def test_map_together_obeys_corrections(
     assert main(["name", building, "monday:0", "kitchen"]) == 0
     assert main(["correct", building, "--different", pair]) == 0
     logs = [str(folder.parent / f"{name}.log") for name in ("monday", "tuesday")]
-    settings = ["--together", "-o", building, "--time-limit", "5", "--set", "ladder=false"]
+    settings = ["--together", "-o", building, "--time-limit", "5"]
     capsys.readouterr()
     main(["map", *logs, *settings])
     told = capsys.readouterr()

@@ -222,7 +222,6 @@ def test_tutorials_run_in_an_empty_folder(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(log_maps, "LEAST", 1000.0)  # however slow this machine is
-    monkeypatch.setattr(log_maps, "ladder", lambda *_, **__: ())  # the shown output has none
     monkeypatch.chdir(tmp_path)
     for block in blocks(page):
         if not block.why:

@@ -56,7 +56,6 @@ class MapQuestion(jobs.FileQuestion):
     width: float  # the width of the robot, in metres
     limit: float | None  # seconds after which the search ends in any case; None for no limit
     maps: int  # the largest number of maps to list; 0 for all
-    ladder: bool  # whether to compute what each kind of evidence contributes
     # Names and corrections of a person, to be obeyed; None for none.
     corrections: Corrections | None = None
     # The best maps of a process that mapped the log and was killed; None if none was killed.
@@ -76,7 +75,7 @@ class MapQuestion(jobs.FileQuestion):
         The run counts as interrupted, so that the next call maps the log again.
         """
         maps = () if known is None else (known,)
-        return replace(self, limit=HURRY, work=HURRY, ladder=False, known=maps)
+        return replace(self, limit=HURRY, work=HURRY, known=maps)
 
     def obeying(self, folder: Path) -> MapQuestion:
         """Return this question with the corrections in a folder, if any. Raises MapError."""
@@ -90,7 +89,7 @@ class MapQuestion(jobs.FileQuestion):
         return {
             "theory": self.theory.to_dict() if self.theory else None,
             "choices": {name: laid_over[name] for name in self.choices},
-            **attributes_of(self, "reading", "width", "limit", "work", "maps", "ladder"),
+            **attributes_of(self, "reading", "width", "limit", "work", "maps"),
             **({} if self.corrections is None else {"corrections": to_yaml(self.corrections)}),
         }
 
@@ -188,7 +187,6 @@ class MapQuestion(jobs.FileQuestion):
                 time_limit=self.limit,
                 work_limit=self.work,
                 max_maps=self.maps or None,
-                with_ladder=self.ladder,
                 corrections=self.corrections,
                 mapping=begun[0],
                 tell=tell,
@@ -269,15 +267,11 @@ class MapQuestion(jobs.FileQuestion):
         "--work-limit W": (
             "units of work for the search, each about a second of a quiet core; the same map on "
             "each machine (default: the time limit or, without one, a unit for 20 seconds that the "
-            "robot drove, less a quarter for the ladder, and at least 30; a search that has no map "
+            "robot drove, and at least 30; a search that has no map "
             "then goes on for up to 64 times as long)"
         ),
         "--time-limit S": "end the search after S seconds in any case",
         **shared.STRICT,
-        "--set ladder true|false=true": (
-            "whether to compute how much each kind of evidence helps; this takes up to a quarter "
-            "of the work limit after the search, or a few units if that is more"
-        ),
         "--set again true|false=false": "whether to map also logs that are already mapped",
         **shared.many("map", "logs"),
         **import_log.READING,
@@ -315,7 +309,6 @@ def run_map(options: argparse.Namespace) -> int:
         limit=options.time_limit,
         work=options.work_limit,
         maps=options.maps,
-        ladder=options.ladder,
     )
     if options.together:
         return _together(question, options)

@@ -24,12 +24,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.data.checks import a_count_of_maps, a_flag, an_instance
-from ssh_abduction.data.errors import MapError, SolverError, TheoryError
+from ssh_abduction.data.errors import SolverError, TheoryError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.evaluation import Evaluation, evaluate, tells_names
 from ssh_abduction.solver import Search, Solution, Start, check_limit
-from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 
@@ -153,7 +152,6 @@ def ladder(
     work_limit: float | None = None,
     max_maps: int | None = 100,
     stars: bool = True,
-    known: Solution | None = None,
     under_way: UnderWay | None = None,
 ) -> Iterator[Rung]:
     """Solve a trace with one theory after the other, each with one more kind of evidence.
@@ -166,8 +164,6 @@ def ladder(
         work_limit: Units of work for each rung, as in `solve`; None for no limit.
         max_maps: List and evaluate at most this many minimal maps on each rung; None for all.
         stars: Whether there is a rung for stars, if the trace has some.
-        known: A solution of this trace. The rung with the same theory uses it and is not solved
-            again.
         under_way: An object with which a signal handler or another thread can interrupt the ladder.
             Ctrl-C works without it.
 
@@ -181,9 +177,6 @@ def ladder(
     check_limit("work_limit", "units of work", work_limit)
     a_count_of_maps(max_maps, SolverError)
     a_flag("stars", stars, TheoryError)
-    if known is not None:
-        mend = "give what solve returned for this trace, or leave it out"
-        an_instance("known", known, Solution, MapError, mend=mend)
     if under_way is not None:
         mend = "give an UnderWay, or leave it out"
         an_instance("under_way", under_way, UnderWay, SolverError, mend=mend)
@@ -192,16 +185,12 @@ def ladder(
     def climbed() -> Iterator[Rung]:
         has_truth = tells_names(trace)
         for name, chosen in rungs(trace, start, stars):
-            solution = (
-                known
-                if known and known.theory == settle(trace, chosen).theory
-                else work.solve(
-                    trace,
-                    chosen,
-                    time_limit=time_limit,
-                    work_limit=work_limit,
-                    max_maps=max_maps,
-                )
+            solution = work.solve(
+                trace,
+                chosen,
+                time_limit=time_limit,
+                work_limit=work_limit,
+                max_maps=max_maps,
             )
             is_judged = has_truth and solution.maps and not work.interrupted
             yield Rung(name, solution, evaluate(solution.maps, trace) if is_judged else None)

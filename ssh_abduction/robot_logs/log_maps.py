@@ -33,7 +33,7 @@ from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.rungs import Rung, UnderWay, ladder, rungs
+from ssh_abduction.evaluation.rungs import UnderWay
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import may_misread, report
 from ssh_abduction.runtime.loggers import log_of
@@ -51,17 +51,13 @@ from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
 
-# Without a time limit, import and mapping together take SHARE of the time that the robot drove. Of
-# the part that the import leaves, the ladder (which compares kinds of evidence) gets LADDER.
-SHARE, LADDER = 1 / 20, 1 / 4
-# Least numbers of seconds: for the search for minimal maps, and for each rung of the ladder.
-LEAST, LEAST_RUNG = 30.0, 1.0
+# Without a limit, the search gets SHARE of a unit of work for each second that the robot drove, and
+# at least LEAST units.
+SHARE, LEAST = 1 / 20, 30.0
 # Without a map, the search is given LONGER times its time, at most PATIENCE times.
 LONGER, PATIENCE = 4.0, 3
 # The recogniser treats all ranges below this, in metres, as equal. So does the clustering of views.
 FLOOR = 0.3
-# Largest number of seconds for a rung, because the ladder is only information for the reader.
-RUNG = 10.0
 # Speed of the robot in metres per second, assumed if the log has no clock. Robots whose logs have a
 # clock drove 0.2 to 0.4 on average. If a robot is slower than SLOWEST by its clock, it mostly
 # stood, or the clock does not count seconds.
@@ -95,8 +91,6 @@ class LogMap:
         log: The robot's log. The scans of several drives follow each other.
         imported: The trace of the log, and how it was made.
         solution: The minimal maps. Those whose loops close best come first.
-        rungs: The rungs of the ladder, each with one more kind of evidence than the last; empty
-            without a ladder.
         seconds: Processor time of each stage in seconds, by the name of the stage. Reading the log
             does not count.
         limit: Seconds that the search for minimal maps was allowed.
@@ -107,7 +101,6 @@ class LogMap:
     log: RobotLog
     imported: Imported
     solution: Solution
-    rungs: tuple[Rung, ...]
     seconds: Mapping[str, float]
     limit: float
     notes: tuple[str, ...] = ()
@@ -159,7 +152,6 @@ class LogMap:
             "complete": solution.complete,
             "count": solution.count,
             "cost": solution.cost.to_dict() if solution.cost else None,
-            "ladder": [rung.to_dict() for rung in self.rungs],
             "seconds": dict(self.seconds),
             "limit": round(self.limit, 1),
             "drove": self.drove,
@@ -178,7 +170,7 @@ class LogMap:
         }
         if solution.maps:
             found["page.html"] = view_page(solution, trace).html
-        found["report.html"] = report(self.log, self.imported, solution, self.rungs, self.to_dict())
+        found["report.html"] = report(self.log, self.imported, solution, self.to_dict())
         files = {name: text.encode() for name, text in found.items()}
         if solution.maps:
             files["recogniser.skops"] = written(recogniser_of(trace, solution.maps[0]))
@@ -273,7 +265,6 @@ def map_log(
     time_limit: float | None = None,
     work_limit: float | None = None,
     max_maps: int | None = MAPS,
-    with_ladder: bool = True,
     corrections: Corrections | None = None,
     mapping: LogMapping | None = None,
     tell: Callable[[str], None] = lambda note: None,
@@ -295,11 +286,8 @@ def map_log(
         work_limit: Units of work for the search for minimal maps, each about a second of a quiet
             core. One log and work limit give one map on each machine. None takes the time limit, or
             a unit for 20 seconds that the robot drove, but at least 30; if no map is found then,
-            the search may do up to 64 times as much. The ladder gets a quarter of this work, but
-            at least a unit for each kind of evidence.
+            the search may do up to 64 times as much.
         max_maps: List at most this many minimal maps; None lists all.
-        with_ladder: Whether to solve the trace with fewer kinds of evidence, too, to show what each
-            kind contributes.
         corrections: Names and corrections of a person, to be obeyed.
         mapping: An object through which another thread can interrupt the mapping; None for none.
         tell: A function that is called with each note on the log and on the search, as soon as the
@@ -323,10 +311,9 @@ def map_log(
     _log.info("%d visits, %d steps", len(imported.visits), len(trace))
 
     # 2. Work as it suits the log.
-    by_drive = max(work_for(log, imported) * (1 - LADDER if with_ladder else 1), LEAST)
+    by_drive = max(work_for(log, imported), LEAST)
     given = time_limit if work_limit is None else work_limit
     allowed = by_drive if given is None else given
-    climbed: list[Rung] = []
 
     def outcome(solution: Solution, interrupted: bool = True) -> LogMap:
         """Make the result for the solution so far, with its names and notes."""
@@ -335,9 +322,7 @@ def map_log(
         solution = solution if corrections is None else with_names(corrections, solution, trace)
         solution = solution if imported.track.is_reliable else _doubted(solution)
         solution = _with_poses(solution, trace)
-        return LogMap(
-            log, imported, solution, tuple(climbed), dict(seconds), allowed, warnings, interrupted
-        )
+        return LogMap(log, imported, solution, dict(seconds), allowed, warnings, interrupted)
 
     # 3. Maps: solve the trace.
     mapping.latest = lambda: outcome(mapping.snapshot())
@@ -349,26 +334,9 @@ def map_log(
         allowed, tries = allowed * LONGER, tries - 1
         tell(f"No map was found yet. The search goes on for up to {allowed:.0f} units of work.")
         solution = mapping.solve(trace, chosen, work_limit=allowed, **limits)
-    mapping.latest = lambda: outcome(solution)
     if corrections is not None:
         solution = with_correction_warnings(corrections, solution)
     seconds["maps"] = round(time.process_time() - begin, 3)
-
-    # 4. Ladder: what each kind of evidence is worth.
-    if with_ladder and not mapping.interrupted:
-        begin, stars = time.process_time(), chosen.star != "none"
-        share = LADDER * allowed / len(list(rungs(trace, chosen, stars)))
-        most = min(max(share, LEAST_RUNG), RUNG)
-        climbed += ladder(
-            trace,
-            chosen,
-            work_limit=most,
-            max_maps=1,
-            stars=stars,
-            known=solution,
-            under_way=mapping,
-        )
-        seconds["ladder"] = round(time.process_time() - begin, 3)
     return outcome(solution, mapping.interrupted)
 
 

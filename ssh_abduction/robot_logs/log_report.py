@@ -8,7 +8,7 @@ the log has them. The map itself was made without corrected poses.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.files import filled
 from ssh_abduction.data.words import counted
-from ssh_abduction.evaluation.rungs import Rung
 from ssh_abduction.output.cards import html_table, html_text, paragraph
 from ssh_abduction.output.roads import place_of_steps
 from ssh_abduction.rivals.listing import Listing, joins_of_drives, trusted
@@ -35,21 +34,15 @@ def report(
     log: RobotLog,
     imported: Imported,
     solution: Solution,
-    rungs: Sequence[Rung],
     run: Mapping[str, Any],
 ) -> str:
-    """Make the page as the text of an HTML file that loads no other file.
-
-    `rungs` are the results of the ladder, each with one more kind of evidence; empty without a
-    ladder.
-    """
+    """Make the page as the text of an HTML file that loads no other file."""
     name = imported.trace.name or "log"
     parts = [
         f"<h1>{html_text(name)}</h1>",
         *map(paragraph, [_summary(solution, run), *run["notes"], *solution.warnings]),
         figure(log, imported, solution),
         *_drives(imported, solution, run),
-        "<h2>What each kind of evidence is worth</h2>" + _ladder(rungs) if rungs else "",
         "<h2>Doubtful joins</h2>" + _doubts(solution)
         if solution.weighed and not solution.weighed.doubt
         else "",
@@ -129,19 +122,6 @@ def _joins_of_drives(solution: Solution) -> str:
     alone = [str(pair) for pair in pairs if not pair.forced and not pair.possible]
     head = ("step", "and step", "how sure")
     return (_table(head, rows) if rows else "") + "".join(paragraph(f"{one}.") for one in alone)
-
-
-def _ladder(rungs: Sequence[Rung]) -> str:
-    """Make the table of the ladder. Each rung is a row, with one more kind of evidence."""
-    has_paths = any(rung.solution.theory.has_paths for rung in rungs)
-    names = ("dstates", "places", *(["paths"] if has_paths else []))
-    rows = []
-    for rung in rungs:
-        cost = rung.solution.cost
-        counts = (getattr(cost, name) if cost else "–" for name in names)
-        time = f"{rung.solution.seconds.total:.1f} s"
-        rows.append((rung.name, rung.solution.status.value, *counts, time))
-    return _table(("evidence", "status", *names, "time"), rows)
 
 
 def _doubts(solution: Solution) -> str:
