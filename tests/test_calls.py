@@ -120,6 +120,7 @@ RIGHT_BY_NAME: dict[str, set[str]] = {
     "turned": {"3.5", "huge"},
 }
 RIGHT: dict[str, set[str]] = {
+    "route.start": {"None"},  # the last dstate
     "stream_visits.scans": {"dict", *EMPTY},
     "stream_visits.width": {"3.5", "huge"},
     "Step.of.view": {"None", "-1", "empty text", "nonsense", "folder"},

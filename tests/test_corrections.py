@@ -192,8 +192,8 @@ def test_solve_obeys_recorded_corrections(folder: Path, capsys: pytest.CaptureFi
     assert main(["correct", building, "--different", "monday:1,tuesday:0"]) == 0
     assert main(["correct", building]) == 0
     assert capsys.readouterr().out.splitlines()[-2:] == [
-        "name 'kitchen' of the place of monday:1",
-        "different: monday:1, tuesday:0",
+        "name 'kitchen' of the place of monday:1 [place 1 (kitchen)]",
+        "different: monday:1 [place 1 (kitchen)], tuesday:0 [place 1 (kitchen)]",
     ]
     assert main(["correct", building, "--different", "monday:1,tuesday:0"]) == 0
     assert capsys.readouterr().out == "nothing changed: this was said before\n"
@@ -242,7 +242,7 @@ def test_any_step_at_a_place_renames_it(folder: Path, capsys: pytest.CaptureFixt
     # Monday ends at the place where it began.
     assert main(["name", building, "monday:0", "hall"]) == 0
     assert main(["name", building, "monday:3", "lobby"]) == 0
-    assert "the place of monday:0 is 'lobby'" in capsys.readouterr().out
+    assert "place 0, the place of monday:0, is 'lobby'" in capsys.readouterr().out
     assert [n.name for n in load_corrections(building).names] == ["lobby"]
 
 
@@ -889,7 +889,7 @@ def test_solve_warns_of_names_that_the_map_does_not_have(
     assert "name 'kitchen'" not in told.err
     assert "(kitchen)" in told.out
     for name in ("kitchen", "cafe"):  # all verbs know both
-        assert main(["route", str(folder / "building"), "--from", "0", "--to", name]) == 0
+        assert main(["route", str(folder / "building"), "--from", "d0", "--to", name]) == 0
         assert "to place 1 (kitchen): " in capsys.readouterr().out
 
 
@@ -918,7 +918,7 @@ def test_names_of_drives_may_have_commas(
     assert main(["correct", str(tmp_path), "--different", "a,b:2,two floors, 1:1"]) == 0
     capsys.readouterr()
     assert main(["correct", str(tmp_path)]) == 0
-    assert "different: a,b:2, two floors, 1:1" in capsys.readouterr().out
+    assert "different: a,b:2 [place 1], two floors, 1:1 [place 1]" in capsys.readouterr().out
     for wrong in ("a,b:0", "a,b:0,a,b:0", "a,b:0,a,b:1,a,b:2", "c,d:0,a,b:1"):
         assert main(["correct", str(tmp_path), "--same", wrong]) == 1
 
@@ -929,5 +929,5 @@ def test_a_route_avoids_a_place_whose_name_has_a_comma(
     maps = str(folder / "building" / "maps.json")
     assert main(["name", maps, "p1", "room 1, left"]) == 0
     capsys.readouterr()
-    assert main(["route", maps, "--from", "0", "--to", "p1", "--avoid", "room 1, left"]) == 1
+    assert main(["route", maps, "--from", "d0", "--to", "p1", "--avoid", "room 1, left"]) == 1
     assert "avoid: expected a dstate of 'to' that is not avoided" in capsys.readouterr().err

@@ -126,11 +126,11 @@ def test_route_goes_around_avoided_dstates() -> None:
     links = ((0, "a", 1), (1, "a", 3), (0, "b", 2), (2, "b", 0), (2, "c", 2), (2, "a", 1))
     ssh_map = SSHMap((0, 1, 2, 3), dstates, links, (0, 1, 2, 3), (MapPath(0, (0, 1)),))
     assert route(ssh_map, 0, 1).dstates == (0, 1)
-    assert route(ssh_map, 0, 1).goal == "dstate 1"
+    assert route(ssh_map, 0, 1).goal == "dstate 1 at place 1"
     assert route(ssh_map, 0, 3).dstates == (0, 1, 3)
     with pytest.raises(
         MapError,
-        match="avoid: expected a way around what is avoided, got none to dstate 3; avoid less",
+        match="avoid: expected a way around what is avoided, got none to dstate 3 at .*; avoid less",
     ):
         route(ssh_map, 0, 3, avoid=[1])
     with pytest.raises(MapError, match="of 'to' that is not avoided"):
@@ -170,7 +170,7 @@ def test_route_passes_no_gateway_that_was_last_seen_closed(
     ("actions", "arguments", "said"),
     [
         # One way only: the paths of the map also lead back.
-        (["travel"] * 3, {}, "take --by places: the places of the map imply a way"),
+        (["travel"] * 3, {"by": "actions"}, "take --by places: the places of the map imply a way"),
         # Nothing leads back through a lift that was used once.
         (
             ["travel", Action("lift", "lift"), "travel"],
@@ -193,7 +193,7 @@ def test_route_advises_only_what_leads_there(
 @pytest.mark.parametrize(("goal", "where"), [(3, "the goal"), ("p3", "at place 3")])
 def test_route_to_its_own_start_says_so(goal: int | str, where: str) -> None:
     found = route(solve(Trace.from_steps("abcd", ["travel"] * 3)), None, goal)
-    assert found.sentence == f"the start, dstate 3, is {where}: there is nothing to do"
+    assert found.sentence == f"the start, dstate 3 at place 3, is {where}: there is nothing to do"
 
 
 def test_route_counts_rivals_that_agree() -> None:
@@ -239,6 +239,33 @@ def test_route_errors_name_the_range(arguments: dict[str, object], message: str)
         route(solve(rectangle(8)).maps[0], **arguments)  # type: ignore[arg-type]
 
 
+def test_bare_number_is_refused_where_it_is_ambiguous(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Pictures number places, and the tables dstates and steps."""
+    file = str(tmp_path / "maps.json")
+    solve(replace(rectangle(8), name="round")).save(file)
+    for words in (
+        ["route", file, "--to", "3"],
+        ["route", file, "--from", "3", "--to", "p1"],
+        ["route", file, "--to", "p1", "--avoid", "3"],
+        ["name", file, "3", "kitchen"],
+        ["correct", file, "--elsewhere", "3,p1"],
+        ["correct", file, "--open", "3 north"],
+    ):
+        assert main(words) == 1, words
+        assert "write p3, d3 or round:3" in capsys.readouterr().err, words
+    assert main(["name", file, "d3", "kitchen"]) == 0
+    assert capsys.readouterr().out.startswith("place 1, the place of round:3, is 'kitchen'")
+    assert main(["route", file, "--to", "KITCHN"]) == 1
+    assert "did you mean kitchen?" in capsys.readouterr().err
+    assert main(["route", file, "--from", "D0", "--to", "P1"]) == 0
+    assert "from dstate 0 at place 0 to place 1 (kitchen)" in capsys.readouterr().out
+    file = str(tmp_path / "causal.json")
+    solve(replace(rectangle(8), name="round"), Theory.causal()).save(file)
+    assert main(["route", file, "--from", "0", "--to", "3"]) == 0
+
+
 def test_route_by_places_needs_places() -> None:
     with pytest.raises(MapError, match="the map has no places"):
         route(solve(rectangle(8), Theory.causal()).maps[0], 0, 1, by="places")
@@ -250,8 +277,9 @@ def test_route_by_places_leads_back_without_paths() -> None:
     actions = ["travel", "travel", "travel", "around"]
     found = solve(Trace.from_steps("abcde", actions, displacements=moves), BARE)
     with pytest.raises(MapError, match="take --by places"):
-        route(found, None, "p1")
+        route(found, None, "p1", by="actions")
     back = route(found, None, "p1", by="places")
+    assert route(found, None, "p1") == back  # falls back, as nothing leaves the last dstate
     assert (back.actions, back.places) == (("travel", "travel"), (3, 2, 1))
     assert (back.views, back.is_known) == (("e", None, None), False)
     assert route(found, "p0", "p3", by="places").is_known
@@ -275,7 +303,7 @@ def test_route_command_prints_the_result_of_python(
 ) -> None:
     file = f"{tmp_path}/map.json"
     square.save(file)
-    assert main(["route", file, "--from", "0", "--to", "p2", "--by", "metres", "--json"]) == 0
+    assert main(["route", file, "--from", "d0", "--to", "p2", "--by", "metres", "--json"]) == 0
     printed = capsys.readouterr().out
     assert json.loads(printed) == json.loads(
         json.dumps(route(square, 0, "p2", by="metres").to_dict())
@@ -283,7 +311,7 @@ def test_route_command_prints_the_result_of_python(
     assert main(["route", file, "--to", "p1", "--by", "places", "--avoid", "p2,p3"]) == 0
     told = capsys.readouterr().out
     assert "never tried" not in told or "implied" in told
-    assert main(["route", file, "--to", "44"]) == 1
+    assert main(["route", file, "--to", "d44"]) == 1
     assert "0 to" in capsys.readouterr().err
 
 

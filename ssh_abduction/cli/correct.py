@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import math
 import os
+import re
 import shlex
 import sys
 import warnings
@@ -43,7 +44,13 @@ from ssh_abduction.data.drives import (
     together,
 )
 from ssh_abduction.data.errors import MapError, TheoryError, TraceError, brief, named, printable
-from ssh_abduction.data.map_parts import NAMED, region_of, thing_named
+from ssh_abduction.data.map_parts import (
+    NAMED,
+    check_says_what,
+    named_by_number,
+    region_of,
+    thing_named,
+)
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted, meant
@@ -297,9 +304,13 @@ def run_correct(options: argparse.Namespace) -> int:
         print("nothing changed: this was said before")
         return 0
     if said == before:
-        print("\n".join(map(printable, sentences_of(said))) or "nothing was said")
+        told = (*said.names, *said.pairs, *said.gateways)
+        print("\n".join(printable(saved.in_words(one)) for one in told) or "nothing was said")
         return 0
     file = saved.save(said)
+    for one in (*said.pairs, *said.gateways):
+        if one not in (*before.pairs, *before.gateways):
+            print(printable(saved.in_words(one)))
     warn(_unlike(saved, said, [pair for pair in said.pairs if pair not in before.pairs]))
     about_gateways = any(kind in ("open", "closed") for kind, _ in given)
     if about_gateways and saved.theory is not None and saved.theory.star == "none":
@@ -361,7 +372,7 @@ def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
         "maps": shared.MAPS_SAID,
         "what": (
             "a place such as p4, a path such as path2, a region such as region3, or its name so "
-            "far; or a step such as monday:12, for its place"
+            "far; or a step such as monday:12, or a dstate such as d7, for its place"
         ),
         "name": 'the name, such as "kitchen"; write -- before a name that begins with -',
         **shared.ONE_MAP,
@@ -376,7 +387,9 @@ def run_name(options: argparse.Namespace) -> int:
     saved = SavedMap.load(options.maps, options.map)
     kind, step = saved.thing_to_name(options.what)
     file = saved.save(saved.corrections.with_name(options.name, kind, step))
-    print(printable(f"the {kind} of {step} is {options.name.strip()!r}, in {named(file)}"))
+    number, name = saved.number_at(kind, step), options.name.strip()
+    where = "" if number is None else f"{named_by_number(kind, number)}, "
+    print(printable(f"{where}the {kind} of {step}, is {name!r}, in {named(file)}"))
     return 0
 
 
@@ -448,6 +461,16 @@ class SavedMap:
         save_corrections(corrections, file)
         return file
 
+    def in_words(self, said: Naming | Said | Passage) -> str:
+        """Put a correction into words, with the place of each step that is in this map."""
+
+        def with_place(step: re.Match[str]) -> str:
+            place = self.number_at("place", step[0])
+            return step[0] if place is None else f"{step[0]} [{self.map.called('place', place)}]"
+
+        names = sorted((re.escape(drive.name) for drive in self.drives), key=len, reverse=True)
+        return re.sub(rf"(?:{'|'.join(names)}):\d+", with_place, str(said))
+
     def thing(self, text: str) -> tuple[str, str]:
         """Find what a person names: return its kind, and a step there. Raises MapError.
 
@@ -474,8 +497,11 @@ class SavedMap:
         for naming in self._names:
             if naming.name == text:
                 return naming.kind, naming.step
+        check_says_what(text, self.drives[0].name)
         kind, number = thing_named(text, self.map.names) or ("", -1)
-        if kind not in NAMED:
+        if kind == "dstate" and number in self.map.dstate_at:
+            return "place", step_name(self.drives, self.map.dstate_at.index(number))
+        if kind not in (*NAMED, "dstate"):
             return None
         for t, label in enumerate(self.map.dstate_at):
             if number_at(self.map, kind, label) == number:
@@ -496,8 +522,10 @@ class SavedMap:
     def thing_to_name(self, text: str) -> tuple[str, str]:
         """Find what a person names, as `thing`. If it has a name, return the step of this name."""
         kind, step = self.thing(text)
-        number = self._at(kind, step)
-        there = [n.step for n in self._names if (n.kind, self._at(kind, n.step)) == (kind, number)]
+        number = self.number_at(kind, step)
+        there = [
+            n.step for n in self._names if (n.kind, self.number_at(kind, n.step)) == (kind, number)
+        ]
         return kind, step if step in there or not there else there[0]
 
     def step(self, text: str) -> str:
@@ -598,5 +626,6 @@ class SavedMap:
             )
         return 90.0 * (quarter % 4)
 
-    def _at(self, kind: str, step: str) -> int | None:
+    def number_at(self, kind: str, step: str) -> int | None:
+        """Return the number of the place, path or region of a step; None if it has none."""
         return number_at(self.map, kind, self.map.dstate_at[step_of(self.drives, step)])

@@ -180,16 +180,16 @@ def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
     {
         "maps": shared.MAPS_SAID,
         "--from A": (
-            "start: the number of a dstate, a step such as monday:12, or a place or region by "
-            "number or name, such as p3, region2 or kitchen (default: the robot's last dstate)",
+            "start: a dstate such as d7, a step such as monday:12, or a place or region by number "
+            "or name, such as p3, region2 or kitchen (default: the robot's last dstate)",
             {"dest": "start"},
         ),
         "--to B!": ("goal: a dstate, place or region, named as for --from", {"dest": "goal"}),
         "--avoid X...": "dstates, places and regions that the route must not visit",
-        "--by {actions,places,metres}=actions": (
+        "--by {actions,places,metres}": (
             "what to minimise. With actions or metres, a route uses only moves that the robot has "
             "made. With places, it may use any move along a path of the map, and drive back where "
-            "it came from"
+            "it came from (default: actions or, if none lead there, places)"
         ),
         **shared.ONE_MAP,
         **shared.JSON,
@@ -216,6 +216,8 @@ def run_route(options: argparse.Namespace) -> int:
     if options.json:
         print(json_line(found.to_dict()))
         return 0
+    if options.by is None and found.by == "places":
+        print("no moves that the robot has made lead there, so this route is by places:")
     print(printable(found.sentence))
     if found.legs:
         called = listing.maps[found.map - 1].called

@@ -50,7 +50,7 @@ from ssh_abduction.data.schema import SparseData
 from ssh_abduction.data.star import is_four
 from ssh_abduction.data.step import Action, Step
 from ssh_abduction.data.trace import Trace, checked_trace, images_file
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import counted, meant
 
 # The fields of a step that its fingerprint covers. Covariances are left out, as `together` adds
 # them if drives differ in their odometry.
@@ -173,6 +173,7 @@ def step_of(drives: Sequence[Drive], name: str) -> int:
         raise TraceError(
             f"step {brief(name)}: expected a drive out of {', '.join(by_name)}, got "
             f"{brief(drive_name)}; name one, such as {next(iter(by_name))}:0"
+            f"{meant(drive_name, by_name)}"
         )
     steps = drive.stop - drive.first
     if not colon and not number.isdecimal():

@@ -33,7 +33,8 @@ from ssh_abduction.data.words import noun_of
 
 # What a person can name.
 NAMED = ("place", "path", "region")
-_NUMBERED = re.compile(r"(?:(p|place|path|region) ?)?([0-9]{1,9})")
+_NUMBERED = re.compile(r"(?:(d|dstate|p|place|path|region) ?)?([0-9]{1,9})", re.IGNORECASE)
+_SHORT = {"d": "dstate", "p": "place", "": "dstate"}
 FAULTS = ("misread", "misseen", "slipped", "jumped", "changed")
 # The slots of the frame of a place, in words: the first dstate there faces slot 0.
 SLOTS = ("ahead", "right", "behind", "left")
@@ -124,16 +125,30 @@ class Name:
 def thing_named(text: str, names: Iterable[Name] = ()) -> tuple[str, int] | None:
     """Return the kind and the number of what a text names; None if it names nothing.
 
-    The text is the number of a dstate, such as "7"; a place, path or region by its number, such as
-    "p4", "place 4" or "region2"; or one of the names that a person gave.
+    The text is a dstate, place, path or region by its number, such as "d7", "p4", "place 4" or
+    "region2"; or one of the names that a person gave. A number alone is that of a dstate.
 
     >>> thing_named("p4"), thing_named("kitchen", [Name("place", 4, "kitchen")])
     (('place', 4), ('place', 4))
     """
     if found := _NUMBERED.fullmatch(text):
-        kind = found[1] or "dstate"
-        return "place" if kind == "p" else kind, int(found[2])
+        kind = (found[1] or "").lower()
+        return _SHORT.get(kind, kind), int(found[2])
     return next(((n.kind, n.id) for n in names if n.text == text), None)
+
+
+def check_says_what(text: str, drive: str | None = None) -> None:
+    """Raise MapError if a text is a number alone, as places, dstates and steps have numbers.
+
+    `drive` is the name of a drive; None if the map does not name its drives.
+    """
+    if text.strip().isdecimal():
+        n = text.strip()
+        ways = f"p{n} or d{n}" if drive is None else f"p{n}, d{n} or {drive}:{n}"
+        raise MapError(
+            f"{n}: expected a place, a dstate or a step, got a number that may be any of these; "
+            f"write {ways}"
+        )
 
 
 @dataclass(frozen=True, slots=True)

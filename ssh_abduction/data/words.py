@@ -34,8 +34,9 @@ def meant(word: object, names: Iterable[str], most: int = 1) -> str:
 
     `most` is the largest number of names in the hint.
     """
-    near = difflib.get_close_matches(str(word), list(names), n=most)
-    return f"; did you mean {' or '.join(near)}?" if near else ""
+    by_text = {name.casefold(): name for name in names}
+    near = difflib.get_close_matches(str(word).casefold(), by_text, n=most)
+    return f"; did you mean {' or '.join(by_text[name] for name in near)}?" if near else ""
 
 
 def that_differ(value: Any) -> dict[str, str]:

@@ -44,6 +44,7 @@ from ssh_abduction.data.checks import a_list, one_of
 from ssh_abduction.data.drives import Drive, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, printable
 from ssh_abduction.data.map_parts import (
+    check_says_what,
     course_named,
     named_by_number,
     right_of,
@@ -115,6 +116,7 @@ class Route:
         map: The number of the map, from 1.
         by: What the route minimises: "actions", "places" or "metres".
         start: The dstate where it begins.
+        origin: The dstate where it begins, and its place, in words.
         goal: The dstate, place or region where it ends, in words.
         view: The view at the start.
         place: The place of the start; None if the dstate has no place.
@@ -130,6 +132,7 @@ class Route:
     map: int
     by: str
     start: int
+    origin: str
     goal: str
     view: View | None
     place: int | None
@@ -182,9 +185,9 @@ class Route:
             parts.append(f"{len(self.agree)} of {self.maps} maps expect the same views")
         if not self.moves:
             where = f"in {self.goal}" if self.goal.startswith("region") else f"at {self.goal}"
-            where = "the goal" if self.goal == f"dstate {self.start}" else where
-            return f"the start, dstate {self.start}, is {where}: there is nothing to do"
-        return f"from dstate {self.start} to {self.goal}: {', '.join(parts)}"
+            where = "the goal" if self.goal == self.origin else where
+            return f"the start, {self.origin}, is {where}: there is nothing to do"
+        return f"from {self.origin} to {self.goal}: {', '.join(parts)}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the route as a dict for JSON, as `route --json` prints it.
@@ -207,7 +210,7 @@ def route(
     start: int | str | None,
     goal: int | str,
     *,
-    by: str = "actions",
+    by: str | None = None,
     avoid: Iterable[int | str] = (),
     map: int | str = 1,
 ) -> Route:
@@ -215,13 +218,14 @@ def route(
 
     Args:
         maps: A solution, maps of one trace, or one map.
-        start: The number of a dstate, or a step of a joint trace such as "monday:12"; or a place or
-            region, such as "p3", "region2" or "kitchen", which means any dstate there; None for the
-            dstate of the last step.
+        start: The number of a dstate, such as 7 or "d7"; or a step such as "monday:12"; or a place
+            or region, such as "p3", "region2" or "kitchen", which means any dstate there; None for
+            the dstate of the last step.
         goal: A dstate, place or region, named in the same way.
         by: What to minimise. "actions" and "metres" use links only, so the robot did each move
             before. "places" minimises travels, and also uses moves that the paths of the map imply,
-            or the ways back of all travels if there are no paths.
+            or the ways back of all travels if there are no paths. None means "actions" or, if no
+            known links lead to the goal, "places".
         avoid: Dstates, places and regions that the route must not visit, named in the same way.
         map: The number of the map to use, from 1, or its id.
 
@@ -229,11 +233,12 @@ def route(
         MapError: There is no such dstate, place, region or map; no route exists; the map has no
             poses for "metres", or no places for "places".
     """
-    one_of("by", by, BY, MapError, mend="say what the route minimises")
+    chosen = "actions" if by is None else by
+    one_of("by", chosen, BY, MapError, mend="say what the route minimises")
     listing = Listing.of(maps)
     number = listing.number(str(map))
     ssh_map = listing.maps[number]
-    graph = MoveGraph(ssh_map, by, listing.drives)
+    graph = MoveGraph(ssh_map, chosen, listing.drives)
     here, start_named = graph.nodes(ssh_map.dstate_at[-1] if start is None else start, "from")
     there, goal_named = graph.nodes(goal, "to")
     if not goal_named.startswith("dstate"):
@@ -249,11 +254,14 @@ def route(
             )
     way = graph.shortest(here - closed, there - closed, closed)
     if way is None:
-        by_places = False
+        by_places: Route | None = None
         if by != "places" and ssh_map.places:
             with suppress(MapError):
-                by_places = bool(route(listing, start, goal, by="places", avoid=avoid, map=map))
-        _raise_no_route(graph, here, there, closed, (start_named, goal_named), by_places)
+                by_places = route(listing, start, goal, by="places", avoid=given, map=map)
+        if by is None and by_places is not None:
+            return by_places
+        ends = start_named, goal_named
+        _raise_no_route(graph, here, there, closed, ends, by_places is not None)
     moves = tuple(graph.move(a, b) for a, b in pairwise(way))
     begin, end = (graph.course(node)[0] for node in (way[0], way[-1]))
     first = way[0]
@@ -261,8 +269,9 @@ def route(
     is_known = all(move.known for move in moves)
     return Route(
         map=number + 1,
-        by=by,
+        by=graph.by,
         start=first,
+        origin=graph.dstate_called(first),
         goal=goal_named,
         view=ssh_map.dstates[first].view,
         place=begin,
@@ -392,11 +401,14 @@ class MoveGraph:
     def nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
         """Return the dstates that a user names, and words for them, such as "place 3".
 
-        `name` is a dstate, place or region by its number, such as 3, "p3" or "region2", or a name
-        that a person gave. A place or region stands for all dstates there, and a step such as
-        "monday:12" for its dstate. `field` is the name of the user's parameter, for messages.
-        Raises MapError, which lists what exists.
+        `name` is a dstate, place or region by its number, such as "d3", "p3" or "region2", or a
+        name that a person gave. A place or region stands for all dstates there, and a step such as
+        "monday:12" for its dstate. The int 3 is dstate 3. But the text "3" is refused if the map
+        has places, as it may be a place, too. `field` is the name of the user's parameter, for
+        messages. Raises MapError, which lists what exists.
         """
+        if isinstance(name, str) and self.map.places:
+            check_says_what(name, self._drives[0].name if self._drives else None)
         kind, number = thing_named(str(name), self.map.names) or (None, -1)
         if kind is None and ":" in str(name) and self._drives:
             try:
@@ -411,7 +423,9 @@ class MoveGraph:
             if (s.id == number if kind == "dstate" else s.place in places.get(kind or "", ()))
         }
         if found and kind:
-            return found, f"dstate {number}" if kind == "dstate" else self.map.called(kind, number)
+            if kind == "dstate":
+                return found, self.dstate_called(number)
+            return found, self.map.called(kind, number)
         known = f", or a place as p{self.map.places[0]}" if self.map.places else ""
         known += ", or a region as region0" if self.map.regions else ""
         names = [n.text for n in self.map.names if n.kind in ("place", "region")]
@@ -420,6 +434,12 @@ class MoveGraph:
             f"{field}: expected a dstate, 0 to {len(self.map.dstates) - 1}{known}, got "
             f"{brief(name)}{meant(name, names, 3) or ';'} ssh-abduction show lists them"
         )
+
+    def dstate_called(self, number: int) -> str:
+        """Return the number of a dstate and its place: "dstate 3 at place 1 (kitchen)"."""
+        place = self.map.dstates[number].place
+        where = "" if place is None else f" at {self.map.called('place', place)}"
+        return f"dstate {number}{where}"
 
     def nodes_in(self, places: AbstractSet[int | None]) -> set[Node]:
         """Find all nodes that are at these places."""
