@@ -23,9 +23,10 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from perception.places.passages import resampled
 from ssh_abduction import Solution, SSHMap, Trace
+from ssh_abduction.building.travels import edges_of
 from ssh_abduction.evaluation import told_poses
-from ssh_abduction.robot_logs.log_picture import edges_of, resampled
 
 Array = NDArray[np.float64]
 # Two visits are at one place if their middles are within ONE metres. Within SURE metres, no

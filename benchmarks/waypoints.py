@@ -35,8 +35,8 @@ from skimage.morphology import skeletonize
 from perception.readers.logs import read_log
 from perception.readers.scans import RobotLog
 from ssh_abduction import SSHMap, Trace
+from ssh_abduction.building.travels import grouped
 from ssh_abduction.data.odometry import Pose
-from ssh_abduction.robot_logs.log_picture import grouped
 
 # Metres between nodes along the skeleton, along walls, and in free space.
 ALONG, BESIDE, FREE = 1.5, 2.5, 1.5

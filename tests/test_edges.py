@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from courses import frechet
 
+from perception.places.passages import resampled
 from ssh_abduction import Trace
+from ssh_abduction.building.travels import edges_of
 from ssh_abduction.data import Action, DState, Step
 from ssh_abduction.data.map_parts import Fit, Pose
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.robot_logs.log_picture import edges_of, resampled
 
 Points = Sequence[tuple[float, float]]
 AHEAD = [(8.0, 0.0)]

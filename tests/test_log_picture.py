@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from coarse import every_second_beam
 
+from perception.places.passages import STEP, resampled
 from perception.readers.scans import RobotLog
 from simulator.tours import record
 from simulator.world import World
@@ -23,7 +24,7 @@ from ssh_abduction.output.roads import place_of_steps, undecided_places
 from ssh_abduction.output.scene import ALARM
 from ssh_abduction.robot_logs import log_picture
 from ssh_abduction.robot_logs.log_maps import LogMap, map_log
-from ssh_abduction.robot_logs.log_picture import BESIDE, EDGE, STEP, drawn_once, figure, resampled
+from ssh_abduction.robot_logs.log_picture import BESIDE, EDGE, drawn_once, figure
 from ssh_abduction.robot_logs.log_report import report
 from ssh_abduction.solver import Status
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from perception.places.closures import DRIFT, NOISE, VisitMatch, uncertainty
 from perception.places.distinctive import RIM, SMALL, Visit, Way, patches_of
 from perception.places.local_map import CELL, PackedPatch
+from perception.places.passages import Passages
 from perception.places.track import Array, Track, covariance_turned, points_turned, wrapped
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.odometry import (
@@ -72,6 +73,7 @@ def to_trace(
     # For each visit with which another drive starts, the number of this drive.
     drives = {visit: drive for drive, visit in enumerate(starts_of_drives(track, visits), 2)}
     patches_of(visits)  # each visit has one
+    passages = Passages(log, track)
     for number, visit in enumerate(visits):
         headings = _headings(visit, track)
         arrivals.append((len(steps), headings[0]))
@@ -84,7 +86,10 @@ def to_trace(
         if number < len(visits) - 1:
             extra = dict(steps[-1].extra)
             if not track.cuts_between(visit.scan, visits[number + 1].scan):
-                extra["course"] = _course(track, visit, visits[number + 1], headings[-1])
+                chain = _course(track, visit, visits[number + 1])
+                ahead = points_turned(-headings[-1], chain[1:] - visit.middle)
+                extra["course"] = [[round(x, 2), round(y, 2)] for x, y in ahead.tolist()]
+                extra |= passages.along(chain, visit, visits[number + 1])
             onward = Action.of("travel")
             if drive := drives.get(number + 1):
                 onward = Action(f"{name} part {drive}" if name else f"drive {drive}", "start")
@@ -183,11 +188,10 @@ def _step(
     )
 
 
-def _course(track: Track, first: Visit, last: Visit, heading: float) -> list[list[float]]:
-    """The course of the robot from one visit to the next, as points of a polygonal chain.
+def _course(track: Track, first: Visit, last: Visit) -> Array:
+    """The course of the robot from one visit to the next: (n, 2) metres, from middle to middle.
 
-    The discs of both places are left out, and the last point is the middle of the next place.
-    The x-axis points along `heading`, in radians, from the middle of the first place.
+    It is a polygonal chain in the frame of the track. The discs of both places are left out.
     """
     from skimage.measure import approximate_polygon
 
@@ -196,9 +200,7 @@ def _course(track: Track, first: Visit, last: Visit, heading: float) -> list[lis
         np.flatnonzero(np.hypot(*(way - visit.middle).T) > visit.radius) for visit in (first, last)
     )
     part = way[left[0] : come[-1] + 1] if len(left) and len(come) else way[:0]
-    chain = approximate_polygon(np.array([first.middle, *part, last.middle]), DETAIL)
-    points = points_turned(-heading, chain[1:] - first.middle)
-    return [[round(x, 2), round(y, 2)] for x, y in points.tolist()]
+    return np.asarray(approximate_polygon(np.array([first.middle, *part, last.middle]), DETAIL))
 
 
 def _star(visit: Visit, heading: float) -> tuple[Gateway, ...]:

@@ -146,7 +146,9 @@ def numbered_by_first_visit(m: Reading) -> Found:
     if m.theory.level == "causal":
         return
     yield from _numbered("places", m.map.places, [(i, s.place) for i, s in m.visited])
-    yield from _numbered("paths", [h.id for h in m.map.paths], [(i, s.path) for i, s in m.visited])
+    yield from _numbered(
+        "paths", [h.id for h in m.map.theory_paths], [(i, s.path) for i, s in m.visited]
+    )
     faced: set[int] = set()
     for i, s in m.visited:
         if (course := course_of(s)) and course[0] not in faced:
@@ -214,7 +216,7 @@ def has_what_the_theory_has(m: Reading) -> Found:
     excuses only with boundary=defeasible.
     """
     causal = m.theory.level == "causal"
-    if causal and (m.map.places or m.map.paths):
+    if causal and (m.map.places or m.map.theory_paths):
         yield [], "The map has places or paths, but the theory is causal."
     for s in m.map.dstates:
         if causal and (s.place, s.path, s.direction) != (None, None, None):
@@ -229,7 +231,7 @@ def has_what_the_theory_has(m: Reading) -> Found:
 
 def excused_are_pairs_of_paths(m: Reading) -> Found:
     """Check that each excuse of the map (an exception to side_of_branch) is a pair of its paths."""
-    paths = {h.id for h in m.map.paths}
+    paths = {h.id for h in m.map.theory_paths}
     for pair in m.map.excused:
         if not is_pair(pair) or not set(pair) <= paths:
             yield [], f"The map excuses {pair}, which is not a pair of its paths."
@@ -241,7 +243,7 @@ def orders_list_places_once(m: Reading) -> Found:
     The axiom on_path covers whether these are the right places.
     """
     places = set(m.map.places)
-    for h in m.map.paths:
+    for h in m.map.theory_paths:
         if len(set(h.order)) < len(h.order):
             yield [], f"The order of path {h.id} lists a place twice."
         for p in set(h.order) - places:

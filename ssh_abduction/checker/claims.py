@@ -314,7 +314,7 @@ def _counts(ssh_map: SSHMap) -> dict[str, float]:
     return {
         "dstates": dstates,
         "places": len(ssh_map.places),
-        "paths": len(ssh_map.paths),
+        "paths": len(ssh_map.theory_paths),
         "excuses": len(ssh_map.excused),
         "faults": faults / 10,
         "tenths": 10 * dstates + faults,

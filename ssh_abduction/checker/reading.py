@@ -152,7 +152,7 @@ class Reading:
             self.along_travels if "travel_orders" in self.axioms else ()
         ):
             edges[path].setdefault((p, q) if direction == 1 else (q, p), move)
-        listed = firsts((h.id, h.order) for h in self.map.paths)
+        listed = firsts((h.id, h.order) for h in self.map.theory_paths)
         return {h: Order(listed.get(h, ()), edges[h], self.axioms) for h in listed | self.along}
 
     @cached_property

@@ -193,7 +193,7 @@ def known_sides(m: Reading) -> Mapping[Course, Mapping[int, RightBranch]]:
         pairs = combinations(m.along.get(path, ()), 2)
         return all(q in after(p, (path, 1)) or p in after(q, (path, 1)) for p, q in pairs)
 
-    ordered = {path.id for path in m.map.paths if is_ordered(path.id)}
+    ordered = {path.id for path in m.map.theory_paths if is_ordered(path.id)}
     found = branches_right_of(m, after)
     return {course: places for course, places in found.items() if course[0] in ordered}
 

@@ -371,15 +371,16 @@ def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
     {
         "maps": shared.MAPS_SAID,
         "what": (
-            "a place such as p4, a path such as path2, a region such as region3, or its name so "
-            "far; or a step such as monday:12, or a dstate such as d7, for its place"
+            "a place such as p4, a path such as path2, a region such as region3, a corridor, room "
+            "or door such as room4, or its name so far; or a step such as monday:12, or a dstate "
+            "such as d7, for its place"
         ),
         "name": 'the name, such as "kitchen"; write -- before a name that begins with -',
         **shared.ONE_MAP,
     }
 )
 def run_name(options: argparse.Namespace) -> int:
-    """Name a place, path or region.
+    """Name a place, path, region, corridor, room or door.
 
     The name is written to corrections.yaml beside the map, for a step at this place. Solving again
     may renumber the places, but the name stays with the place of that step.

@@ -255,6 +255,14 @@ def _names(words: list[str] | None, given: Collection[str]) -> list[str]:
     {
         "maps": shared.MAPS_SAID,
         "--map I": "show only the map with this number, from 1, or this id (default: all)",
+        "--paths": (
+            "show only the paths, corridors, doors and rooms, of the first map unless --map names "
+            "another. A map that has none gets them from its trace"
+        ),
+        "--trace TRACE": (
+            "with --paths, the trace that was mapped (default: the trace that solve -o or map "
+            "wrote with the maps)"
+        ),
     }
 )
 def run_show(options: argparse.Namespace) -> int:
@@ -263,11 +271,33 @@ def run_show(options: argparse.Namespace) -> int:
     Regions are also printed.
     """
     listing = shared.listing_of(options.maps)
+    if options.paths:
+        from ssh_abduction.building.telling import told  # loads numpy
+
+        ssh_map = _built(options, listing, listing.maps[listing.number(options.map or "1")])
+        print("\n".join(map(printable, told(ssh_map))))
+        return 0
     if options.map is not None:
         print(_with_regions(listing.maps[listing.number(options.map)]))
         return 0
     print("\n\n".join(f"map {i}\n{_with_regions(m)}" for i, m in enumerate(listing.maps, 1)))
     return 0
+
+
+def _built(options: argparse.Namespace, listing: Listing, ssh_map: SSHMap) -> SSHMap:
+    """Return a map with its paths, corridors, doors and rooms, derived if it has none."""
+    if ssh_map.building is not None:
+        return ssh_map
+    from ssh_abduction.building.derive import with_building  # loads numpy
+
+    trace = shared.mapped_trace(options.maps, options.trace)
+    if trace is None:
+        raise MapError(
+            f"{named(options.maps)}: expected maps with paths, or their trace, got neither; name "
+            "the trace that was mapped with --trace"
+        )
+    with said_of(named(options.maps), MapError):
+        return with_building(ssh_map, trace)
 
 
 def _with_regions(ssh_map: SSHMap) -> str:

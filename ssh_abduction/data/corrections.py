@@ -70,11 +70,11 @@ DIRECTIONS = {"ahead": 0.0, "right": 90.0, "back": 180.0, "left": 270.0}
 
 @dataclass(frozen=True, slots=True)
 class Naming:
-    """A name for the place, path or region of a step.
+    """A name for the place, path, region, corridor, room or door of a step.
 
     Attributes:
         name: The name.
-        kind: "place", "path" or "region".
+        kind: "place", "path", "region", "corridor", "room" or "door".
         step: The step, such as "monday:12".
         note: A remark of the person; it has no effect.
     """
@@ -218,7 +218,7 @@ class Corrections:
 
         Args:
             name: The new name.
-            kind: "place", "path" or "region".
+            kind: "place", "path", "region", "corridor", "room" or "door".
             step: The step, such as "monday:12".
 
         Raises:
@@ -451,8 +451,18 @@ class Corrections:
 
 
 def number_at(ssh_map: SSHMap, kind: str, label: int) -> int | None:
-    """Return the number of the place, path or region of a dstate; None if it has none."""
-    dstate = ssh_map.dstates[label]
+    """Return the number of the place, path, region and so on of a dstate; None if it has none.
+
+    The door of a dstate is the first one through which a travel from there leads. The path of a
+    map without paths of its theory is the longest one through the place.
+    """
+    dstate, building = ssh_map.dstates[label], ssh_map.building
+    if kind in ("corridor", "room", "door"):
+        number = {"corridor": "corridor_of", "room": "room_of", "door": "door_of"}[kind]
+        at = label if kind == "door" else dstate.place
+        return getattr(building, number)(at) if building else None
+    if kind == "path" and not ssh_map.theory_paths:
+        return next((p.id for p in ssh_map.paths if dstate.place in p.order), None)
     if kind == "region":
         return region_of(ssh_map.regions, dstate.place)
     return dstate.place if kind == "place" else dstate.path

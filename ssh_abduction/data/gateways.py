@@ -126,7 +126,7 @@ def _onward_of(
     kinds = {action.name: action.kind for action in trace.actions}
     states = {s.id: s for s in ssh_map.dstates}
     total = {"path_order_total", "on_path"} <= set(axioms)
-    listed = {h.id: h.order for h in ssh_map.paths} if total else {}
+    listed = {h.id: h.order for h in ssh_map.theory_paths} if total else {}
     # the places that travels along a path reach from a place, in each direction
     reached: dict[tuple[int, int, int], set[int]] = defaultdict(set)
     for source, name, target in ssh_map.links if "travel_orders" in axioms else ():

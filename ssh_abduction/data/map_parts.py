@@ -25,15 +25,16 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, TypeAlias
 
+from ssh_abduction.data.building import SIDES, read_building
 from ssh_abduction.data.checks import View, a_path
 from ssh_abduction.data.errors import MapError, is_writable
 from ssh_abduction.data.files import BadJson, opened_file, parse_json, save_file, source_of
-from ssh_abduction.data.schema import FieldReader, PlainData, Shape, SparseData
+from ssh_abduction.data.schema import FieldReader, Shape, SparseData
 from ssh_abduction.data.words import noun_of
 
 # What a person can name.
-NAMED = ("place", "path", "region")
-_NUMBERED = re.compile(r"(?:(d|dstate|p|place|path|region) ?)?([0-9]{1,9})", re.IGNORECASE)
+NAMED = ("place", "path", "region", "corridor", "room", "door")
+_NUMBERED = re.compile(rf"(?:(d|dstate|p|{'|'.join(NAMED)}) ?)?([0-9]{{1,9}})", re.IGNORECASE)
 _SHORT = {"d": "dstate", "p": "place", "": "dstate"}
 FAULTS = ("misread", "misseen", "slipped", "jumped", "changed")
 # The slots of the frame of a place, in words: the first dstate there faces slot 0.
@@ -90,17 +91,40 @@ def signed_path(path: int | None, direction: int | None) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class MapPath(PlainData):
+class MapPath(SparseData):
     """A path and the order of its places.
 
     Attributes:
         id: Its number.
         order: The places, in the order of direction +1. With path_order=partial, several orders
             are consistent with the map, and this is one of them.
+        line: Its course as points in metres; empty if the map has no poses.
+        length: Metres along the line; None if there is none.
+        width: The median width in metres; None if it is unknown.
+        sure: For a path that was derived from the finished map of a log: the probability that it is
+            right, by the cost of the best other pairing of edges. None for a path of the theory.
+        left: The places left of it in direction +1.
+        right: The places right of it in direction +1.
+        around: The places that ways on both sides of it lead to.
     """
 
     id: int
     order: tuple[int, ...]
+    line: tuple[tuple[float, float], ...] = field(default=(), repr=False)
+    length: float | None = field(default=None, repr=False)
+    width: float | None = field(default=None, repr=False)
+    sure: float | None = field(default=None, repr=False)
+    left: tuple[int, ...] = field(default=(), repr=False)
+    right: tuple[int, ...] = field(default=(), repr=False)
+    around: tuple[int, ...] = field(default=(), repr=False)
+
+    def left_of(self, place: int) -> bool:
+        """Whether a place is known to lie left of the path in direction +1."""
+        return place in self.left
+
+    def right_of(self, place: int) -> bool:
+        """Whether a place is known to lie right of the path in direction +1."""
+        return place in self.right
 
 
 @dataclass(frozen=True, slots=True)
@@ -500,6 +524,9 @@ class _MapReader(FieldReader):
             "fit": self._fit(record, len(dstates)),
             "regions": regions,
             "names": names,
+            "building": None
+            if record.get("building") is None
+            else read_building(self, record["building"], "building"),
         }
 
     def _check_numbered(self, name: str, things: Sequence[DState | Region]) -> None:
@@ -545,7 +572,17 @@ class _MapReader(FieldReader):
         return dstate
 
     def _path(self, value: Any, name: str) -> MapPath:
-        path = self.record(MapPath, value, name, id=self.integer, order=self.integers)
+        line: Shape[Any] = self.several(self.several(self.number, "two numbers", 2), "points")
+        path = self.record(
+            MapPath,
+            value,
+            name,
+            id=self.integer,
+            order=self.integers,
+            line=line,
+            **dict.fromkeys(("length", "width", "sure"), self.number),
+            **dict.fromkeys(SIDES, self.integers),
+        )
         if len(set(path.order)) < len(path.order):
             raise self.wrong(f"{name}.order", "each place once", list(path.order))
         return path

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
+from ssh_abduction.data.building import Corridor, Indoors, MapDoor, MapRoom
 from ssh_abduction.data.checks import a_list, a_whole_number, all_instances, an_instance, one_of
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
 from ssh_abduction.data.files import json_line
@@ -76,6 +77,8 @@ class SSHMap:
             first. None if they were not derived (`ssh_abduction.solver.find_regions`).
         names: The names that a person gave to places, paths and regions.
         starts: The steps, besides step 0, at which a drive starts.
+        building: The corridors, rooms, doors and junctions of the map of a log; None if they were
+            not derived (`ssh_abduction.building.derive.with_building`).
     """
 
     dstate_at: tuple[int, ...]
@@ -89,6 +92,7 @@ class SSHMap:
     regions: tuple[Region, ...] | None = field(default=None, compare=False, repr=False)
     names: tuple[Name, ...] = field(default=(), compare=False)
     starts: tuple[int, ...] = field(default=(), compare=False)
+    building: Indoors | None = field(default=None, compare=False, repr=False)
 
     def __repr__(self) -> str:
         parts = [counted(len(self.dstates), "dstates")]
@@ -99,6 +103,26 @@ class SSHMap:
         if self.faults:
             parts.append(counted(len(self.faults), "faults"))
         return f"<SSHMap: {', '.join(parts)}; {counted(len(self.dstate_at), 'steps')}>"
+
+    @property
+    def theory_paths(self) -> tuple[MapPath, ...]:
+        """The paths of the theory, without those that were derived from the finished map."""
+        return tuple(path for path in self.paths if path.sure is None)
+
+    @property
+    def corridors(self) -> tuple[Corridor, ...]:
+        """The corridors; empty if none were derived."""
+        return self.building.corridors if self.building else ()
+
+    @property
+    def rooms(self) -> tuple[MapRoom, ...]:
+        """The rooms; empty if none were derived."""
+        return self.building.rooms if self.building else ()
+
+    @property
+    def doors(self) -> tuple[MapDoor, ...]:
+        """The doors; empty if none were derived."""
+        return self.building.doors if self.building else ()
 
     @property
     def labels(self) -> tuple[Any, ...]:
@@ -257,15 +281,12 @@ class SSHMap:
             )
             for i, s in enumerate(visited)
         )
-        paths = [
-            MapPath(path[p.id], tuple(place[q] for q in p.order[:: -1 if p.id in flipped else 1]))
-            for p in self.paths
-        ]
+        paths = [_renumbered_path(p, path[p.id], place, p.id in flipped) for p in self.paths]
         fit = self.fit
         if fit and fit.poses:
             fit = replace(fit, poses=tuple(fit.poses[s.id] for s in visited))
         regions, region = renumbered(self.regions or (), place, path, flipped)
-        new = {"place": place, "path": path, "region": region}
+        new: dict[str, dict[int | None, int]] = {"place": place, "path": path, "region": region}
         return SSHMap(
             dstate_at=tuple(number[s] for s in self.dstate_at),
             dstates=dstates,
@@ -276,8 +297,9 @@ class SSHMap:
             fit=fit,
             faults=tuple(replace(fault, place=place.get(fault.place)) for fault in self.faults),
             regions=None if self.regions is None else regions,
-            names=tuple(replace(n, id=new[n.kind].get(n.id, n.id)) for n in self.names),
+            names=tuple(replace(n, id=new.get(n.kind, {}).get(n.id, n.id)) for n in self.names),
             starts=self.starts,
+            building=self.building and self.building.renumbered(place, path, number),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -300,6 +322,8 @@ class SSHMap:
         data |= {name: value for name, value in more.items() if value}
         if self.regions is not None:
             data |= attributes_of(self, "regions")
+        if self.building is not None:
+            data |= attributes_of(self, "building")
         if self.fit:
             data |= {"fit": self.fit.to_dict()}
             poses = self.fit.poses
@@ -340,6 +364,17 @@ class SSHMap:
             raise MapError(f"{named(path)}: expected one map, got a solution; take Solution.load")
         (ssh_map,) = maps_of(data, named(path))
         return ssh_map
+
+
+def _renumbered_path(
+    path: MapPath, number: int, place: Mapping[int | None, int], flipped: bool
+) -> MapPath:
+    """Return a path with new numbers; in the other direction if it is flipped."""
+    way = -1 if flipped else 1
+    sides = [tuple(sorted(place[q] for q in side)) for side in (path.left, path.right, path.around)]
+    order, line = tuple(place[q] for q in path.order[::way]), path.line[::way]
+    left, right = sides[:2][::way]
+    return replace(path, id=number, order=order, line=line, left=left, right=right, around=sides[2])
 
 
 def _changed(fault: Fault) -> tuple[int | None, ...]:

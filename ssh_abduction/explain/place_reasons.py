@@ -171,7 +171,7 @@ class PlaceQuestion(LimitedQuestion[PlaceExplanation]):
     def _sides_and_regions(self) -> tuple[tuple[PathSide, ...], tuple[str, ...]]:
         """Find the sides and the regions of the place. Raises MapError, as `known`."""
         first = self._maps[0]
-        paths = [h.id for h in first.paths]
+        paths = [h.id for h in first.theory_paths]
         _check("place", self._place, first.places)
         if self._path is not None:
             _check("path", self._path, paths)

@@ -383,7 +383,7 @@ class MoveGraph:
             )
         # One travel costs more than all turns of a route together, as a route has at most as many
         # moves as there are dstates and courses.
-        courses = 2 * sum(len(path.order) for path in ssh_map.paths) + len(ssh_map.places)
+        courses = 2 * sum(len(path.order) for path in ssh_map.theory_paths) + len(ssh_map.places)
         self._travel_cost = OPEN_TURN * (len(ssh_map.dstates) + courses)
         # The place, slot and bearing of each gateway that was last seen closed.
         changes = (fault for fault in ssh_map.faults if fault.kind == "changed")
@@ -542,7 +542,7 @@ class MoveGraph:
                 at.setdefault(s.place, set()).add(s.id)
                 if s.path is not None and s.direction is not None:
                     facing.setdefault((s.place, s.path, s.direction), s.id)
-        paths = self.map.paths
+        paths = self.map.theory_paths
         courses: list[tuple[int, int | None, int | None]] = [
             (place, p.id, way) for p in paths for place in p.order for way in (1, -1)
         ]
@@ -598,7 +598,7 @@ class MoveGraph:
         for source, action, target in self.map.links:
             s, x = dstates[source], dstates[target]
             moves = s.place != x.place if onward else s.direction != x.direction
-            if s.path == x.path and moves and (s.path is not None or not self.map.paths):
+            if s.path == x.path and moves and (s.path is not None or not self.map.theory_paths):
                 names.add(action)
         return names.pop() if len(names) == 1 else None
 
@@ -664,7 +664,7 @@ def coarse_route(ssh_map: SSHMap, start: int, goal: int) -> tuple[Leg, ...]:
 def _passed(ssh_map: SSHMap, start: int, goal: int) -> list[Leg]:
     """List the paths that have the start on one side and the goal on the other."""
     found = []
-    for path in ssh_map.paths:
+    for path in ssh_map.theory_paths:
         right, left = (right_of(ssh_map.regions or (), path.id, way) for way in (1, -1))
         if start in right and goal in left:
             found.append(Leg("pass", path=path.id, starts="right"))

@@ -149,7 +149,7 @@ def _topological(ssh_map: SSHMap) -> nx.Graph[Any]:
     graph: nx.Graph[Any] = nx.Graph()
     for place in ssh_map.places:
         graph.add_node(("place", place), bipartite=0, **_named(ssh_map, "place", place))
-    for path in ssh_map.paths:
+    for path in ssh_map.theory_paths:
         graph.add_node(("path", path.id), bipartite=1, **_named(ssh_map, "path", path.id))
         for index, place in enumerate(path.order):
             graph.add_edge(("place", place), ("path", path.id), index=index)
@@ -167,14 +167,14 @@ def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
         floor = ssh_map.dstates[dstates[0]].floor if dstates else None
         more = only_known(floor=floor) | _named(ssh_map, "place", place)
         graph.add_node(place, pos=found.places[place], dstates=dstates, **more)
-    for path in ssh_map.paths:
+    for path in ssh_map.theory_paths:
         streets = travelled(ssh_map, path)
         for index, (p, q) in enumerate(pairwise(path.order)):
             metres = math.dist(found.places[p], found.places[q]) if found.metric else None
             more = only_known(metres=metres) | _named(ssh_map, "path", path.id)
             went = (min(p, q), max(p, q)) in streets
             graph.add_edge(p, q, key=path.id, path=path.id, order=index, travelled=went, **more)
-    if not ssh_map.paths:
+    if not ssh_map.theory_paths:
         at = [s.place for s in ssh_map.dstates]
         for p, q in neighbours((at[s], at[x]) for s, _, x in ssh_map.links):
             metres = math.dist(found.places[p], found.places[q]) if found.metric else None

@@ -328,7 +328,7 @@ class StraightDrawing:
         }
         # Travels between places of a path join these places to one segment.
         self.segments: Any = nx.utils.UnionFind(
-            (path.id, place) for path in ssh_map.paths for place in path.order
+            (path.id, place) for path in ssh_map.theory_paths for place in path.order
         )
         for path, p, q in self.travels:
             self.segments.union((path, p), (path, q))
@@ -377,7 +377,7 @@ class StraightDrawing:
             for s in reversed(self.map.dstates)
         }
         streets: dict[tuple[int, int], tuple[float, float]] = {}
-        for path in self.map.paths:
+        for path in self.map.theory_paths:
             pairs = list(pairwise(path.order))
             if not whole:
                 index = {place: i for i, place in enumerate(path.order)}
@@ -388,7 +388,7 @@ class StraightDrawing:
                 way = facing.get((path.id, p), facing.get((path.id, q), 0.0))
                 if is_travelled or (p, q) not in streets:
                     streets[p, q] = way, 1.0 if is_travelled else LOOSE
-        for s, x in () if self.map.paths else self._walks():
+        for s, x in () if self.map.theory_paths else self._walks():
             streets.setdefault((self.spot[s], self.spot[x]), (headings[s], 1.0))
         # Of two streets between the same spots keep the one with the larger share, else the first.
         kept: dict[tuple[int, int], tuple[float, float]] = {}
@@ -401,8 +401,10 @@ class StraightDrawing:
         """Move parts that no street connects below each other. The first spot is at (0, 0)."""
         graph: nx.Graph[Any] = nx.Graph()
         graph.add_nodes_from(self.spots)
-        graph.add_edges_from(pair for path in self.map.paths for pair in pairwise(path.order))
-        if not self.map.paths:
+        graph.add_edges_from(
+            pair for path in self.map.theory_paths for pair in pairwise(path.order)
+        )
+        if not self.map.theory_paths:
             graph.add_edges_from((self.spot[s], self.spot[x]) for s, x in self._walks())
         parts = [[p for p in self.spots if p in part] for part in nx.connected_components(graph)]
         moves, (x0, y0) = _moves_of(parts, at, GAP), at[self.spots[0]]

@@ -226,7 +226,7 @@ def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
     Both directions are included. The action is None if the robot only travelled the other way.
     """
     ends: dict[tuple[int, int], Way] = {}
-    for path in ssh_map.paths:
+    for path in ssh_map.theory_paths:
         index = {place: i for i, place in enumerate(path.order)}
         for p, q in travelled(ssh_map, path):
             direction = 1 if index.get(p, 0) < index.get(q, 0) else -1
@@ -237,7 +237,7 @@ def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
         here, there = one.place, other.place
         if here is not None and there is not None and here != there:
             ends[here, there] = _way(ssh_map, s, action, x)
-            if not ssh_map.paths and one.floor == other.floor:
+            if not ssh_map.theory_paths and one.floor == other.floor:
                 ends.setdefault((there, here), (None, None, None))
     return ends
 

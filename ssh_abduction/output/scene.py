@@ -315,7 +315,7 @@ class _Drawing:
         shows direction +1.
         """
         orders, travels, heads = [], [], []
-        for path in self.map.paths:
+        for path in self.map.theory_paths:
             colour = colour_of(path.id)
             for p, q in untravelled(self.map, path):
                 ends = (self.spots[p], self.spots[q])
@@ -461,7 +461,7 @@ class _Drawing:
                 text, colour = (f"x{s.id}", "#444") if s.id != self.first else ("x0 start", "#000")
                 beside = [self.along(s, ahead) for ahead in (END, 17)]
                 yield text, beside, 7, colour, 11, s.id == self.first
-        for path in self.map.paths:
+        for path in self.map.theory_paths:
             streets = [[self.spots[p] for p in ends] for ends in self.streets_along(path)]
             beside = [
                 (a[0] + (b[0] - a[0]) * share, a[1] + (b[1] - a[1]) * share)
@@ -535,7 +535,7 @@ def streets_in(ssh_map: SSHMap, region: Region) -> list[tuple[int, int]]:
     """Find the pairs of neighbouring places of a region: by links, and along paths."""
     place = [s.place for s in ssh_map.dstates]
     pairs = [(place[s], place[x]) for s, _, x in ssh_map.links]
-    pairs += [ends for path in ssh_map.paths for ends in pairwise(path.order)]
+    pairs += [ends for path in ssh_map.theory_paths for ends in pairwise(path.order)]
     return neighbours(ends for ends in pairs if {*ends} <= {*region.places})
 
 

@@ -140,7 +140,7 @@ def _entry(ssh_map: SSHMap, name: str, shared: _SharedParts) -> dict[str, Any]:
         "id": name,
         "labeling": shared.labelings[ssh_map.dstate_at, views],
         "places": shared.places[tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)],
-        "orders": shared.orders[tuple((path.id, path.order) for path in ssh_map.paths)],
+        "orders": shared.orders[tuple((path.id, path.order) for path in ssh_map.theory_paths)],
     }
     if leaps := _leaps(ssh_map):
         entry["leaps"] = leaps

@@ -262,7 +262,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     *of_choice, together = _depending(asked, options)
     # Count what the maps have.
     fits = [ssh_map.fit.chi2 for ssh_map in listing.maps if ssh_map.fit]
-    sizes = Counter((len(m.dstates), len(m.places), len(m.paths)) for m in listing.maps)
+    sizes = Counter((len(m.dstates), len(m.places), len(m.theory_paths)) for m in listing.maps)
     faults = {m.faults for m in listing.maps}
     variants: dict[Matter, int] = {"faults": len(faults)} if any(faults) else {}
     return Comparison(

@@ -290,7 +290,7 @@ def _links_only_in(
 
 def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
     """Return the numbers of dstates, places, paths and links of a map."""
-    return len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.links)
+    return len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.theory_paths), len(ssh_map.links)
 
 
 def _groups_in_words(groups: Sequence[Steps], none: Steps) -> str:
@@ -411,7 +411,7 @@ def _sides(
     right = [
         {
             (path.id, way): {*right_of(m.regions or (), path.id, way)}
-            for path in m.paths
+            for path in m.theory_paths
             for way in (1, -1)
         }
         for m in maps

@@ -352,7 +352,7 @@ class Consequences:
             if s.path is not None and s.place is not None
         }
         self._turns_back = theory is None or theory.hard >= _OF_COURSES
-        self._orders = {path.id: path.order for path in ssh_map.paths}
+        self._orders = {path.id: path.order for path in ssh_map.theory_paths}
 
     def of(self, dstate: int, action: Action) -> Consequence:
         """Predict where an action leads from a dstate, and what is seen there."""

@@ -27,6 +27,7 @@ from perception.places.importing import Imported, import_log, join_logs
 from perception.readers.scans import RobotLog
 from perception.recognition import recogniser as new_recogniser
 from perception.store import written
+from ssh_abduction.building.derive import with_building
 from ssh_abduction.data.checks import all_instances
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import drives_of
@@ -319,9 +320,9 @@ def map_log(
         """Make the result for the solution so far, with its names and notes."""
         ended = INTERRUPTED if interrupted else how_it_ended(solution, allowed)
         warnings = (*notes, ended) if ended else notes
+        solution = _built(_with_poses(solution, trace), trace)
         solution = solution if corrections is None else with_names(corrections, solution, trace)
         solution = solution if imported.track.is_reliable else _doubted(solution)
-        solution = _with_poses(solution, trace)
         return LogMap(log, imported, solution, dict(seconds), allowed, warnings, interrupted)
 
     # 3. Maps: solve the trace.
@@ -334,6 +335,7 @@ def map_log(
         allowed, tries = allowed * LONGER, tries - 1
         tell(f"No map was found yet. The search goes on for up to {allowed:.0f} units of work.")
         solution = mapping.solve(trace, chosen, work_limit=allowed, **limits)
+    solution = _built(_with_poses(solution, trace), trace)
     if corrections is not None:
         solution = with_correction_warnings(corrections, solution)
     seconds["maps"] = round(time.process_time() - begin, 3)
@@ -346,6 +348,14 @@ def _with_poses(solution: Solution, trace: Trace) -> Solution:
         return solution
     first, *others = solution.maps
     return replace(solution, maps=(Ranking(trace).fitted(first), *others))
+
+
+def _built(solution: Solution, trace: Trace) -> Solution:
+    """Derive the paths, corridors, doors and rooms of the first map, if it has none yet."""
+    if not solution.maps or solution.maps[0].building:
+        return solution
+    first, *others = solution.maps
+    return replace(solution, maps=(with_building(first, trace), *others))
 
 
 def _doubted(solution: Solution) -> Solution:

@@ -9,9 +9,7 @@ The first dstate faces right, as in all drawings of a map. Each drive of a joint
 its own. It is moved and turned to where the map has its steps.
 
 A course is the way of the robot from the middle of one place to the middle of the next. The map
-says where these middles are. Travels between the same two places are on one edge if their courses
-lie close together. So two ways that leave a place in nearly one direction are two edges, and a
-robot that cuts a corner is on the same edge as one that does not.
+says where these middles are.
 """
 
 from __future__ import annotations
@@ -20,25 +18,23 @@ import cmath
 import math
 from bisect import bisect
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from perception.places.importing import Imported
+from perception.places.passages import STEP, resampled
 from perception.readers.scans import RobotLog, Scan
+from ssh_abduction.building.travels import edges_of
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Pose, moved
 from ssh_abduction.data.star import Star
-from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.drawing import svg_of
 from ssh_abduction.output.layout import drawable_poses, fitted_motion
 from ssh_abduction.output.roads import place_of_steps, undecided_places
@@ -80,12 +76,6 @@ SURE = 0.95
 # The colour of edges that belong to no meaningful path, of walls, and of the robot's way.
 EDGE, WALL, WAY = "#0072b2", "#8a8a8a", "#c9d4df"
 ASIDE = 5.0  # metres between drives that no map joins
-# Two courses are one edge if their Hausdorff distance is at most APART metres. They are compared at
-# points STEP metres apart.
-APART, STEP = 1.5, 0.25
-# Standard deviations of the heading at a dstate in radians, and of the chord of a course in metres.
-# They weigh what both say about the rotation of the course.
-HEADING, CHORD = 0.2, 0.3
 
 
 def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
@@ -108,7 +98,7 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
     if not solution.maps:
         caption = f"The visits over the scans, at {poses}."
     else:
-        colours = "Colours are paths. " if solution.maps[0].paths else ""
+        colours = "Colours are paths. " if solution.maps[0].theory_paths else ""
         if len(drives) > 1:
             colours = f"Colours are drives: {legend(drives)}. "
         caption = (
@@ -404,73 +394,3 @@ def _spots(poses: Sequence[Pose], imported: Imported) -> list[Pose]:
         x, y, heading = step.extra["seen"]
         spots.append(moved(poses[visit.scan], (float(x), float(y), float(heading))))
     return spots
-
-
-def edges_of(trace: Trace, ssh_map: SSHMap) -> dict[int, int]:
-    """Return the edge of each travel, by the step at which the travel begins.
-
-    Edges are numbered by first use. Travels of a log have a `course`. Others count as straight.
-    """
-    places = place_of_steps(ssh_map)
-    travels = {
-        t: (places[t], places[t + 1], _laid(trace, ssh_map, t))
-        for t, action in enumerate(trace.actions)
-        if action.kind == "travel" and places[t] is not None and places[t + 1] is not None
-    }
-    return dict(zip(travels, grouped(travels.values()), strict=True))
-
-
-def grouped(travels: Iterable[tuple[Any, Any, Array]]) -> list[int]:
-    """Number the edges of travels, each given by its first and last place and its course.
-
-    The places can be compared. A course is (n, 2) metres, with points STEP apart. Any two travels
-    on one edge are close together.
-    """
-    between: dict[tuple[Any, Any], dict[int, Array]] = defaultdict(dict)
-    for k, (first, last, course) in enumerate(travels):
-        between[min(first, last), max(first, last)][k] = course
-    edges: dict[int, tuple[Any, ...]] = {}
-    for ends, alike in between.items():
-        far = [apart(one, other) for one, other in combinations(alike.values(), 2)]
-        parts = fcluster(linkage(far, "complete"), APART, "distance") if far else [1]
-        edges |= {k: (*ends, part) for k, part in zip(alike, parts, strict=True)}
-    numbers: dict[tuple[Any, ...], int] = {}
-    return [numbers.setdefault(edges[k], len(numbers)) for k in sorted(edges)]
-
-
-def _laid(trace: Trace, ssh_map: SSHMap, t: int) -> Array:
-    """The course of the travel from step t in the frame of the map: (n, 2) metres.
-
-    It is the origin alone if the map has no poses.
-    """
-    if ssh_map.fit is None or not ssh_map.fit.poses:
-        return np.zeros((1, 2))
-    here, there = (ssh_map.fit.poses[ssh_map.dstate_at[k]] for k in (t, t + 1))
-    begin, end = complex(here.x, here.y), complex(there.x, there.y)
-    told = trace.steps[t].extra.get("course", ())
-    way = np.array([0.0, *(complex(x, y) for x, y in told)])
-    # This rotation has the least squared errors of the heading and of the chord.
-    turn = np.exp(1j * here.heading) / HEADING**2 + (end - begin) * way[-1].conj() / CHORD**2
-    way = begin + way * turn / abs(turn)
-    if not told:
-        way = np.array([begin, end])
-    far = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(way)))])
-    # The error at the end grows steadily along the course.
-    way += (end - way[-1]) * far / max(far[-1], STEP)
-    return resampled(np.stack([way.real, way.imag], axis=1), STEP)
-
-
-def resampled(way: Array, step: float) -> Array:
-    """Place points every `step` metres along a chain, (n, 2) metres, the last one at its end."""
-    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
-    moving = np.concatenate([[True], np.diff(far) > 1e-6])
-    if far[-1] < 1e-6:
-        return way[:1]
-    at = np.minimum(np.arange(0.0, far[-1] + step / 2, step), far[-1])
-    return np.stack([np.interp(at, far[moving], way[moving, k]) for k in (0, 1)], axis=1)
-
-
-def apart(first: Array, second: Array) -> float:
-    """Compute the Hausdorff distance of two sequences of points, (n, 2), in metres."""
-    far = cdist(first, second)
-    return float(max(far.min(axis=0).max(), far.min(axis=1).max()))

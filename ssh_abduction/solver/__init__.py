@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.board import Judging as Judging
     from ssh_abduction.solver.costs.estimating import maps_apart as maps_apart
     from ssh_abduction.solver.costs.misfit import Misfit as Misfit
+    from ssh_abduction.solver.derived_paths import best_pairings as best_pairings
+    from ssh_abduction.solver.derived_paths import chains_of as chains_of
+    from ssh_abduction.solver.derived_paths import sides_of as sides_of
     from ssh_abduction.solver.derived_regions import find_regions as find_regions
     from ssh_abduction.solver.derived_regions import with_regions as with_regions
     from ssh_abduction.solver.entry import Front as Front

@@ -257,7 +257,7 @@ class Candidates:
                 "candidate of %d dstates, %d places, %d paths",
                 len(ssh_map.dstates),
                 len(ssh_map.places),
-                len(ssh_map.paths),
+                len(ssh_map.theory_paths),
             )
             self._known.keep(found, ssh_map.dstate_at)
 

@@ -51,7 +51,7 @@ class Cost:
         """Count the dstates, places, paths, excuses and faults of a map."""
         checked_map(ssh_map)
         faults = sum(round(10 * fault.cost) for fault in ssh_map.faults) / 10
-        kinds = (ssh_map.dstates, ssh_map.places, ssh_map.paths, ssh_map.excused)
+        kinds = (ssh_map.dstates, ssh_map.places, ssh_map.theory_paths, ssh_map.excused)
         dstates, places, paths, excuses = map(len, kinds)
         return Cost(dstates, places, paths, excuses, faults)
 

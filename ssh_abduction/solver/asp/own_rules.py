@@ -354,7 +354,7 @@ def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
         return True
     control = Control(check=look_at_clock)
     steps = range(len(trace))
-    control.add("base", [], facts.theory_facts(theory, len(ssh_map.paths)))
+    control.add("base", [], facts.theory_facts(theory, len(ssh_map.theory_paths)))
     control.add("base", [], facts.trace_facts(problem, 0, len(trace), evidence=False))
     control.add("base", [], "\n".join(f"{fact}." for fact in _shown(trace, ssh_map)))
     control.add("base", [], f"query({len(trace) - 1}).\n{FORBIDDEN}")
@@ -395,7 +395,7 @@ def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
         for thing, steps in indices_of(things).items():
             pairs = combinations(steps, 2) if thing is not None else ()
             yield from (f"{name}({i},{t})" for i, t in pairs)
-    for h in ssh_map.paths:
+    for h in ssh_map.theory_paths:
         number, faced = path[h.id]
         order = [place[p] for p in h.order[::faced]]
         yield from (f"on({number},{p})" for p in order)

@@ -169,7 +169,7 @@ class Sketch:
         sketch._map, sketch.labels = ssh_map, list(ssh_map.dstate_at)
         sketch._links = {(s, action): x for s, action, x in ssh_map.links}
         sketch._excused = ssh_map.excused
-        sketch._orders = [list(path.order) for path in ssh_map.paths]
+        sketch._orders = [list(path.order) for path in ssh_map.theory_paths]
         sketch._states, sketch._along, sketch._facing, sketch._slots = [], {}, {}, {}
         stars: dict[int, object] = {}
         # The star of a dstate is that of its first step.

@@ -1,0 +1,154 @@
+"""Measures the free space beside a robot on its way, and finds the doors there, in local maps.
+
+Each point of a course has two widths: the distances from the course to the nearest wall on the left
+and on the right. A door is a narrow part of a course with wider parts before and behind it. The
+local maps also show doors and other openings in the walls that the robot passes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from perception.places.distinctive import Visit
+from perception.places.local_map import CELL, LocalMaps, Recent
+from perception.places.track import Array, Track
+from perception.readers.scans import RobotLog
+from ssh_abduction.data.odometry import radians_between
+
+# Widths are measured every STEP metres, in local maps of scans that are EVERY metres apart, within
+# REACH metres of the trajectory. A local map serves for a stretch of STRETCH metres.
+STEP, EVERY, REACH, STRETCH = 0.25, 0.3, 3.0, 2.0
+# Walls farther than WIDE metres count as WIDE metres away. A wall is beside a point if it is within
+# ALONG metres of it, measured along the course.
+WIDE, ALONG = 4.0, 0.3
+# A door is at most DOOR metres wide. Within NEAR metres before and behind it, the free space is
+# wider by WIDER metres.
+DOOR, NEAR, WIDER = 1.45, 2.0, 0.4
+# A part of a wall is an opening if there the free space reaches DEEP metres farther than beside it,
+# over a length from LEAST to MOST metres. Beside it means within BESIDE metres.
+DEEP, LEAST, MOST, BESIDE = 0.6, 0.5, 1.8, 2.5
+# The robot drove over what is less than DRIVEN metres beside its course, so no wall is there.
+DRIVEN = 0.15
+_TURN = 0.5  # A scan is also used if the robot turned by this angle in radians.
+
+
+def resampled(way: Array, step: float) -> Array:
+    """Place points every `step` metres along a chain, (n, 2) metres, the last one at its end."""
+    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
+    moving = np.concatenate([[True], np.diff(far) > 1e-6])
+    if far[-1] < 1e-6:
+        return way[:1]
+    at = np.minimum(np.arange(0.0, far[-1] + step / 2, step), far[-1])
+    return np.stack([np.interp(at, far[moving], way[moving, k]) for k in (0, 1)], axis=1)
+
+
+class Passages:
+    """Measures the ways of a robot between places in local maps of its log."""
+
+    def __init__(self, log: RobotLog, track: Track) -> None:
+        self._track, self._recent = track, Recent()
+        self._maps = LocalMaps(self._recent, REACH)
+        chosen = [0]
+        for i in range(1, len(log)):
+            far = track.way[i] - track.way[chosen[-1]]
+            turned = radians_between(track.poses[chosen[-1], 2], track.poses[i, 2])
+            if i in track.breaks or far >= EVERY or turned > _TURN:
+                chosen.append(i)
+        for i in chosen:
+            self._recent.append(log.scans[i], track.pose(i))
+        self._chosen = np.array(chosen)
+
+    def along(self, chain: Array, first: Visit, last: Visit) -> dict[str, Any]:
+        """Measure the widths along a chain from one visit to another, and find the doors.
+
+        The chain, (n, 2) metres, is in the frame of the track.
+
+        Returns:
+            `widths`: for each point, STEP metres apart, the distances to the walls on the left and
+            on the right, at most WIDE. `doors`: for each door, `at` in metres along the chain, its
+            `width`, and its `side`: "through", "left" or "right".
+        """
+        way = resampled(chain, STEP)
+        if len(way) < 2:
+            return {}
+        walls, free = self._beside(way, first.scan, last.scan)
+        through = [
+            {"at": round(k * STEP, 2), "width": round(float(walls[k].sum()), 2), "side": "through"}
+            for k in doors_in(walls.sum(axis=1), (first.radius, last.radius))
+        ]
+        aside = [
+            {"at": round(at * STEP, 2), "width": round(length, 2), "side": side}
+            for column, side in enumerate(("left", "right"))
+            for at, length in openings_in(free[:, column])
+        ]
+        return {"widths": np.round(walls, 2).tolist(), "doors": through + aside}
+
+    def _beside(self, way: Array, begin: int, end: int) -> tuple[Array, Array]:
+        """Measure how far walls, and the free space, reach left and right: (n, 2) each."""
+        ahead = directions(way)
+        walls, free = np.full((len(way), 2), WIDE), np.zeros((len(way), 2))
+        scans = self._chosen[(self._chosen >= begin) & (self._chosen <= end)]
+        scans = scans if len(scans) else self._chosen[[np.abs(self._chosen - begin).argmin()]]
+        stretch = round(STRETCH / STEP)
+        for first in range(0, len(way), stretch):
+            points = way[first : first + stretch]
+            middle = points.mean(axis=0)
+            far = np.hypot(*(self._track.poses[scans, :2] - middle).T)
+            near = int(np.searchsorted(self._chosen, scans[far.argmin()]))
+            patch = self._maps.around(near, middle, WIDE + STRETCH / 2 + 0.5)
+            blocked = patch.position(np.argwhere(patch.occupied).astype(float)) - points[:, None]
+            hidden = np.argwhere(~patch.free & ndimage.binary_dilation(patch.free))
+            unseen = patch.position(hidden.astype(float)) - points[:, None]
+            part = ahead[first : first + stretch, None]
+            for found, ends, half in ((walls, blocked, ALONG), (free, unseen, CELL)):
+                along = (ends * part).sum(axis=2)
+                off = part[..., 0] * ends[..., 1] - part[..., 1] * ends[..., 0]
+                for column, side in enumerate((1, -1)):
+                    beside = (np.abs(along) <= half) & (side * off > DRIVEN)
+                    nearest = np.where(beside, side * off, WIDE).min(axis=1, initial=WIDE)
+                    found[first : first + stretch, column] = nearest
+        return walls, free
+
+
+def directions(way: Array) -> Array:
+    """The unit vectors, (n, 2), along a way of n points, over four steps each."""
+    low, high = np.arange(len(way)) - 2, np.arange(len(way)) + 2
+    off = way[np.minimum(high, len(way) - 1)] - way[np.maximum(low, 0)]
+    return np.asarray(off / np.maximum(np.hypot(*off.T), 1e-6)[:, None])
+
+
+def doors_in(widths: Array, discs: tuple[float, float]) -> Iterator[int]:
+    """Yield the points of a course, STEP metres apart, at which it passes a door.
+
+    `discs` has the radii, in metres, of the places at both ends, where the course ends in free
+    space.
+    """
+    reach = round(NEAR / STEP)
+    wide = ndimage.median_filter(widths, 3, mode="nearest")
+    wide = np.concatenate([[2 * discs[0]], wide, [2 * discs[1]]])
+    parts, count = ndimage.label(wide <= DOOR)
+    for part in range(1, count + 1):
+        inside = np.flatnonzero(parts == part)
+        k = int(inside[np.abs(wide[inside] - wide[inside].min()) < 0.05].mean())
+        before, behind = wide[max(0, k - reach) : k], wide[k + 1 : k + 1 + reach]
+        if 0 < k < len(wide) - 1 and min(before.max(), behind.max()) >= wide[k] + WIDER:
+            yield k - 1
+
+
+def openings_in(free: Array) -> Iterator[tuple[float, float]]:
+    """Yield the openings in the wall on one side of a course: their middle, and their length.
+
+    `free` has how far the free space reaches on this side, every STEP metres. The middle is in
+    steps, the length in metres.
+    """
+    usual = ndimage.median_filter(free, 2 * round(BESIDE / STEP) + 1, mode="nearest")
+    parts, count = ndimage.label(free >= usual + DEEP)
+    for part in range(1, count + 1):
+        inside = np.flatnonzero(parts == part)
+        length = len(inside) * STEP
+        if LEAST <= length <= MOST and inside[0] > 0 and inside[-1] < len(free) - 1:
+            yield float(inside.mean()), length

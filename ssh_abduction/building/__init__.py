@@ -1,0 +1,1 @@
+"""The topological level of a building: paths, corridors, doors and rooms of a finished map."""

@@ -1,0 +1,69 @@
+"""Derive the topological level of a building from the finished map of a robot's log.
+
+The map is not changed. Paths, sides, corridors, doors and rooms follow from its places, its poses
+and its trace, after the search for maps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ssh_abduction.building.edges import FloorPlan
+from ssh_abduction.building.pairing import paths_of, ways_of
+from ssh_abduction.building.rooms import corridors_of, room_of_places, rooms_of, with_doors
+from ssh_abduction.data.building import Indoors
+from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_map
+from ssh_abduction.data.trace import Trace, checked_trace
+
+NO_POSES = (
+    "paths: the map has no poses, so it has neither paths nor corridors, doors and rooms; solve a "
+    "trace with displacements, and without a short time limit"
+)
+NO_PLACES = "paths: the map has no places, so it has no paths; solve with --theory topological"
+NO_WIDTHS = (
+    "corridors, doors, rooms: the trace has no widths, so only paths were derived; import the log "
+    "again"
+)
+NO_TRAVEL = "paths: the map has one place, so it has no path; take a longer drive"
+
+
+def with_building(ssh_map: SSHMap, trace: Trace) -> SSHMap:
+    """Return the same map with its paths, corridors, doors and rooms.
+
+    A map that has paths of its theory keeps them.
+
+    Args:
+        ssh_map: A map of the trace.
+        trace: The trace. The travels of a log have a course, widths and doors.
+
+    Returns:
+        The map with its field `building`, whose notes say what the map cannot have. The paths of a
+        map without paths are derived.
+
+    Raises:
+        MapError: The map is not of the trace.
+
+    Reference:
+        Kuipers 2000, "The Spatial Semantic Hierarchy": places, paths and regions.
+    """
+    checked_map(ssh_map)
+    check_of_trace([ssh_map], checked_trace(trace), "map", views=False)
+    if not ssh_map.places or not ssh_map.fit or not ssh_map.fit.poses:
+        note = NO_POSES if ssh_map.places else NO_PLACES
+        return replace(ssh_map, building=Indoors(notes=(note,)), paths=ssh_map.theory_paths)
+    plan = FloorPlan.of(ssh_map, trace)
+    junctions = gathered((name, p) for p, name in plan.name.items()).values()
+    listed = tuple(tuple(sorted(some)) for some in junctions if len(some) > 1)
+    if not plan.edges:
+        empty = Indoors(junctions=listed, notes=(NO_TRAVEL,))
+        return replace(ssh_map, building=empty, paths=ssh_map.theory_paths)
+    room = room_of_places(plan)
+    doors = with_doors(plan, room, ssh_map) if plan.measured else ()
+    ways = ways_of(plan)
+    paths = paths_of(plan, ways)
+    corridors = corridors_of(plan, ways, paths)
+    rooms = rooms_of(plan, room, doors, corridors) if plan.measured else ()
+    notes = () if plan.measured else (NO_WIDTHS,)
+    building = Indoors(corridors, rooms, doors, listed, notes)
+    return replace(ssh_map, building=building, paths=ssh_map.theory_paths or paths)

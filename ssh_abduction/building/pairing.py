@@ -1,0 +1,217 @@
+"""Pair the ends of the edges of a plan into paths: the costs, and the paths with their sides.
+
+Clingo decides (encodings/derived/paths.lp). The cost of a pair of ends is how unlikely it is that
+one straight way bends, shifts and changes its width so much.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from perception.places.track import wrapped
+from ssh_abduction.building.edges import FloorPlan, Gap, PlanEdge
+from ssh_abduction.building.travels import Array
+from ssh_abduction.data.map_parts import MapPath
+from ssh_abduction.data.odometry import radians_between
+from ssh_abduction.solver import best_pairings, chains_of, sides_of
+
+# Standard deviations of a straight joint: its bend in radians, its shift to the side in metres, and
+# the logarithm of the ratio of the widths.
+BEND, ASIDE, WIDER = math.radians(13), 1.2, 1.0
+# A joint bends by at most MOST radians beyond its slack, and by ROUGH radians in all. The middle of
+# a place is off by SLACK of its radius.
+MOST, ROUGH, SLACK = math.radians(40), math.radians(60), 0.25
+# The directions of two edges of a path differ by at most TURN radians, and by SLOW radians more for
+# each metre between them.
+TURN, SLOW = math.radians(60), math.radians(5)
+# The direction of an end is measured from OUT to FAR metres outside of the disc of its place.
+OUT, FAR = 0.3, 3.0
+NARROW = 0.6  # metres; smaller widths count as this
+
+
+@dataclass(frozen=True)
+class Leaving:
+    """How an end of an edge leaves its place."""
+
+    bearing: float  # radians
+    aside: float  # metres by which its line passes left of the middle of the place
+    width: float  # metres; NaN if it is unknown
+
+
+@dataclass(frozen=True, eq=False)
+class PairedWay:
+    """A path of a plan: its edges in its direction."""
+
+    edges: tuple[PlanEdge, ...]
+    ends: tuple[int, ...]  # for each edge, the end at which it begins: 2 x number + 0 or 1
+    gap: float  # nats to the best pairing without this path
+
+    @property
+    def places(self) -> list[int]:
+        """The places and corners in order."""
+        return [self.edges[0].ends[0], *(edge.ends[1] for edge in self.edges)]
+
+    @property
+    def line(self) -> Array:
+        """The course, (n, 2) metres."""
+        return np.concatenate([edge.course for edge in self.edges])
+
+    @property
+    def stops(self) -> list[int]:
+        """The points of the line at which its places are; the last point of an edge counts."""
+        return [0, *(int(n) - 1 for n in np.cumsum([len(edge.course) for edge in self.edges]))]
+
+    @property
+    def metres(self) -> Array:
+        """How far each point of the line is along it, (n,) metres."""
+        steps = np.hypot(*np.diff(self.line, axis=0).T)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @property
+    def passages(self) -> list[Gap]:
+        """The doors that the way passes and the openings beside it, at points of the line."""
+        begins = [0, *np.cumsum([len(edge.course) for edge in self.edges])]
+        return [
+            replace(p, at=p.at + int(begin))
+            for begin, edge in zip(begins, self.edges, strict=False)
+            for p in edge.passages
+        ]
+
+    @property
+    def widths(self) -> Array:
+        """The free space across the way at each point of the line, (n,) metres."""
+        return np.concatenate([edge.widths.sum(axis=1) for edge in self.edges])
+
+
+def ways_of(plan: FloorPlan) -> list[PairedWay]:
+    """Find the paths of a plan, the longest first."""
+    ends = [(2 * x + k, x, edge.ends[k]) for x, edge in enumerate(plan.edges) for k in (0, 1)]
+    (pairing,), gaps = best_pairings(ends, joints(plan), other_directions(plan))
+    found = []
+    for chain, gap in zip(chains_of(ends, pairing), gaps, strict=True):
+        edges = [plan.edges[e // 2] for e in chain]
+        turned = [x.turned() if e % 2 else x for e, x in zip(chain, edges, strict=True)]
+        found.append(PairedWay(tuple(turned), tuple(chain), gap))
+    return sorted(found, key=lambda way: (-round(sum(e.length for e in way.edges), 2), way.ends))
+
+
+def joints(plan: FloorPlan) -> dict[tuple[int, int], float]:
+    """Find the pairs of ends at one place that may be one path, and their costs in nats."""
+    at = defaultdict(list)
+    for x, edge in enumerate(plan.edges):
+        for k in (0, 1):
+            at[edge.ends[k]].append(2 * x + k)
+    leaves = {e: leaving(plan, e) for ends in at.values() for e in ends}
+    found = {}
+    for place, ends in at.items():
+        off = SLACK * plan.spots[place].radius
+        for e, f in combinations(ends, 2):
+            one, other = leaves[e], leaves[f]
+            bend = radians_between(one.bearing, other.bearing + math.pi)
+            slack = sum(math.atan(off / plan.edges[end // 2].length) for end in (e, f))
+            if e // 2 == f // 2 or bend > ROUGH or (bend := max(0.0, bend - slack)) > MOST:
+                continue
+            wider = math.log(max(one.width, NARROW) / max(other.width, NARROW))
+            errors = [bend / BEND, (one.aside + other.aside) / ASIDE, wider / WIDER]
+            found[e, f] = float(np.nansum(np.square(errors))) / 2
+    return found
+
+
+def other_directions(plan: FloorPlan) -> Iterator[tuple[int, int]]:
+    """Yield the pairs of edges whose directions differ too much for one path."""
+    for (x, one), (y, other) in combinations(enumerate(plan.edges), 2):
+        first, second = (edge.course[-1] - edge.course[0] for edge in (one, other))
+        bend = math.atan2(*first[::-1]) - math.atan2(*second[::-1])
+        bend = min(radians_between(bend, 0), radians_between(bend, math.pi))  # as undirected lines
+        between = min(math.dist(p, q) for p in one.course[[0, -1]] for q in other.course[[0, -1]])
+        if bend > TURN + SLOW * between:
+            yield x, y
+
+
+def leaving(plan: FloorPlan, end: int) -> Leaving:
+    """Find how an end leaves its place: 2 x the number of its edge, plus 0 or 1."""
+    edge = plan.edges[end // 2].turned() if end % 2 else plan.edges[end // 2]
+    here, there = (plan.spots[p] for p in edge.ends)
+    way = edge.course
+    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
+    begin = min(here.radius + OUT, far[-1] / 2)
+    stop = max(min(here.radius + FAR, far[-1] - there.radius), min(begin + 1.0, far[-1]))
+    points = [np.array([np.interp(s, far, way[:, k]) for k in (0, 1)]) for s in (begin, stop)]
+    onward = _unit(points[1] - points[0])
+    chord = _unit(
+        np.array([np.interp(min(4.0, far[-1]), far, way[:, k]) for k in (0, 1)]) - here.at
+    )
+    bearing = math.atan2(*(onward + chord)[::-1])
+    left = np.array([-math.sin(bearing), math.cos(bearing)])
+    near = edge.widths.sum(axis=1)[(far >= begin) & (far <= stop)]
+    width = float(np.median(near)) if len(near) else math.nan
+    return Leaving(bearing, float((points[0] - here.at) @ left), width)
+
+
+def _unit(off: Array) -> Array:
+    return np.asarray(off / max(float(np.hypot(*off)), 1e-6))
+
+
+def paths_of(plan: FloorPlan, ways: list[PairedWay]) -> tuple[MapPath, ...]:
+    """Make the paths of a map from the ways of its plan."""
+    beside, around = sides_of(
+        [(k, p) for k, way in enumerate(ways) for p in way.places],
+        [(k, p, side, edge.ends[1]) for k, p, side, edge in branches(plan, ways)],
+        [edge.ends for edge in plan.edges],
+    )
+
+    def places(some: Iterable[int]) -> tuple[int, ...]:
+        return tuple(sorted(p for p in some if p >= 0))
+
+    return tuple(
+        MapPath(
+            k,
+            tuple(p for p in way.places if p >= 0),
+            chain_points(way.line),
+            round(sum(edge.length for edge in way.edges), 2),
+            None if np.isnan(way.widths).any() else round(float(np.median(way.widths)), 2),
+            round(1 / (1 + math.exp(-way.gap)), 4),
+            places(q for h, side, q in beside if (h, side) == (k, "left")),
+            places(q for h, side, q in beside if (h, side) == (k, "right")),
+            places(q for h, q in around if h == k),
+        )
+        for k, way in enumerate(ways)
+    )
+
+
+def branches(plan: FloorPlan, ways: list[PairedWay]) -> Iterator[tuple[int, int, str, PlanEdge]]:
+    """Yield the edges that leave paths: the path, its place, the side, and the edge from there.
+
+    At a place of a path, an edge leaves on the left if its bearing is between that of the way ahead
+    and that of the way back, counterclockwise.
+    """
+    bearing = {
+        2 * x + k: leaving(plan, 2 * x + k).bearing for x in range(len(plan.edges)) for k in (0, 1)
+    }
+    for n, way in enumerate(ways):
+        own = {e // 2 for e in way.ends}
+        for i, place in enumerate(way.places):
+            ahead = bearing[way.ends[i]] if i < len(way.ends) else None
+            back = bearing[way.ends[i - 1] ^ 1] if i else None
+            ahead = wrapped((back or 0.0) + math.pi) if ahead is None else ahead
+            back = wrapped(ahead + math.pi) if back is None else back
+            for x, edge in enumerate(plan.edges):
+                for k in (0, 1):
+                    if edge.ends[k] == place and x not in own:
+                        turn = (bearing[2 * x + k] - ahead) % math.tau
+                        side = "left" if turn < (back - ahead) % math.tau else "right"
+                        yield n, place, side, edge.turned() if k else edge
+
+
+def chain_points(line: Array) -> tuple[tuple[float, float], ...]:
+    """Simplify a course, (n, 2) metres, to a chain of points within 0.1 m of it."""
+    from skimage.measure import approximate_polygon
+
+    chain = approximate_polygon(line, 0.1) if len(line) > 2 else line
+    return tuple((round(float(x), 2), round(float(y), 2)) for x, y in chain)

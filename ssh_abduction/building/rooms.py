@@ -1,0 +1,222 @@
+"""Find the doors, rooms and corridors of a plan.
+
+Rooms are what doors cut off. Corridors are the long and slim parts of paths. A fire door across a
+corridor parts rooms, but neither the path nor the corridor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import groupby, pairwise
+
+import networkx as nx
+import numpy as np
+
+from ssh_abduction.building.edges import FloorPlan, walls_beside
+from ssh_abduction.building.pairing import PairedWay, branches, chain_points
+from ssh_abduction.building.travels import Array
+from ssh_abduction.data.building import Corridor, MapDoor, MapRoom, WayOut
+from ssh_abduction.data.map_parts import MapPath
+from ssh_abduction.data.maps import SSHMap
+
+# Two doors between the same rooms, less than HALF metres apart, are the halves of a double door.
+HALF = 1.5
+# A corridor is at least LONG metres long, and SLIM times as long as wide. Its ends are at least
+# STRAIGHT of its length apart.
+LONG, SLIM, STRAIGHT = 6.0, 2.5, 0.8
+# A part of a path between two doors is a room if it is shorter than SHORT metres, or than SQUARE
+# widths; at an end of the path, than END widths. Its width is exceeded on WIDEST per cent of it.
+SHORT, SQUARE, END, WIDEST = 2.0, 1.3, 2.0, 30
+# An opening that the robot never drove through is told if it is at least BESIDE metres from those
+# that it did drive through.
+BESIDE = 1.2
+OUTLINE = 8  # A room has an outline if at least this many points of its walls were seen.
+Part = tuple[int, int]  # the first and the last point of a part of a way
+
+
+def room_of_places(plan: FloorPlan) -> dict[int, int]:
+    """Find the room of each place and corner: those that no door parts have one room."""
+    graph = nx.Graph()
+    graph.add_nodes_from(plan.spots)
+    graph.add_edges_from(edge.ends for edge in plan.edges if not edge.doors)
+    parts = sorted(map(sorted, nx.connected_components(graph)), key=lambda part: abs(part[-1]))
+    parts.sort(key=lambda part: next((p for p in part if p >= 0), math.inf))
+    return {p: k for k, part in enumerate(parts) for p in part}
+
+
+def with_doors(plan: FloorPlan, room: dict[int, int], ssh_map: SSHMap) -> tuple[MapDoor, ...]:
+    """Find the doors that edges pass, and number them. The halves of a double door are one."""
+    found: list[MapDoor] = []
+    edges = []
+    for edge in plan.edges:
+        passages = []
+        for passage in edge.passages:
+            if passage.side == "through":
+                x, y = (round(float(v), 2) for v in edge.course[passage.at])
+                new = MapDoor(
+                    len(found),
+                    (x, y),
+                    passage.width,
+                    tuple(sorted(p for p in edge.ends if p >= 0)),
+                    tuple(sorted({room[p] for p in edge.ends})),
+                    tuple(sorted({ssh_map.dstate_at[t] for t in edge.travels})),
+                )
+                number = next((d.id for d in found if _halves(d, new)), new.id)
+                found[number : number + 1] = [
+                    _joined(found[number], new) if number < new.id else new
+                ]
+                passages.append(replace(passage, door=number))
+            else:
+                passages.append(passage)
+        edges.append(replace(edge, passages=tuple(passages)))
+    plan.edges = edges
+    return tuple(found)
+
+
+def _halves(one: MapDoor, other: MapDoor) -> bool:
+    return one.rooms == other.rooms and math.dist(one.at, other.at) < HALF
+
+
+def _joined(one: MapDoor, other: MapDoor) -> MapDoor:
+    """Join the halves of a double door."""
+    return replace(
+        one,
+        width=max(one.width, other.width),
+        places=tuple(sorted({*one.places, *other.places})),
+        dstates=tuple(sorted({*one.dstates, *other.dstates})),
+    )
+
+
+def corridors_of(
+    plan: FloorPlan, ways: Sequence[PairedWay], paths: Sequence[MapPath]
+) -> tuple[Corridor, ...]:
+    """Find the corridors: the long and slim parts of paths, without the rooms that they cross."""
+    beside: dict[int, list[tuple[int, str, int, int | None]]] = {}
+    for k, place, side, edge in branches(plan, list(ways)):
+        door = next((p.door for p in edge.doors), None)
+        beside.setdefault(k, []).append((place, side, edge.ends[1], door))
+    found = []
+    for path, way in zip(paths, ways, strict=True):
+        if not np.isfinite(way.widths).all():
+            continue
+        far, stops = way.metres, dict(zip(way.places, way.stops, strict=True))
+        for begin, end in long_parts(way):
+            order = tuple(p for p in path.order if begin <= stops[p] <= end)
+            driven = [
+                WayOut(
+                    side,
+                    round(float(far[stops[p]] - far[begin]), 1),
+                    p,
+                    door,
+                    to if to >= 0 else None,
+                )
+                for p, side, to, door in beside.get(path.id, ())
+                if p in order
+            ]
+            seen = [
+                WayOut(p.side, round(float(far[p.at] - far[begin]), 1))
+                for p in way.passages
+                if p.side != "through" and begin < p.at < end
+            ]
+            new = [
+                o
+                for o in seen
+                if all(o.side != d.side or abs(o.metres - d.metres) > BESIDE for d in driven)
+            ]
+            across = {p.door for p in way.passages if p.door is not None and begin < p.at < end}
+            if len(order) > 1:
+                corridor = Corridor(
+                    0,
+                    path.id,
+                    order,
+                    chain_points(way.line[begin : end + 1]),
+                    round(float(far[end] - far[begin]), 1),
+                    round(float(np.median(way.widths[begin : end + 1])), 2),
+                    tuple(sorted(across)),
+                    tuple(sorted([*driven, *new], key=lambda o: (o.metres, o.side))),
+                    path.left,
+                    path.right,
+                    path.around,
+                )
+                found.append(corridor)
+    found.sort(key=lambda c: -c.length)
+    return tuple(replace(c, id=k) for k, c in enumerate(found))
+
+
+def long_parts(way: PairedWay) -> Iterator[Part]:
+    """Yield the parts of a way that are corridors: between rooms that it crosses."""
+    stops = sorted({p.at for p in way.passages if p.door is not None})
+    parts = list(pairwise([0, *stops, len(way.line) - 1]))
+    runs = [
+        [parts.index(part) for part in run]
+        for is_room, run in groupby(parts, key=lambda part: _is_room(way, part, SQUARE))
+        if not is_room
+    ]
+    found: list[tuple[list[int], Part]] = []
+    for run in runs:
+        if (whole := _corridor(way, [parts[k] for k in run])) is None:
+            continue
+        if found and run[0] - found[-1][0][-1] == 2:  # A crossing between two corridors.
+            joined = [*range(found[-1][0][0], run[-1] + 1)]
+            if (both := _corridor(way, [parts[k] for k in joined])) is not None:
+                found[-1] = joined, both
+                continue
+        found.append((run, whole))
+    return (part for _, part in found)
+
+
+def _corridor(way: PairedWay, parts: list[Part]) -> Part | None:
+    """The parts of a way as one corridor, without rooms at its ends; None if it is none."""
+    while parts and _is_room(way, parts[0], END):
+        parts = parts[1:]
+    while parts and _is_room(way, parts[-1], END):
+        parts = parts[:-1]
+    if not parts:
+        return None
+    begin, end = parts[0][0], parts[-1][1]
+    length = float(way.metres[end] - way.metres[begin])
+    width = float(np.median(way.widths[begin : end + 1]))
+    chord = math.dist(way.line[begin], way.line[end])
+    is_slim = length >= max(LONG, SLIM * width) and chord >= STRAIGHT * length
+    return (begin, end) if is_slim else None
+
+
+def _is_room(way: PairedWay, part: Part, share: float) -> bool:
+    """Whether a part of a way is short for its width."""
+    begin, end = part
+    wide = float(np.percentile(way.widths[begin : end + 1], 100 - WIDEST))
+    return bool(way.metres[end] - way.metres[begin] < max(SHORT, share * wide))
+
+
+def rooms_of(
+    plan: FloorPlan, room: dict[int, int], doors: Sequence[MapDoor], corridors: Sequence[Corridor]
+) -> tuple[MapRoom, ...]:
+    """Make the rooms, from the room of each place. A room of corners alone has no places."""
+    return tuple(
+        MapRoom(
+            k,
+            tuple(sorted(p for p, own in room.items() if own == k and p >= 0)),
+            tuple(door.id for door in doors if k in door.rooms),
+            tuple(c.id for c in corridors if any(room[p] == k for p in c.order)),
+            _outline(plan, {p for p, own in room.items() if own == k}),
+        )
+        for k in sorted({*room.values()})
+    )
+
+
+def _outline(plan: FloorPlan, places: set[int]) -> tuple[tuple[float, float], ...]:
+    """The convex hull of the walls that were seen along the edges of a room."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    inside = [walls_beside(edge) for edge in plan.edges if places.issuperset(edge.ends)]
+    points: Array = np.concatenate([np.zeros((0, 2)), *inside])
+    if len(points) < OUTLINE:
+        return ()
+    try:
+        return tuple(
+            (round(float(x), 2), round(float(y), 2)) for x, y in points[ConvexHull(points).vertices]
+        )
+    except QhullError:  # All walls are on one line.
+        return ()

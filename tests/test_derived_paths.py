@@ -1,0 +1,303 @@
+"""Paths, sides, corridors, doors and rooms that follow from a finished map."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from perception.places.passages import STEP, doors_in, openings_in, resampled
+from ssh_abduction import SSHMap, Trace
+from ssh_abduction.building.derive import with_building
+from ssh_abduction.building.telling import told
+from ssh_abduction.data.maps import DState, Fit, Pose
+from ssh_abduction.data.trace import Action, Step
+from ssh_abduction.solver.derived_paths import PRICE, best_pairings, chains_of, sides_of
+
+Point = tuple[float, float]
+TRAVEL = Action.of("travel")
+
+
+def drive(
+    points: Sequence[Point],
+    visits: Sequence[int],
+    width: float = 2.0,
+    doors: Iterable[tuple[int, int]] = (),
+    courses: dict[tuple[int, int], list[Point]] | None = None,
+) -> tuple[SSHMap, Trace]:
+    """A drive along places at points, between walls, with doors halfway of some travels."""
+    steps, states, poses, labels = [], [], [], []
+    known: dict[tuple[int, int], int] = {}
+    doors = {frozenset(door) for door in doors}
+    for t, (p, q) in enumerate(itertools.pairwise([*visits, visits[-1]])):
+        a, b = points[p], points[q]
+        if p == q:
+            heading, extra = 0.0, {}
+        else:
+            way = [a, *((courses or {}).get((p, q)) or (courses or {}).get((q, p), [])[::-1]), b]
+            heading = math.atan2(way[1][1] - a[1], way[1][0] - a[0])
+            turn = complex(math.cos(heading), -math.sin(heading))
+            off = [complex(x - a[0], y - a[1]) * turn for x, y in way[1:]]
+            length = float(np.hypot(*np.diff(np.array(way), axis=0).T).sum())
+            count = len(resampled(np.array(way), STEP))
+            door = {"at": length / 2, "width": 0.9, "side": "through"}
+            extra = {
+                "course": [[z.real, z.imag] for z in off],
+                "widths": [[width / 2, width / 2]] * count,
+                "doors": [door] if frozenset((p, q)) in doors else [],
+            }
+        key = p, round(math.degrees(heading)) % 360
+        if key not in known:
+            known[key] = len(states)
+            states.append(DState(len(states), "v", p))
+            poses.append(Pose(*a, heading))
+        labels.append(known[key])
+        last = t == len(visits) - 1
+        steps.append(Step("v", None if last else TRAVEL, extra=extra))
+    links = sorted({(a, "travel", b) for a, b in itertools.pairwise(labels)})
+    places = tuple(sorted({s.place for s in states if s.place is not None}))
+    fit = Fit(0.0, 0, 1.0, poses=tuple(poses))
+    ssh_map = SSHMap(tuple(labels), tuple(states), tuple(links), places, fit=fit)
+    return ssh_map, Trace(tuple(steps))
+
+
+def orders(ssh_map: SSHMap) -> set[tuple[int, ...]]:
+    """The orders of the paths, each from its smaller end."""
+    return {min(p.order, p.order[::-1]) for p in ssh_map.paths}
+
+
+LINE = [(0.0, 0.0), (5.0, 0.0), (10.0, 0.0), (15.0, 0.0)]
+# A corridor with a side corridor to the left at place 1, and one to the right at place 2.
+CROSS = [*LINE, (5.0, 6.0), (10.0, -6.0)]
+TOUR = [0, 1, 4, 1, 2, 5, 2, 3, 2, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("points", "visits", "expected"),
+    [
+        (LINE, [0, 1, 2, 3], {(0, 1, 2, 3)}),
+        (LINE, [3, 2, 1, 0], {(0, 1, 2, 3)}),
+        (CROSS, TOUR, {(0, 1, 2, 3), (1, 4), (2, 5)}),
+        # An L ends a path.
+        ([(0, 0), (6, 0), (6, 6)], [0, 1, 2], {(0, 1), (1, 2)}),
+        # Of three equal branches of a Y, none are paired.
+        (
+            [(0, 0), (6, 0), (-3, 5.2), (-3, -5.2)],
+            [1, 0, 2, 0, 3, 0, 1],
+            {(0, 1), (0, 2), (0, 3)},
+        ),
+        # A robot that zigzags through a wide hall is on one path.
+        ([(4.0 * k, 0.6 * (-1) ** k) for k in range(6)], [*range(6)], {(0, 1, 2, 3, 4, 5)}),
+        # A corridor that bends slowly is one path.
+        (
+            [(20 * math.sin(0.25 * k), 20 * math.cos(0.25 * k)) for k in range(7)],
+            [*range(7)],
+            {(0, 1, 2, 3, 4, 5, 6)},
+        ),
+    ],
+)
+def test_paths_go_straight_on(
+    points: list[Point], visits: list[int], expected: set[tuple[int, ...]]
+) -> None:
+    found = with_building(*drive(points, visits, width=4.0 if len(visits) == 6 else 2.0))
+    assert orders(found) == expected
+    assert all(0.5 < (path.sure or 0) <= 1 for path in found.paths)
+
+
+def test_an_offset_crossing_does_not_pair() -> None:
+    """Two corridors that meet a third one 3 m apart are two paths."""
+    points = [(0.0, 0.0), (6.0, 0.0), (9.0, 0.0), (15.0, 0.0), (6.0, 7.0), (9.0, -7.0)]
+    found = with_building(*drive(points, [0, 1, 4, 1, 2, 5, 2, 3]))
+    assert orders(found) == {(0, 1, 2, 3), (1, 4), (2, 5)}
+
+
+def test_a_travel_is_cut_where_it_passes_a_place() -> None:
+    found = with_building(*drive(CROSS, [0, 1, 4, 1, 2, 5, 2, 3, 0]))
+    assert orders(found) == {(0, 1, 2, 3), (1, 4), (2, 5)}
+
+
+def test_sides_and_mirror_images() -> None:
+    found = with_building(*drive(CROSS, TOUR))
+    (street,) = (path for path in found.paths if len(path.order) == 4)
+    forward = street.order[0] == 0
+    assert street.left == ((4,) if forward else (5,))
+    assert street.left_of(4 if forward else 5)
+    assert street.right_of(5 if forward else 4)
+    mirrored = with_building(*drive([(x, -y) for x, y in CROSS], TOUR))
+    (image,) = (path for path in mirrored.paths if len(path.order) == 4)
+    assert image.order == street.order
+    assert (image.left, image.right) == (street.right, street.left)
+
+
+def test_turned_and_backward_drives_give_the_same_paths() -> None:
+    expected = orders(with_building(*drive(CROSS, TOUR)))
+    turn = complex(math.cos(1.0), math.sin(1.0))
+    turned = [(z.real, z.imag) for x, y in CROSS for z in [complex(x, y) * turn + 3]]
+    assert orders(with_building(*drive(turned, TOUR))) == expected
+    assert orders(with_building(*drive(CROSS, [5, 2, 3, 2, 1, 4, 1, 0]))) == expected
+    renamed = [3, 1, 5, 0, 2, 4]  # the new number of each place
+    points = [CROSS[renamed.index(p)] for p in range(6)]
+    found = with_building(*drive(points, [renamed[p] for p in TOUR]))
+    new = {tuple(renamed[p] for p in order) for order in expected}
+    assert orders(found) == {min(order, order[::-1]) for order in new}
+
+
+def test_places_on_a_loop_lie_around() -> None:
+    """Ways left and right of the street 0-1-2 lead to place 3, round its end."""
+    points = [
+        (0.0, 0.0),
+        (5.0, 0.0),
+        (10.0, 0.0),
+        (5.0, 8.0),
+        (5.0, -8.0),
+        (16.0, 8.0),
+        (16.0, -8.0),
+    ]
+    found = with_building(*drive(points, [0, 1, 2, 1, 3, 5, 6, 4, 1]))
+    (street,) = (path for path in found.paths if path.order in ((0, 1, 2), (2, 1, 0)))
+    assert set(street.around) == {3, 4, 5, 6}
+    assert not street.left
+    assert not street.right
+
+
+def test_doors_cut_off_rooms_but_do_not_end_a_corridor() -> None:
+    doors = [(1, 4), (2, 5), (1, 2)]  # the last one is a fire door across the corridor
+    found = with_building(*drive(CROSS, TOUR, doors=doors))
+    assert [room.places for room in found.rooms] == [(0, 1), (2, 3), (4,), (5,)]
+    assert sorted(door.places for door in found.doors) == [(1, 2), (1, 4), (2, 5)]
+    (corridor,) = found.corridors
+    assert corridor.order in ((0, 1, 2, 3), (3, 2, 1, 0))
+    assert corridor.length == pytest.approx(15.0, abs=0.3)
+    assert len(corridor.doors) == 1
+    assert {(o.side, o.place) for o in corridor.openings} in (
+        {("left", 1), ("right", 2)},
+        {("right", 1), ("left", 2)},
+    )
+    (text,) = (line for line in told(found) if "corridor 0:" in line)
+    assert "15 m, 2.0 m wide" in text
+
+
+def test_files_keep_paths_and_buildings() -> None:
+    found = with_building(*drive(CROSS, TOUR, doors=[(1, 4)]))
+    again = SSHMap.from_dict(found.to_dict())
+    assert again.paths == found.paths
+    assert [p.line for p in again.paths] == [p.line for p in found.paths]
+    assert again.building == found.building
+    assert found.theory_paths == ()
+    new = found.renumbered()
+    assert len(new.paths) == len(found.paths)
+    assert [len(c.order) for c in new.corridors] == [len(c.order) for c in found.corridors]
+
+
+def test_near_places_are_one_junction_only_if_the_robot_drove_between_them() -> None:
+    points = [(0.0, 0.0), (5.0, 0.0), (5.6, 0.3), (10.0, 0.0), (15.0, 0.0)]
+    joined = with_building(*drive(points, [0, 1, 2, 3, 4]))
+    assert joined.building
+    assert joined.building.junctions == ((1, 2),)
+    apart = with_building(*drive(points, [0, 1, 3, 4, 3, 2, 0]))  # maybe a missed join
+    assert apart.building
+    assert apart.building.junctions == ()
+
+
+def test_maps_say_what_they_cannot_have() -> None:
+    ssh_map, trace = drive(LINE, [0, 1, 2, 3])
+    bare = Trace(tuple(replace(step, extra={}) for step in trace.steps))
+    found = with_building(ssh_map, bare)
+    assert orders(found) == {(0, 1, 2, 3)}
+    assert found.building
+    assert "no widths" in found.building.notes[0]
+    assert not found.corridors
+    for wrong, why in (
+        (replace(ssh_map, fit=None), "no poses"),
+        (with_one_place(ssh_map), "one place"),
+    ):
+        found = with_building(wrong, trace)
+        assert found.building
+        assert why in found.building.notes[0]
+        assert not found.paths
+
+
+def with_one_place(ssh_map: SSHMap) -> SSHMap:
+    """The same map, with all dstates at place 0."""
+    dstates = tuple(replace(s, place=0) for s in ssh_map.dstates)
+    return replace(ssh_map, dstates=dstates, places=(0,))
+
+
+def test_doors_are_narrow_with_wider_space_on_both_sides() -> None:
+    wide = np.full(40, 3.0)
+    wide[18:20] = 0.9
+    assert [*doors_in(wide, (1.0, 1.0))] in ([18], [19])
+    narrow = np.full(40, 1.2)  # a narrow corridor is no door
+    assert [*doors_in(narrow, (0.5, 0.5))] == []
+    wide[20:] = 0.9  # one end of a narrow corridor is no door, either
+    assert [*doors_in(wide, (1.0, 0.4))] == []
+
+
+def test_openings_are_deep_parts_of_a_wall() -> None:
+    free = np.full(60, 1.0)
+    free[20:24], free[40:55] = 3.0, 3.0  # a doorway, and a hall
+    ((at, length),) = openings_in(free)
+    assert (at, length) == (21.5, 1.0)
+
+
+def brute_force(ends: Sequence[Any], costs: dict[tuple[int, int], float]) -> float:
+    """The least cost of all pairings in which no path visits a place twice."""
+    best = math.inf
+    for count in range(len(costs) + 1):
+        for chosen in itertools.combinations(costs, count):
+            used = [e for pair in chosen for e in pair]
+            if len(set(used)) < len(used):
+                continue
+            pairing = tuple(sorted(chosen))
+            chains = chains_of(ends, pairing)
+            if sum(map(len, chains)) < len(ends) // 2:
+                continue  # a ring
+            place = {e: p for e, _, p in ends}
+            visits = [[place[c[0]], *(place[e ^ 1] for e in c)] for c in chains]
+            if all(len(set(v)) == len(v) for v in visits):
+                best = min(best, sum(costs[pair] - PRICE for pair in chosen))
+    return best
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_pairings_agree_with_brute_force(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    ends: list[tuple[int, int, int]] = []
+    for x in range(6):
+        p, q = random.choice(4, 2, replace=False).tolist()
+        ends += [(2 * x, x, p), (2 * x + 1, x, q)]
+    meeting = [
+        (e, f)
+        for (e, x, p), (f, y, q) in itertools.combinations(ends, 2)
+        if p == q and x != y and random.random() < 0.6
+    ][:9]
+    costs = {pair: round(float(random.uniform(0, 6)), 2) for pair in meeting}
+    (best,), gaps = best_pairings(ends, costs, ())
+    least = sum(costs[pair] - PRICE for pair in best)
+    assert least == pytest.approx(brute_force(ends, costs), abs=0.02)
+    assert len(gaps) == len(chains_of(ends, best))
+    assert min(gaps) >= 0
+
+
+def test_all_best_pairings_are_listed() -> None:
+    ends = [(0, 0, 7), (1, 0, 8), (2, 1, 8), (3, 1, 9), (4, 2, 8), (5, 2, 10)]
+    found, gaps = best_pairings(ends, {(1, 2): 0.5, (1, 4): 0.5, (2, 4): 4.5}, (), most=0)
+    assert found == (((1, 2),), ((1, 4),))
+    assert gaps == (0.0, 0.0)
+
+
+def test_edges_of_other_directions_are_not_on_one_path() -> None:
+    ends = [(0, 0, 7), (1, 0, 8), (2, 1, 8), (3, 1, 9)]
+    assert best_pairings(ends, {(1, 2): 0.5}, [(0, 1)])[0] == ((),)
+
+
+def test_sides_are_disjoint() -> None:
+    joined = [(5, 7), (6, 8), (7, 8)]
+    beside, around = sides_of([(0, 1), (0, 2)], [(0, 1, "left", 5), (0, 2, "right", 6)], joined)
+    assert beside == set()
+    assert around == {(0, 5), (0, 6), (0, 7), (0, 8)}
