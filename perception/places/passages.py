@@ -128,8 +128,7 @@ def doors_in(widths: Array, discs: tuple[float, float]) -> Iterator[int]:
     space.
     """
     reach = round(NEAR / STEP)
-    wide = ndimage.median_filter(widths, 3, mode="nearest")
-    wide = np.concatenate([[2 * discs[0]], wide, [2 * discs[1]]])
+    wide = np.concatenate([[2 * discs[0]], widths, [2 * discs[1]]])
     parts, count = ndimage.label(wide <= DOOR)
     for part in range(1, count + 1):
         inside = np.flatnonzero(parts == part)
