@@ -320,7 +320,7 @@ def map_log(
         """Make the result for the solution so far, with its names and notes."""
         ended = INTERRUPTED if interrupted else how_it_ended(solution, allowed)
         warnings = (*notes, ended) if ended else notes
-        solution = _built(_with_poses(solution, trace), trace)
+        solution = _with_poses(solution, trace)
         solution = solution if corrections is None else with_names(corrections, solution, trace)
         solution = solution if imported.track.is_reliable else _doubted(solution)
         return LogMap(log, imported, solution, dict(seconds), allowed, warnings, interrupted)
@@ -351,8 +351,8 @@ def _with_poses(solution: Solution, trace: Trace) -> Solution:
 
 
 def _built(solution: Solution, trace: Trace) -> Solution:
-    """Derive the paths, corridors, doors and rooms of the first map, if it has none yet."""
-    if not solution.maps or solution.maps[0].building:
+    """Derive the paths, corridors, doors and rooms of the first map."""
+    if not solution.maps:
         return solution
     first, *others = solution.maps
     return replace(solution, maps=(with_building(first, trace), *others))
