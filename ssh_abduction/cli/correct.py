@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli import shared
-from ssh_abduction.cli.outcome import warn
+from ssh_abduction.cli.outcome import keep_folder_whole, warn
 from ssh_abduction.cli.parsing import maps_path, verb
 from ssh_abduction.data.corrections import (
     ASSERTIONS,
@@ -304,11 +304,13 @@ def run_correct(options: argparse.Namespace) -> int:
         print("nothing changed: this was said before")
         return 0
     if said == before:
-        told = (*said.names, *said.pairs, *said.gateways)
+        told: tuple[Naming | Said | Passage, ...] = (*said.names, *said.pairs, *said.gateways)
         print("\n".join(printable(saved.in_words(one)) for one in told) or "nothing was said")
         return 0
     file = saved.save(said)
-    for one in (*said.pairs, *said.gateways):
+    keep_folder_whole(saved.file, "corrections")
+    now: tuple[Said | Passage, ...] = (*said.pairs, *said.gateways)
+    for one in now:
         if one not in (*before.pairs, *before.gateways):
             print(printable(saved.in_words(one)))
     warn(_unlike(saved, said, [pair for pair in said.pairs if pair not in before.pairs]))
@@ -388,6 +390,7 @@ def run_name(options: argparse.Namespace) -> int:
     saved = SavedMap.load(options.maps, options.map)
     kind, step = saved.thing_to_name(options.what)
     file = saved.save(saved.corrections.with_name(options.name, kind, step))
+    keep_folder_whole(saved.file, "names")
     number, name = saved.number_at(kind, step), options.name.strip()
     where = "" if number is None else f"{named_by_number(kind, number)}, "
     print(printable(f"{where}the {kind} of {step}, is {name!r}, in {named(file)}"))

@@ -24,7 +24,7 @@ from itertools import zip_longest
 from operator import is_not
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any, NoReturn, Self, TypeAlias
+from typing import Any, Literal, NoReturn, Self, TypeAlias
 
 from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.files import mend_of
@@ -176,6 +176,15 @@ def save_solution(solution: Solution, file: str | None) -> None:
         warn([f"{keeps}; delete it first to write the new answer, or name another file"])
     elif file is not None:
         solution.save(file)
+        keep_folder_whole(file, "maps")
+
+
+def keep_folder_whole(file: str | Path, change: Literal["names", "corrections", "maps"]) -> None:
+    """Rewrite the pages beside a file of maps, if it is in a folder that map wrote."""
+    if (Path(file).parent / "run.json").is_file():
+        from ssh_abduction.robot_logs.run_folder import bring_up_to_date  # loads scikit-learn
+
+        bring_up_to_date(Path(file), change)
 
 
 def _has_maps(file: str) -> bool:

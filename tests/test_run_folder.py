@@ -1,0 +1,72 @@
+"""A folder of map is one thing: what changes it rewrites its pages, or they say they are old."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from perception.readers.logs import read_log
+from ssh_abduction import Trace
+from ssh_abduction.cli import main
+from ssh_abduction.robot_logs.log_maps import map_log
+from ssh_abduction.robot_logs.run_folder import NOTICE, with_notice
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    log = tmp_path_factory.mktemp("logs") / "round.log"
+    assert main(["simulate", "triangle", "-o", str(log), "--set", "every=0.5"]) == 0
+    return map_log(read_log(log), name="round", work_limit=3).files()
+
+
+@pytest.fixture
+def house(made: dict[str, bytes], tmp_path: Path) -> Path:
+    for name, data in made.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path
+
+
+def notice(file: Path) -> str:
+    found = NOTICE.search(file.read_text())
+    return found[0] if found else ""
+
+
+def test_each_change_reaches_the_page_or_is_said_on_it(house: Path) -> None:
+    page, report, maps = (house / name for name in ("page.html", "report.html", "maps.json"))
+    assert notice(page) == notice(report) == ""
+    assert main(["name", str(house), "p0", "pantry"]) == 0
+    assert "pantry" in page.read_text()
+    assert notice(page) == ""
+    assert "before the last names" in notice(report)
+    assert main(["correct", str(house), "--different", "round:0,round:1"]) == 0
+    assert "before the last correction" in notice(page)
+    assert "before the last correction" in notice(report)
+    assert main(["name", str(house), "p0", "cellar"]) == 0
+    assert "before the last correction" in notice(page)  # still waits for a search
+    before = (house / "recogniser.skops").read_bytes()
+    assert main(["solve", str(house), "--theory", "causal", "-o", str(maps)]) == 0
+    assert notice(page) == ""
+    assert "page.html shows the new map" in notice(report)
+    assert report.read_text().count("made-before") == 2  # the style and one notice
+    assert json.loads((house / "run.json").read_text())["theory"]["level"] == "causal"
+    assert (house / "recogniser.skops").read_bytes() != before
+
+
+def test_other_drives_replace_the_trace_of_the_folder(house: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.jsonl"
+    Trace.from_steps("aba", ["east", "west"], name="other").save(other)
+    maps = str(house / "maps.json")
+    assert main(["solve", str(other), "--theory", "causal", "-o", maps]) == 0
+    assert len(Trace.load(house / "trace.jsonl")) == 3
+    assert not (house / "recogniser.skops").exists()
+    assert main(["show", str(house)]) == 0
+
+
+def test_notice_replaces_an_earlier_one_and_escapes() -> None:
+    page = "<body>\n<h1>map</h1>"
+    once = with_notice(page, "a < b")
+    assert "a &lt; b</p>\n<h1>map" in once
+    assert with_notice(once, "c").count("<p ") == 1
+    assert with_notice(once, "") == page
