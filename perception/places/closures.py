@@ -326,7 +326,7 @@ class _ClosureGraph:
         ]
         noise = np.array([*spreads, *[np.diag(NOISE) ** 2] * len(found)]).reshape(-1, 3, 3)
         self._whitening = np.linalg.inv(np.linalg.cholesky(noise))
-        # ClosureFinder have no way, as no drift turns a match.
+        # Closures have no way, as no drift turns a match.
         way = np.abs(np.diff(track.way[scans])) if len(visits) > 1 else np.zeros(0)
         self._way = np.array([*(way[k - 1] for k in moves), *[0.0] * len(found)])
         self._moves = len(moves)
