@@ -120,7 +120,7 @@ def import_log(
     with _timed(seconds, "places"):
         visits = known.visits if known and is_known else find_visits(log, track, width)
     found = known.closings if known and is_known else None
-    return _imported((log, track, notes), visits, width, name, seconds, found)
+    return assembled((log, track, notes), visits, found, width, name, seconds)
 
 
 def _refuse_bad(
@@ -156,15 +156,19 @@ def _refuse_bad(
     raise error
 
 
-def _imported(
+def assembled(
     tracked: Tracked,
     visits: tuple[Visit, ...],
+    closings: list[closures.VisitMatch] | None,
     width: float,
     name: str | None,
     seconds: Seconds,
-    closings: list[closures.VisitMatch] | None,
 ) -> Imported:
-    """Make the trace of the visits, and gather the result of an import. Raises LogError."""
+    """Make the trace of the visits, and gather the result of an import. Raises LogError.
+
+    `closings` are the closures of the visits; None if they are not known yet. The ranges of the log
+    are not read.
+    """
     log, track, notes = tracked
     _refuse_bad(log, track, notes, visits)
     with _timed(seconds, "trace"):

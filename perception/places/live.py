@@ -13,10 +13,12 @@ nothing.
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from pathlib import Path
 
 import numpy as np
 
@@ -26,6 +28,7 @@ from perception.places.closures import ClosureFinder, fitted_poses
 from perception.places.distinctive import WIDTH, WINDOW, Visit, VisitFinder
 from perception.places.following import Followed, Follower, GrowingTrack
 from perception.places.importing import Grown, Imported, Tell, import_log, placed, tell_nobody
+from perception.places.saved import Folder
 from perception.places.track import Array
 from perception.readers.scans import Damage, RobotLog, Scan, ScanTable
 from ssh_abduction.data.checks import a_function, a_number
@@ -42,6 +45,8 @@ MOVES, MOST = 100, 2000
 LOOKS = (200, 400, 800, 1600)
 # Visits whose fitted middles are at most this many metres apart are to one place.
 NEAR = 0.8
+# The attributes of a `LiveLog` that are saved.
+SAVED = ("width", "source", "damaged", "visits", "_follower", "_finder", "_closures")
 
 
 def import_live(
@@ -176,6 +181,7 @@ class LiveLog:
         self._scans, self._done = ScanTable(), GrowingTrack()
         self._follower = Follower(odometers.LiveJumps())
         self._finder, self._closures = VisitFinder(width), ClosureFinder(2 * WINDOW)
+        self._folder: Folder | None = None  # where the state was saved last
 
     def __len__(self) -> int:
         """The number of scans."""
@@ -256,6 +262,25 @@ class LiveLog:
             self._compare()
         return import_log(self.log, self.width, name, lambda note: self.tell([note]), self.grown())
 
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Save the state in a folder. To save there again only adds what is new. Raises OSError."""
+        if self._folder is None or self._folder.path != Path(folder):
+            self._folder = Folder(folder)
+        state = {name: getattr(self, name) for name in SAVED}
+        notes = [self.tell.notes, self.tell.kinds]
+        self._folder.save(self._scans, self._done, [state, notes])
+
+    @staticmethod
+    def load(folder: str | os.PathLike[str], tell: Tell = tell_nobody) -> LiveLog:
+        """Restore the state from a folder, to go on. Raises LogError."""
+        live = LiveLog(tell=tell)
+        live._folder = Folder(folder)
+        live._scans, live._done, (state, notes) = live._folder.load()
+        for name in SAVED:
+            setattr(live, name, state[name])
+        live.tell.notes, live.tell.kinds = notes
+        return live
+
     def _compare(self) -> None:
         """Compare the track with the odometry over the first scans."""
         if len(self._scans) > 1 and not self.tell.notes:
@@ -288,14 +313,14 @@ class Teller:
     def __init__(self, tell: Tell) -> None:
         self._tell = tell
         self.notes: list[str] = []  # the notes so far
-        self._kinds: set[str] = set()
+        self.kinds: set[str] = set()
 
     def __call__(self, notes: Iterable[str]) -> None:
         """Tell each note, unless an earlier note begins with the same words up to a number."""
         for note in notes:
             kind = re.split(r"\d", note)[0]
-            if kind not in self._kinds:
-                self._kinds.add(kind)
+            if kind not in self.kinds:
+                self.kinds.add(kind)
                 self.notes.append(note)
                 self._tell(note)
 

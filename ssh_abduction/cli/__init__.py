@@ -32,6 +32,7 @@ from ssh_abduction.cli import (
     import_log,
     judge,
     learn,
+    live_map,
     mapping,
     simulate,
     solve,
@@ -57,6 +58,7 @@ VERBS: Mapping[str, tuple[Verb, ...]] = {
     "map: find the maps of a trace or a log": (
         solve.run_solve,
         mapping.run_map,
+        live_map.run_live,
         import_log.run_import,
         learn.run_cluster,
     ),

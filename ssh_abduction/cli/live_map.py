@@ -1,0 +1,102 @@
+"""ssh-abduction live: map a building while the robot drives, from ROS 2 or from a log."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ssh_abduction.cli import import_log
+from ssh_abduction.cli.outcome import StopFlag, warn
+from ssh_abduction.cli.parsing import verb
+from ssh_abduction.cli.text import counted
+from ssh_abduction.data.errors import AbductionError, named
+
+if TYPE_CHECKING:
+    from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper
+
+# A pause of the robot in a log is replayed for at most this many seconds.
+PAUSE = 1.0
+
+
+def positive(text: str) -> float:
+    """Convert text to a positive number. Raise ArgumentTypeError for anything else."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a positive number, got {text!r}")
+    return value
+
+
+@verb(
+    {
+        "--replay LOG": f"replay a log instead of listening to ROS 2: {import_log.LOG_SAID}",
+        "--speed X": (
+            "replay this many times as fast as the robot drove (default: as fast as possible)",
+            {"type": positive},
+        ),
+        "--save FOLDER": (
+            "folder to save the state to, each second, with the files of the last map; if it has a "
+            "state, the drive goes on from there"
+        ),
+        "--work W": (
+            "units of work for each search, each about a second of a quiet core (default: 5)",
+            {"type": positive, "default": 5.0},
+        ),
+        **import_log.READING,
+    }
+)
+def run_live(options: argparse.Namespace) -> int:
+    """Map a building while the robot drives.
+
+    Take laser scans one at a time. Say when a place is new, moved, or joined with another one. The
+    map follows in another process.
+    """
+    from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper
+
+    folder = None if options.save is None else Path(options.save)
+    if folder is not None:
+        import_log.check_folder(folder)
+    tell = lambda note: warn([note])  # noqa: E731
+    if folder is not None and OnlineLogMapper.is_saved(folder):
+        mapper = OnlineLogMapper.load(folder, tell)
+        print(f"{named(folder)}: the drive goes on after {counted(len(mapper), 'scans')}")
+    else:
+        mapper = OnlineLogMapper(options.width or import_log.WIDTH, tell)
+    session = LiveSession(mapper, folder, lambda line: print(line, flush=True), options.work)
+    if options.replay is None:
+        raise AbductionError("live: expected --replay LOG; give the file of a log")
+    _replay(options, session)
+    _say_map(mapper)
+    return 0
+
+
+def _replay(options: argparse.Namespace, session: LiveSession) -> None:
+    """Give the scans of a log to a session, as fast as asked for. Ctrl-C ends the log."""
+    log = import_log.read(options.replay, options)
+    for warning in log.warnings:
+        warn([warning])
+    due, last = time.monotonic(), None
+    with import_log.until_ctrl_c(iter(log.scans[len(session.mapper) :]), StopFlag()) as scans:
+        for scan in scans:
+            if options.speed and last is not None and scan.time is not None:
+                due += min(max(scan.time - last, 0.0), PAUSE) / options.speed
+                time.sleep(max(0.0, due - time.monotonic()))
+            last = scan.time
+            session.take(scan)
+            session.tick()
+        session.end()
+
+
+def _say_map(mapper: OnlineLogMapper) -> None:
+    """Print the places of the last map."""
+    found = mapper.to_dict()
+    for place in found["places"]:
+        name = f" ({place['name']})" if place["name"] else ""
+        print(f"place {place['place']}{name} at ({place['x']:.1f}, {place['y']:.1f}) m")
+    places = counted(len(found["places"]), "places")
+    visits = counted(found["visits"], "visits")
+    print(f"{places} after {counted(found['scans'], 'scans')} and {visits}: {found['said']}")

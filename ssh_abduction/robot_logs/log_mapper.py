@@ -1,0 +1,476 @@
+"""Keeps the map of a building while a robot drives: laser scans come one at a time.
+
+There are three tiers. `observe` takes a scan in bounded time. `task` matches the new visits with
+earlier ones, and gathers what a search needs. `solved` searches for the map, which may take long
+and may run in another process; `accept` takes its result.
+
+Places have numbers that last. A number never moves to another place. If a search joins two places,
+the place keeps the older number. If a later search takes that back, the younger number returns.
+
+The result of `finish` is that of `import_log` for the whole log.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import LogError
+from perception.places.distinctive import WIDTH, Visit
+from perception.places.importing import Grown, Imported, Tell, assembled, tell_nobody
+from perception.places.live import LiveLog, LivePlace
+from perception.readers.scans import RobotLog, Scan
+from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.errors import named
+from ssh_abduction.data.files import json_line, mend_of, parse_json, read_file, write_file
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
+from ssh_abduction.data.words import counted
+from ssh_abduction.evaluation.rungs import UnderWay
+from ssh_abduction.page.html import view_page
+from ssh_abduction.robot_logs.log_maps import BARE
+from ssh_abduction.solver import LimitError, Watch, in_process
+
+NAMES = "drive.names"
+FORMAT, VERSION, MOST = "ssh-live-names", 1, 2**26
+# The standard deviation of the position of the robot relative to a known place: metres, and metres
+# for each metre driven since the last visit that the map has.
+NEAR, DRIFT = 0.5, 0.02
+# The robot is at no place if all places are farther away than this many metres.
+AWAY = 1.5
+# A place has moved if its middle is this many metres from where it was.
+MOVED = 1.0
+EVERY = 1.0  # seconds from saving to saving
+POLL = 0.2  # seconds to wait for a search
+# Units of work of a search, each about a second of a quiet core.
+WORK = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class RobotSeen:
+    """What the mapper knows after a scan.
+
+    Attributes:
+        pose: The pose of the robot on the track: x, y in metres and heading in radians.
+        on_map: Its pose on the last map; None without a map.
+        belief: The probability that the robot is at each place, by its number. The rest is the
+            probability that it is at none.
+        visits: The visits that are final now.
+    """
+
+    pose: Pose
+    on_map: Pose | None
+    belief: Mapping[int, float]
+    visits: tuple[Visit, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A change of the map.
+
+    Attributes:
+        kind: "new", "joined", "retracted" or "moved".
+        place: The number of the place.
+        other: For "joined", the number that is no longer used. For "retracted", the number of the
+            place that it was joined with.
+    """
+
+    kind: str
+    place: int
+    other: int | None = None
+
+    def __str__(self) -> str:
+        other = {"joined": f" with place {self.other}", "retracted": f" from place {self.other}"}
+        said = {"new": "is new", "retracted": "is apart again"}.get(self.kind, f"was {self.kind}")
+        return f"place {self.place} {said}{other.get(self.kind, '')}"
+
+
+@dataclass(frozen=True, eq=False)
+class MapTask:
+    """All that the search for a map needs."""
+
+    log: RobotLog  # without ranges
+    grown: Grown
+    width: float
+    work: float
+
+
+@dataclass(frozen=True, eq=False)
+class FoundMap:
+    """The result of a search.
+
+    Attributes:
+        scans: The scan of each visit.
+        places: The number of the place of each visit in this map.
+        poses: (n, 3) the fitted pose of each visit: the middle of its place in metres, and by how
+            many radians the track is turned there.
+        middles: (n, 2) the middle of each visit by the track, in metres.
+        said: How good the map is: its status and its probability.
+        files: The files of the map, by name.
+    """
+
+    scans: tuple[int, ...]
+    places: tuple[int, ...]
+    poses: np.ndarray[Any, np.dtype[np.float64]]
+    middles: np.ndarray[Any, np.dtype[np.float64]]
+    said: str
+    files: Mapping[str, bytes]
+
+
+def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
+    """Search for the map of a task. Return None if there is none, or nothing to map yet.
+
+    The watch is that of `in_process`, which stops the process of the search.
+    """
+    grown = task.grown
+    try:
+        done = assembled(
+            (task.log, grown.track, ()), grown.visits, grown.closings, task.width, "live", {}
+        )
+    except LogError:  # the robot hardly moved
+        return None
+    solution = UnderWay().solve(done.trace, BARE, time_limit=None, max_maps=1, work_limit=task.work)
+    if not solution.maps:
+        return None
+    ssh_map = solution.maps[0]
+    first = {int(step.extra["visit"]): t for t, step in reversed([*enumerate(done.trace.steps)])}
+    places = (ssh_map.dstates[ssh_map.dstate_at[first[k]]].place for k in range(len(done.visits)))
+    parts = [solution.status.value, solution.weighed and solution.weighed.sentence]
+    files = {
+        "trace.jsonl": "".join(f"{line}\n" for line in done.trace.to_lines()).encode(),
+        "maps.json": f"{json_line(solution.to_dict())}\n".encode(),
+        "page.html": view_page(solution, done.trace).html.encode(),
+    }
+    return FoundMap(
+        tuple(visit.scan for visit in done.visits),
+        tuple(-1 if place is None else place for place in places),
+        done.poses,
+        np.array([visit.middle for visit in done.visits]).reshape(-1, 2),
+        ", ".join(part for part in parts if part),
+        files,
+    )
+
+
+@dataclass
+class _Names:
+    """The lasting numbers of places.
+
+    The first visit to a place founds its number. Wherever this visit is, there is the number. If a
+    place has the founders of several numbers, it has the oldest number, and the others rest.
+    """
+
+    founders: list[int] = field(default_factory=list)  # the scan of the visit that founded each
+    resting: dict[int, int] = field(default_factory=dict)  # a number that rests, and the one in use
+    place_of: dict[int, int] = field(default_factory=dict)  # by the scan of the visit
+    middles: dict[int, tuple[float, float]] = field(default_factory=dict)  # metres, on the map
+    texts: dict[int, str] = field(default_factory=dict)  # the names that a person gave
+    anchor: tuple[Pose, Pose] | None = None  # a pose on the track, and the same on the map
+
+    def update(self, found: FoundMap) -> list[Event]:
+        """Number the places of a map, and say what changed."""
+        number_of, resting = dict[int, int](), dict[int, int]()
+        for number, scan in enumerate(self.founders):
+            # Later scans may move a visit a little.
+            visit = min(range(len(found.scans)), key=lambda k: abs(found.scans[k] - scan))
+            used = number_of.setdefault(found.places[visit], number)
+            resting |= {} if used == number else {number: used}
+        events = [Event("joined", used, n) for n, used in resting.items() if n not in self.resting]
+        events += [
+            Event("retracted", n, used) for n, used in self.resting.items() if n not in resting
+        ]
+        visits: dict[int, list[int]] = {}
+        for k, (scan, place) in enumerate(zip(found.scans, found.places, strict=True)):
+            if place not in number_of:
+                number_of[place] = len(self.founders)
+                events.append(Event("new", number_of[place]))
+                self.founders.append(scan)
+            visits.setdefault(number_of[place], []).append(k)
+        before, self.resting = self.middles, resting
+        self.place_of = {found.scans[k]: number for number, some in visits.items() for k in some}
+        means = {n: found.poses[some, :2].mean(axis=0).tolist() for n, some in visits.items()}
+        self.middles = {number: (x, y) for number, (x, y) in means.items()}
+        events += [
+            Event("moved", number)
+            for number, middle in self.middles.items()
+            if number in before and math.dist(before[number], middle) > MOVED
+        ]
+        (ahead, left), (x, y, turn) = found.middles[-1].tolist(), found.poses[-1].tolist()
+        self.anchor = (ahead, left, 0.0), (x, y, turn)
+        return events
+
+
+class OnlineLogMapper:
+    """Keeps the track, the visits and the map of a drive while its scans come.
+
+    Args:
+        width: The width of the robot in metres. It cannot pass narrower parts of the free space.
+        tell: A function that gets each note on suspicious odometry, at once.
+
+    Attributes:
+        live: The scans, the track, the visits and the closures so far.
+        said: How good the last map is; empty without a map.
+
+    Raises:
+        LogError: An argument is invalid.
+
+    Example:
+        >>> from ssh_abduction.robot_logs.log_mapper import OnlineLogMapper
+        >>> mapper = OnlineLogMapper(width=0.5)
+        >>> mapper.places()
+        []
+    """
+
+    def __init__(self, width: float = WIDTH, tell: Tell = tell_nobody) -> None:
+        self.live = LiveLog(width, tell)
+        self.said = ""
+        self._names = _Names()
+        self._asked = 0  # the number of final visits at the last task
+        self._way = 0.0  # metres since the anchor
+        self._last: Pose | None = None
+
+    def __len__(self) -> int:
+        """The number of scans."""
+        return len(self.live)
+
+    def observe(self, scan: Scan) -> RobotSeen:
+        """Add the next scan, with odometry in metres and radians, in bounded time.
+
+        Raises LogError if it is no Scan.
+        """
+        an_instance("scan", scan, Scan, LogError, mend="give a Scan of perception.readers.scans")
+        one, visits = self.live.add(scan)
+        self._way += math.dist(self._last[:2], one.pose[:2]) if self._last else 0.0
+        self._last = one.pose
+        on_map = self._on_map(one.pose)
+        return RobotSeen(one.pose, on_map, self._belief(on_map), tuple(visits))
+
+    def _on_map(self, pose: Pose) -> Pose | None:
+        if self._names.anchor is None:
+            return None
+        on_track, on_map = self._names.anchor
+        return moved(on_map, displacement_between(on_track, pose))
+
+    def _belief(self, pose: Pose | None) -> dict[int, float]:
+        if pose is None:
+            return {}
+        spread = NEAR + DRIFT * self._way
+        near = {
+            place: math.exp(-(math.dist(middle, pose[:2]) ** 2) / (2 * spread**2))
+            for place, middle in self._names.middles.items()
+        }
+        total = sum(near.values()) + math.exp(-(AWAY**2) / (2 * NEAR**2))
+        found = {place: p / total for place, p in near.items() if p / total > 0.01}
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    def places(self) -> list[LivePlace]:
+        """The places that the robot passed, by fitted poses, without a search."""
+        return self.live.places()
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a visit became final since the last task."""
+        return len(self.live.visits) > self._asked
+
+    def task(self, work: float = WORK) -> MapTask:
+        """Gather what `solved` needs to search for a map, with this many units of work.
+
+        New visits are matched with earlier ones first.
+        """
+        self._asked = len(self.live.visits)
+        nothing = np.zeros(0)
+        scans = tuple(replace(scan, ranges=nothing) for scan in self.live.log.scans)
+        return MapTask(RobotLog(scans), self.live.grown(), self.live.width, work)
+
+    def accept(self, found: FoundMap | None) -> list[Event]:
+        """Take the result of `solved`, and return what changed."""
+        if found is None:
+            return []
+        events = self._names.update(found)
+        self.said, self._way = found.said, 0.0
+        return events
+
+    def name(self, place: int, text: str) -> None:
+        """Name a place by its number. Raises LogError if there is none of this number."""
+        if place not in self._names.middles:
+            raise LogError(
+                f"place: expected one of {counted(len(self._names.middles), 'places')}, got "
+                f"{place}; take a number of the map"
+            )
+        self._names.texts[place] = text
+
+    def to_dict(self) -> dict[str, Any]:
+        """The map so far as plain data: places by number, edges, and the pose of the robot."""
+        names, order = self._names, sorted(self._names.place_of.items())
+        travels = {tuple(sorted((a, b))) for (_, a), (_, b) in itertools.pairwise(order)}
+        return {
+            "places": [
+                {"place": place, "x": round(x, 2), "y": round(y, 2), "name": names.texts.get(place)}
+                for place, (x, y) in sorted(names.middles.items())
+            ],
+            "edges": sorted(pair for pair in travels if pair[0] != pair[1]),
+            "scans": len(self.live),
+            "visits": len(self.live.visits),
+            "said": self.said,
+        }
+
+    def finish(self, name: str | None = None) -> Imported:
+        """Import the log so far, as `import_log` does. Raises LogError as it does."""
+        return self.live.finish(name)
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Save the state in a folder. To save there again only adds what is new. Raises OSError."""
+        self.live.save(folder)
+        names = {"format": FORMAT, "version": VERSION, "said": self.said, **asdict(self._names)}
+        write_file(Path(folder) / NAMES, json_line(names).encode())
+
+    @staticmethod
+    def is_saved(folder: str | os.PathLike[str]) -> bool:
+        """Whether a folder has the state of a drive."""
+        return (Path(folder) / NAMES).exists()
+
+    @staticmethod
+    def load(folder: str | os.PathLike[str], tell: Tell = tell_nobody) -> OnlineLogMapper:
+        """Restore the state from a folder, to go on. Raises LogError."""
+        mapper = OnlineLogMapper(tell=tell)
+        mapper.live = LiveLog.load(folder, tell)
+        file = Path(folder) / NAMES
+        data = parse_json(read_file(file, MOST, "the names of places", LogError))
+        if (data.pop("format", None), version := data.pop("version", None)) != (FORMAT, VERSION):
+            raise LogError(
+                f"{named(file)}: expected names of version {VERSION}, got {version}; move the "
+                "folder away, and start anew"
+            )
+        mapper.said = data.pop("said")
+        for field_name, value in data.items():
+            by_number = isinstance(value, dict)
+            kept = {int(key): one for key, one in value.items()} if by_number else value
+            setattr(mapper._names, field_name, kept)
+        return mapper
+
+
+class MapSearch:
+    """Searches for maps in another process, one at a time. It ends with this program."""
+
+    def __init__(self) -> None:
+        self._thread: threading.Thread | None = None
+        self._watch, self._found = Watch(None), list[FoundMap | None]()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a search runs, or its result was not taken yet."""
+        return self._thread is not None
+
+    def begin(self, task: MapTask) -> None:
+        """Begin a search. None may be busy."""
+        assert self._thread is None
+        self._watch, self._found = Watch(None), []
+
+        def search() -> None:
+            with suppress(LimitError):  # the search was ended
+                self._found.append(in_process(solved, task, watch=self._watch))
+
+        self._thread = threading.Thread(target=search, daemon=True)
+        self._thread.start()
+
+    def taken(self, wait: float = 0.0) -> FoundMap | None:
+        """Take the result, if there is one within `wait` seconds; None if there is none."""
+        if self._thread is None:
+            return None
+        self._thread.join(wait)
+        if self._thread.is_alive():
+            return None
+        self._thread = None
+        return self._found[0] if self._found else None
+
+    def end(self) -> None:
+        """End the search, and its process."""
+        if self._thread is not None:
+            self._watch.interrupted = True
+            self._thread.join()
+            self._thread = None
+
+
+class LiveSession:
+    """A drive that is mapped, saved and told about while it goes on.
+
+    Args:
+        mapper: The mapper, which may have a saved state.
+        folder: The folder to save to each second, with the files of the last map; None for none.
+        say: A function that takes a line about what happened.
+        work: Units of work for each search, each about a second of a quiet core.
+    """
+
+    def __init__(
+        self, mapper: OnlineLogMapper, folder: Path | None, say: Tell, work: float = WORK
+    ) -> None:
+        self.mapper, self.folder, self.work = mapper, folder, work
+        self.seen: RobotSeen | None = None
+        self.maps = 0  # the number of maps so far
+        self._say, self._search, self._saved, self._failed = say, MapSearch(), 0.0, False
+
+    def take(self, scan: Scan) -> RobotSeen:
+        """Add the next scan."""
+        self.seen = self.mapper.observe(scan)
+        return self.seen
+
+    def tick(self, wait: float = 0.0) -> bool:
+        """Do what is due: take a map, begin a search, save. Return whether there is a new map."""
+        found = self._search.taken(wait)
+        if found is not None:
+            for event in self.mapper.accept(found):
+                self._say(str(event))
+            self.maps += 1
+            self._keep(found.files)
+        if self.mapper.is_due and not self._search.is_busy:
+            self._search.begin(self.mapper.task(self.work))
+        if time.monotonic() - self._saved > EVERY:
+            self.save()
+        return found is not None
+
+    def save(self) -> None:
+        """Save the state. If the folder cannot be written, say so once."""
+        self._saved = time.monotonic()
+        if self.folder is not None and len(self.mapper):
+            with self._told():
+                self.mapper.save(self.folder)
+
+    def end(self) -> None:
+        """Search for the map of the whole drive, and save all. Ctrl-C ends the search."""
+        try:
+            if len(self.mapper):
+                self._search.end()
+                self._search.begin(self.mapper.task(self.work))
+                while self._search.is_busy:
+                    self.tick(POLL)
+        finally:
+            self._search.end()
+            self.save()
+
+    def _keep(self, files: Mapping[str, bytes]) -> None:
+        if self.folder is not None:
+            with self._told():
+                self.folder.mkdir(parents=True, exist_ok=True)
+                for name, data in files.items():
+                    write_file(self.folder / name, data)
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+            self._failed = False
+        except OSError as error:
+            if not self._failed:
+                self._say(
+                    f"{named(self.folder)}: cannot be written: {error.strerror}; the map goes on "
+                    f"in memory; {mend_of(error)}"
+                )
+            self._failed = True

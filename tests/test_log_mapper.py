@@ -1,0 +1,167 @@
+"""A map grows while a robot drives: saved, restored, with numbers of places that last."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from coarse import every_second_beam, hall
+
+from perception.errors import LogError
+from perception.places.importing import import_log
+from perception.places.saved import SCANS, STATE
+from perception.readers.scans import RobotLog, Scan
+from perception.readers.writers import write_carmen
+from ssh_abduction.cli import main
+from ssh_abduction.robot_logs.log_mapper import (
+    Event,
+    FoundMap,
+    LiveSession,
+    OnlineLogMapper,
+    RobotSeen,
+    solved,
+)
+
+
+@pytest.fixture(scope="module")
+def scans() -> tuple[Scan, ...]:
+    """A drive of a tour through a hall, a scan of 90 beams every half metre."""
+    return every_second_beam(hall(every=0.5)[:100])
+
+
+@pytest.fixture(scope="module")
+def house(scans: tuple[Scan, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the state after 60 scans. Its program was killed while it wrote more."""
+    folder = tmp_path_factory.mktemp("live") / "house"
+    mapper = OnlineLogMapper()
+    for i, scan in enumerate(scans[:60]):
+        mapper.observe(scan)
+        if i in (20, 59):
+            mapper.save(folder)
+    with (folder / SCANS).open("ab") as file:
+        file.write(b"half a row")
+    return folder
+
+
+def test_saved_drive_goes_on_as_if_it_had_not_ended(scans: tuple[Scan, ...], house: Path) -> None:
+    mapper = OnlineLogMapper.load(house)
+    assert len(mapper) == 60
+    for scan in scans[60:]:
+        mapper.observe(scan)
+    done, whole = mapper.finish(), import_log(RobotLog(scans))
+    assert done.trace.steps == whole.trace.steps
+    assert done.trace.closures == whole.trace.closures
+    assert done.poses.tolist() == whole.poses.tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda data: data.replace(b'"version": 1', b'"version": 9'), "of version 1, got 9"),
+        (lambda data: b"something", "of version 1, got another file"),
+        (lambda data: data[:-5], "got a damaged file"),
+        (None, "No such file"),
+    ],
+)
+def test_other_states_are_refused(
+    change: object, told: str, house: Path, tmp_path: Path, scans: tuple[Scan, ...]
+) -> None:
+    for file in house.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    state = tmp_path / STATE
+    if callable(change):
+        state.write_bytes(change(state.read_bytes()))
+    else:
+        state.unlink()
+    with pytest.raises(LogError, match=told):
+        OnlineLogMapper.load(tmp_path)
+
+
+def test_search_gives_a_map_and_a_belief(scans: tuple[Scan, ...]) -> None:
+    mapper = OnlineLogMapper()
+    for scan in scans[:99]:
+        assert not mapper.observe(scan).belief
+    assert mapper.is_due
+    events = mapper.accept(solved(mapper.task(work=1.0)))
+    assert [event.kind for event in events] == ["new"] * len(events)
+    assert {place["place"] for place in mapper.to_dict()["places"]} == set(range(len(events)))
+    assert not mapper.is_due
+    seen = mapper.observe(scans[99])
+    assert isinstance(seen, RobotSeen)
+    assert seen.on_map is not None
+    assert sum(seen.belief.values()) <= 1.0
+
+
+def found(*places: int, x: float = 0.0) -> FoundMap:
+    """A map of visits at scans 0, 10, … to these places, with place n at (10 n + x, 0)."""
+    poses = np.array([(10.0 * place + x, 0.0, 0.0) for place in places])
+    scans = tuple(10 * k for k in range(len(places)))
+    return FoundMap(scans, places, poses, poses[:, :2], "feasible", {})
+
+
+@pytest.mark.parametrize(
+    ("maps", "numbers", "events"),
+    [
+        # A map may number its places anew: the places keep their numbers.
+        ([found(0, 1, 0), found(1, 0, 1, 2)], [0, 1, 0, 2], [Event("new", 2)]),
+        # Of two places that are joined, the older number stays.
+        ([found(0, 1, 1), found(5, 5, 5)], [0, 0, 0], [Event("joined", 0, 1), Event("moved", 0)]),
+        # A join that is taken back: the number that rested returns.
+        (
+            [found(0, 1, 1), found(0, 0, 0), found(0, 1, 1)],
+            [0, 1, 1],
+            [Event("retracted", 1, 0)],
+        ),
+        # The visits since a join do not take the number along.
+        (
+            [found(0, 1), found(0, 0, 0, 0), found(0, 1, 1, 1)],
+            [0, 1, 1, 1],
+            [Event("retracted", 1, 0)],
+        ),
+        # A number that rests is not given to another place.
+        ([found(0, 1), found(0, 0), found(0, 0, 1)], [0, 0, 2], [Event("new", 2)]),
+        ([found(0, 1), found(0, 1, x=3.0)], [0, 1], [Event("moved", 0), Event("moved", 1)]),
+    ],
+)
+def test_numbers_of_places_last(
+    maps: list[FoundMap], numbers: list[int], events: list[Event]
+) -> None:
+    mapper = OnlineLogMapper()
+    for one in maps:
+        said = mapper.accept(one)
+    last = mapper._names.place_of
+    assert [last[10 * k] for k in range(len(numbers))] == numbers
+    assert [event for event in said if event in events] == events
+
+
+def test_folder_that_cannot_be_written_is_told_once(
+    scans: tuple[Scan, ...], tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    said: list[str] = []
+    session = LiveSession(OnlineLogMapper(), tmp_path / "file" / "house", said.append)
+    for scan in scans[:3]:
+        session.take(scan)
+        session.save()
+    (line,) = said
+    assert "cannot be written" in line
+
+
+@pytest.mark.slow
+def test_replayed_log_is_mapped_and_goes_on(
+    scans: tuple[Scan, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_carmen(tmp_path / "a.log", [replace(scan, corrected=None) for scan in scans[:50]])
+    house = str(tmp_path / "house")
+    call = ["live", "--replay", str(tmp_path / "a.log"), "--save", house, "--work", "0.1"]
+    assert main(call) == 0
+    first = capsys.readouterr().out
+    assert "place 0 is new" in first
+    assert "places after 50 scans" in first
+    assert {"maps.json", "page.html", "trace.jsonl"} <= {
+        file.name for file in Path(house).iterdir()
+    }
+    assert main(call) == 0
+    assert "the drive goes on after 50 scans" in capsys.readouterr().out
