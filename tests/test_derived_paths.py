@@ -231,11 +231,10 @@ def with_one_place(ssh_map: SSHMap) -> SSHMap:
 def test_doors_are_narrow_with_wider_space_on_both_sides() -> None:
     wide = np.full(40, 3.0)
     wide[18:20] = 0.9
-    assert [*doors_in(wide, (1.0, 1.0))] in ([18], [19])
-    narrow = np.full(40, 1.2)  # a narrow corridor is no door
-    assert [*doors_in(narrow, (0.5, 0.5))] == []
-    wide[20:] = 0.9  # one end of a narrow corridor is no door, either
-    assert [*doors_in(wide, (1.0, 0.4))] == []
+    assert [*doors_in(wide)] == [18]
+    assert [*doors_in(np.full(40, 1.2))] == []  # a narrow corridor is no door
+    wide[20:] = 0.9  # nor is one end of a narrow corridor
+    assert [*doors_in(wide)] == []
 
 
 def test_openings_are_deep_parts_of_a_wall() -> None:

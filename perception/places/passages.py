@@ -28,6 +28,7 @@ WIDE, ALONG = 4.0, 0.3
 # A door is at most DOOR metres wide. Within NEAR metres before and behind it, the free space is
 # wider by WIDER metres.
 DOOR, NEAR, WIDER = 1.45, 2.0, 0.4
+SAME = 0.05  # widths that differ by less than this, in metres, are equal
 # A part of a wall is an opening if there the free space reaches DEEP metres farther than beside it,
 # over a length from LEAST to MOST metres. Beside it means within BESIDE metres.
 DEEP, LEAST, MOST, BESIDE = 0.6, 0.5, 1.8, 2.5
@@ -76,9 +77,12 @@ class Passages:
         if len(way) < 2:
             return {}
         walls, free = self._beside(way, first.scan, last.scan)
+        before = self._beyond(way[::-1], first.scan)[::-1]
+        wide = np.concatenate([before, walls, self._beyond(way, last.scan)]).sum(axis=1)
         through = [
             {"at": round(k * STEP, 2), "width": round(float(walls[k].sum()), 2), "side": "through"}
-            for k in doors_in(walls.sum(axis=1), (first.radius, last.radius))
+            for k in (k - len(before) for k in doors_in(wide))
+            if 0 < k < len(way) - 1
         ]
         aside = [
             {"at": round(at * STEP, 2), "width": round(length, 2), "side": side}
@@ -87,12 +91,26 @@ class Passages:
         ]
         return {"widths": np.round(walls, 2).tolist(), "doors": through + aside}
 
+    def _beyond(self, way: Array, scan: int) -> Array:
+        """Measure the widths straight on beyond the end of a way, up to NEAR metres or a wall."""
+        ahead = directions(way)[-1]
+        more = way[-1] + np.arange(1, round(NEAR / STEP) + 1)[:, None] * STEP * ahead
+        patch = self._maps.around(self._near(scan), way[-1], WIDE + NEAR)
+        cells = np.rint((more - patch.corner) / CELL).astype(int)
+        open_ = patch.free[cells[:, 0], cells[:, 1]]
+        more = more[: len(more) if open_.all() else int(np.argmin(open_))]
+        return self._beside(np.concatenate([way[-1:], more]), scan, scan)[0][1:]
+
+    def _near(self, scan: int) -> int:
+        """The index of the chosen scan that is next to a scan."""
+        return int(np.abs(self._chosen - scan).argmin())
+
     def _beside(self, way: Array, begin: int, end: int) -> tuple[Array, Array]:
         """Measure how far walls, and the free space, reach left and right: (n, 2) each."""
         ahead = directions(way)
         walls, free = np.full((len(way), 2), WIDE), np.zeros((len(way), 2))
         scans = self._chosen[(self._chosen >= begin) & (self._chosen <= end)]
-        scans = scans if len(scans) else self._chosen[[np.abs(self._chosen - begin).argmin()]]
+        scans = scans if len(scans) else self._chosen[[self._near(begin)]]
         stretch = round(STRETCH / STEP)
         for first in range(0, len(way), stretch):
             points = way[first : first + stretch]
@@ -121,21 +139,19 @@ def directions(way: Array) -> Array:
     return np.asarray(off / np.maximum(np.hypot(*off.T), 1e-6)[:, None])
 
 
-def doors_in(widths: Array, discs: tuple[float, float]) -> Iterator[int]:
-    """Yield the points of a course, STEP metres apart, at which it passes a door.
+def doors_in(wide: Array) -> Iterator[int]:
+    """Yield the points of a course at which it passes a door.
 
-    `discs` has the radii, in metres, of the places at both ends, where the course ends in free
-    space.
+    `wide` has the free space across the course, (n,) metres, every STEP metres.
     """
     reach = round(NEAR / STEP)
-    wide = np.concatenate([[2 * discs[0]], widths, [2 * discs[1]]])
     parts, count = ndimage.label(wide <= DOOR)
     for part in range(1, count + 1):
         inside = np.flatnonzero(parts == part)
-        k = int(inside[np.abs(wide[inside] - wide[inside].min()) < 0.05].mean())
-        before, behind = wide[max(0, k - reach) : k], wide[k + 1 : k + 1 + reach]
-        if 0 < k < len(wide) - 1 and min(before.max(), behind.max()) >= wide[k] + WIDER:
-            yield k - 1
+        k = int(inside[wide[inside] < wide[inside].min() + SAME].mean())
+        sides = wide[max(0, k - reach) : k], wide[k + 1 : k + 1 + reach]
+        if min(side.max(initial=0.0) for side in sides) >= wide[k] + WIDER:
+            yield k
 
 
 def openings_in(free: Array) -> Iterator[tuple[float, float]]:
