@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from ssh_abduction.data.checks import an_instance
@@ -35,22 +34,19 @@ from ssh_abduction.data.star import with_gateway
 from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import noun_of
-from ssh_abduction.runtime.clock import counting, each_heeding, heeding
+from ssh_abduction.runtime.clock import counting, each_heeding
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
-from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.onto import Solving, joint_with, solve_onto
 from ssh_abduction.solver.parts import Limits, Start
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.solution.result import Solution
-from ssh_abduction.solver.solution.sharing import Backbone, Sharing
-from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine, may_name
+from ssh_abduction.solver.solution.sharing import Backbone
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.exact.prefixes import prove_backbone
 from ssh_abduction.solver.values import Found, Progress
 from ssh_abduction.theory.evidence.of_steps import are_alike
-from ssh_abduction.theory.settle import Problem, settle
-from ssh_abduction.theory.speedups import ALL, Speedups, row
+from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.speedups import ALL, Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 _log = log_of(__name__)
@@ -178,9 +174,9 @@ def find_backbone(
 ) -> Backbone | None:
     """Find the backbone: what all minimal maps share, also those that the solution does not list.
 
-    Clingo looks for minimal maps that do not share what all known ones share, until it has proven
-    that there are none. That may take as long as the search did. If the solution already has a
-    proven backbone, or has no minimal map, its backbone is returned at once.
+    The trace is solved again. Then clingo looks for minimal maps that do not share what all known
+    ones share, until it has proven that there are none. If the solution already has a proven
+    backbone, or has no minimal map, its backbone is returned at once.
 
     >>> from ssh_abduction import Theory, Trace, solve
     >>> solution = solve(Trace.load("examples/aces3-route.jsonl")[:16], max_maps=1)
@@ -213,28 +209,20 @@ def find_backbone(
         raise SolverError("trace: expected the trace that was solved, got none; give it")
     views = "functional_view" in solution.theory.hard
     check_of_trace(minimal, trace, "solution", views=views)
-    sharing = Sharing(minimal)
-    watch = Watch(time_limit, memory_limit, work=work_limit)
-    watch.start()
-    cost, proven = solution.costs[0].preferred_by(solution.theory), False
-    with (
-        suppress(LimitError, KeyboardInterrupt),
-        counting(watch.counts_work),
-        heeding(watch.check),
-    ):
-        task = Task.of(Problem.of(trace, solution.theory), watch)
-        mends = row("mending").holds_for(task.theory) and may_name(task)
-        if mends and len(task.trace) > READABLE:  # no engine finds the maps of such a search
-            return known
-        # A search that needed only a prefix used no engine that finds dstates first.
-        is_whole = solution.effort.prefix == solution.steps
-        engine = labelling_engine(task, solution.maps[0].dstate_at if is_whole else ())
-        engine.grow(solution.effort.prefix)
-        judging = Judging(task.problem)
-        proven = prove_backbone(task, judging, cost, sharing, engine)
-    # The search may have seen more maps than the solution holds.
-    has_learnt = proven or sharing.maps > len(minimal)
-    return replace(sharing.backbone(proven=proven), drives=known.drives) if has_learnt else known
+    search = Search(
+        trace,
+        solution.theory,
+        time_limit=time_limit,
+        memory_limit=memory_limit,
+        work_limit=work_limit,
+        max_maps=1,
+        _start=Start(reasons=True, known=minimal),
+    )
+    cost = solution.costs[0].preferred_by(solution.theory)
+    for ssh_map in minimal:
+        search.parts.rivals.add(ssh_map, cost)
+    found = search.solution(tuple(search.unranked())).backbone
+    return found and replace(found, drives=known.drives)
 
 
 @dataclass(frozen=True)
