@@ -35,7 +35,7 @@ many rules. So they are added only for paths that an answer contradicts.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing
 from itertools import chain, islice
 
@@ -71,8 +71,6 @@ class LabelsFirst:
         )
         self._fitting = Fitting(task, self.asker) if task.theory.level == "topological" else None
         self._contradicted = 0  # the size of a prefix whose visits fit no frames
-        # The minimal cost, and all labels of maps with this cost.
-        self._best: tuple[tuple[int, ...], list[list[int]]] | None = None
 
     @property
     def size(self) -> int:
@@ -99,7 +97,6 @@ class LabelsFirst:
     def grow(self, size: int) -> None:
         if size == self.size:
             return
-        self._best = None
         self._contradicted = 0 if self._labels.grow(size) else size
         if self._fitting and not self._contradicted:
             self._fitting.take(self._labels.chart)
@@ -119,16 +116,11 @@ class LabelsFirst:
         if len(self._task.theory.priorities) == 1:
             return
         # 2. Other labels with the same number of dstates may have fewer paths or places.
-        as_good: list[list[int]] = []
         for other in chain([labels], self._all_that_fit(len(set(labels)), besides=labels)):
-            found = None
             for found in self._fitting.improving(other):
                 if found.cost < best.cost:
-                    best, as_good = found, []
+                    best = found
                     yield best
-            if found is not None and found.cost == best.cost:
-                as_good.append(other)
-        self._best = best.cost, as_good
 
     def _first_that_fits(self) -> tuple[list[int], Found] | None:
         """Find labels with the fewest dstates that have a map, with this map; None if none have."""
@@ -147,14 +139,8 @@ class LabelsFirst:
             return
         # Given the dstates, list the maps with the fewest other counts.
         mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
-        maps = (self._fitting.maps(labels, mode) for labels in self._labels_of(cost))
+        maps = (self._fitting.maps(labels, mode) for labels in self._all_that_fit(cost[0]))
         yield from islice(chain.from_iterable(maps), enough or None)
-
-    def _labels_of(self, cost: tuple[int, ...]) -> Iterable[list[int]]:
-        """Return the known labels of maps of this cost; if none are known, search for all."""
-        if self._best and self._best[0] == cost:
-            return self._best[1]
-        return self._all_that_fit(cost[0])
 
     def _all_that_fit(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
         """Yield all labels with this many dstates that places and paths fit, except `besides`.
@@ -192,20 +178,6 @@ class LabelsFirst:
         if self._fitting:
             self._fitting.forbid(equalities)
         self._labels.forbid_together(equalities)
-        if self._best:  # the remaining maps of that cost have some of these labels
-            node_of = self._labels.chart.node_of
-            cost, every = self._best
-            self._best = (
-                cost,
-                [
-                    labels
-                    for labels in every
-                    if any(
-                        e.of == "place" or labels[node_of[e.first]] != labels[node_of[e.second]]
-                        for e in equalities
-                    )
-                ],
-            )
         return True
 
     def _causal(self, labels: Sequence[int]) -> Found:
