@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from ssh_abduction.solver.asp import workers
+from ssh_abduction.runtime import workers
 from ssh_abduction.solver.asp.limits import Watch
 
 

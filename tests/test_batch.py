@@ -30,7 +30,7 @@ from ssh_abduction.cli.batch import SolveQuestion
 from ssh_abduction.cli.jobs import Absence, FileAnswer, answers_here, answers_on_cluster
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.outcome import StopFlag
-from ssh_abduction.solver.asp import workers
+from ssh_abduction.runtime import workers
 from ssh_abduction.theory import Speedups
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

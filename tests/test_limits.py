@@ -37,8 +37,8 @@ from ssh_abduction.cli import main
 from ssh_abduction.cli import outcome as ending
 from ssh_abduction.explain import explain, explain_pair, explain_trace
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
+from ssh_abduction.runtime import workers
 from ssh_abduction.solver import Search, Status, check_rules, find_backbone
-from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.solver.asp.own_rules import EXAMPLE
@@ -332,7 +332,7 @@ def test_stopped_workers_answer_and_start_nothing() -> None:
 def test_workers_end_if_their_parent_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "pid"
     program = (
-        "from ssh_abduction.solver.asp import workers; from in_processes import stay; "
+        "from ssh_abduction.runtime import workers; from in_processes import stay; "
         f"list(workers.answers(stay, [(0, {str(path)!r})], 1, bool, None, 1.0))"
     )
     with subprocess.Popen(

@@ -47,8 +47,8 @@ from ssh_abduction.robot_logs.log_maps import (
     seconds_driven,
     work_for,
 )
+from ssh_abduction.runtime import workers
 from ssh_abduction.solver import Solution, Status, solve
-from ssh_abduction.solver.asp import workers
 
 SCANS = 110
 REAL = Path(__file__).parents[2] / "shared" / "data" / "logs"

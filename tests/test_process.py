@@ -13,8 +13,9 @@ from unittest.mock import patch
 
 import pytest
 
-from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch, peak_memory
-from ssh_abduction.solver.asp.workers import in_process
+from ssh_abduction.runtime.clock import POLL
+from ssh_abduction.solver import in_process
+from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
 
 
 def double_and_tell_where(values: list[int], watch: Watch) -> tuple[list[int], int]:
@@ -131,7 +132,7 @@ def test_process_ends_with_its_parent(tmp_path: Path) -> None:
     program = f"""
 from pathlib import Path
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.asp.workers import in_process
+from ssh_abduction.solver import in_process
 from test_process import write_again_and_again
 in_process(write_again_and_again, Path({str(path)!r}), watch=Watch())
 """

@@ -22,8 +22,8 @@ from ssh_abduction import Solution, Theory, Trace
 from ssh_abduction.cli import main
 from ssh_abduction.evaluation.rungs import UnderWay
 from ssh_abduction.robot_logs.log_maps import LogMapping
-from ssh_abduction.runtime import program
-from ssh_abduction.solver.asp import workers
+from ssh_abduction.runtime import program, workers
+from ssh_abduction.solver import in_process
 from ssh_abduction.solver.asp.limits import Watch
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="sends signals, which Windows has none of")
@@ -55,7 +55,7 @@ def test_workers_import_no_module_of_the_current_folder(
     hostile: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "path", ["", str(hostile), *sys.path])
-    assert workers.in_process(from_here, str(hostile), watch=Watch()) == []
+    assert in_process(from_here, str(hostile), watch=Watch()) == []
     assert list(workers.answers(from_there, [(0, str(hostile))], 1, lambda: False, None, 1.0)) == [
         []
     ]
@@ -194,7 +194,7 @@ def test_temporary_files_of_workers_are_removed(tmp_path: Path) -> None:
     """They are removed even if the parent of the workers is killed."""
     told = tmp_path / "told"
     script = f"""
-from ssh_abduction.solver.asp import workers
+from ssh_abduction.runtime import workers
 from in_processes import leave_a_temporary_file
 list(workers.answers(leave_a_temporary_file, [(0, {str(told)!r})], 1, lambda: False, None, 1.0))
 """

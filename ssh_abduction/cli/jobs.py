@@ -21,8 +21,9 @@ from ssh_abduction.cli.outcome import EXIT_ERROR, StopFlag, on_ctrl_c, warn
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError, SolverError, brief, named, printable
+from ssh_abduction.runtime import workers
+from ssh_abduction.runtime.clock import POLL
 from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
-from ssh_abduction.solver import POLL, workers
 
 if TYPE_CHECKING:
     from distributed import Client, Future

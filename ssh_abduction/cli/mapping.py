@@ -32,8 +32,9 @@ from ssh_abduction.data.corrections import (
 from ssh_abduction.data.errors import AbductionError, MapError, brief, named
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import attributes_of
+from ssh_abduction.runtime import workers
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solver import Stop, check_limit, workers
+from ssh_abduction.solver import Stop, check_limit
 from ssh_abduction.theory.joins import joins_in_words
 from ssh_abduction.theory.theory import Theory
 

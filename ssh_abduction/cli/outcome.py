@@ -34,11 +34,10 @@ from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.learning.runner_up import second_map
 from ssh_abduction.runtime import program
-from ssh_abduction.runtime.clock import counting
+from ssh_abduction.runtime.clock import POLL, STARVED, counting
 from ssh_abduction.runtime.loggers import PACKAGE, PROGRESS
+from ssh_abduction.runtime.workers import end_all
 from ssh_abduction.solver import (
-    POLL,
-    STARVED,
     WAITING,
     Cost,
     Search,
@@ -46,7 +45,6 @@ from ssh_abduction.solver import (
     Status,
     Stop,
     Watch,
-    end_all,
     processor_clock,
     resident_memory,
 )

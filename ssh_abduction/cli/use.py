@@ -38,7 +38,7 @@ from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.runtime import program
-from ssh_abduction.solver import end_all
+from ssh_abduction.runtime.workers import end_all
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

@@ -14,7 +14,8 @@ from ssh_abduction.data.groups import minimal_part
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import closures_among
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solver import POLL, Control, facts
+from ssh_abduction.runtime.clock import POLL
+from ssh_abduction.solver import Control, facts
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Displacement, Equality, Planar
 from ssh_abduction.theory.settle import Problem, displacement_of

@@ -34,6 +34,12 @@ Item = TypeVar("Item")
 TURN, SHORT_TURN, LONG_TURN = 800, 80, 8000
 MICRO = 1_000_000  # microunits in a unit; whole numbers add up to the same sum in each order
 
+# Seconds between two checks of the clock and of Ctrl-C while clingo is busy. Limits may be exceeded
+# by a second, and a check takes far less time than this.
+POLL = 0.05
+# The work for the first map may wait this many times as long: without a map there is no answer.
+STARVED = 30.0
+
 
 class _Done(threading.local):
     """The work that this thread has done, in microunits."""

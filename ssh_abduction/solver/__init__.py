@@ -11,20 +11,16 @@ TYPE_CHECKING = False
 
 if TYPE_CHECKING:
     from ssh_abduction.solver.asp import facts as facts
-    from ssh_abduction.solver.asp import workers as workers
     from ssh_abduction.solver.asp.control import Control as Control
-    from ssh_abduction.solver.asp.limits import POLL as POLL
-    from ssh_abduction.solver.asp.limits import STARVED as STARVED
     from ssh_abduction.solver.asp.limits import WAITING as WAITING
     from ssh_abduction.solver.asp.limits import LimitError as LimitError
     from ssh_abduction.solver.asp.limits import Stop as Stop
     from ssh_abduction.solver.asp.limits import Watch as Watch
     from ssh_abduction.solver.asp.limits import check_limit as check_limit
+    from ssh_abduction.solver.asp.limits import in_process as in_process
     from ssh_abduction.solver.asp.limits import processor_clock as processor_clock
     from ssh_abduction.solver.asp.limits import resident_memory as resident_memory
     from ssh_abduction.solver.asp.own_rules import check_rules as check_rules
-    from ssh_abduction.solver.asp.workers import end_all as end_all
-    from ssh_abduction.solver.asp.workers import in_process as in_process
     from ssh_abduction.solver.board import InternalError as InternalError
     from ssh_abduction.solver.board import Judging as Judging
     from ssh_abduction.solver.costs.estimating import maps_apart as maps_apart

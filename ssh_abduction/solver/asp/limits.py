@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, TypeVar
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
 from ssh_abduction.runtime.clock import counting, counts_work, now, work_done
@@ -15,19 +16,15 @@ from ssh_abduction.runtime.clock import counting, counts_work, now, work_done
 # A search that has found no map of the whole trace ends when this share of the time limit is left.
 # The rest of the time is for making a map without a search.
 RESERVE = 0.1
-# Seconds between two checks of the clock and of Ctrl-C while clingo is busy. Limits may be exceeded
-# by a second, and a check takes far less time than this.
-POLL = 0.05
 # Seconds between two reports of progress. A person cannot read them faster.
 TICK = 0.5
 # Work that is limited by processor time may wait for the processor, or for another thread, until
 # WAITING times as many seconds are over.
 WAITING = 4.0
-# The work for the first map may wait this many times as long: without a map there is no answer.
-STARVED = 30.0
 # More conflicts of clasp than this count as no limit: they take days.
 MOST_CONFLICTS = 2**31 - 1
 
+Result = TypeVar("Result")
 Stop: TypeAlias = Literal[
     "work limit", "time limit", "memory limit", "interrupted", "maps limit", "no proof"
 ]
@@ -256,6 +253,60 @@ class Watch:
         least = -1 if conflicts > MOST_CONFLICTS else max(int(conflicts) + 1, 1)
         around = self._around.conflicts_left(weight) if self._around is not None else -1
         return min((n for n in (least, around) if n >= 0), default=-1)
+
+
+def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) -> Result:
+    """Call `work` in another process, or in this one if no other process can be started.
+
+    Args:
+        work: The function to call, with `arguments` and then a watch. The function, its arguments,
+            its result and its errors must be picklable.
+        arguments: The first arguments of `work`.
+        watch: The limits. At a limit the other process is killed. There, `work` gets a new watch
+            that has only the memory limit. In this process, it gets `watch` itself.
+
+    Returns:
+        The result of `work`.
+
+    Raises:
+        LimitError: A limit is reached, or the process ended without an answer.
+    """
+
+    def stopped() -> bool:
+        watch.check()
+        return False
+
+    from ssh_abduction.runtime import workers  # loads subprocess
+
+    # A program that embeds Python cannot be run as Python.
+    if "python" not in os.path.basename(sys.executable or "").lower():
+        return work(*arguments, watch)
+    tasks = [(0, work, arguments, watch.memory_left())]
+    try:
+        (answer,) = workers.answers(_attempted, tasks, 1, stopped, None, 0.0)
+    except OSError:
+        return work(*arguments, watch)
+    if isinstance(answer, workers.Lost):  # most likely the system is short of memory
+        raise LimitError("memory limit")
+    attempted: tuple[Result, Exception | None] = answer
+    result, error = attempted
+    if error is not None:
+        raise error
+    return result
+
+
+def _attempted(
+    _: int,
+    work: Callable[..., object],
+    arguments: tuple[object, ...],
+    memory: float | None,
+    __: Callable[[], bool],
+) -> tuple[object, Exception | None]:
+    """Call `work` in the other process. Return its result, or the exception that it raised."""
+    try:
+        return work(*arguments, Watch(memory=memory)), None
+    except Exception as error:
+        return None, error
 
 
 def resident_memory() -> float:

@@ -35,11 +35,10 @@ from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.groups import first_index_of, indices_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.clock import POLL, look_at_clock
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts import number_symbols
-from ssh_abduction.solver.asp.limits import POLL
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.settle import Problem

@@ -20,12 +20,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from typing import Any, BinaryIO, NamedTuple, TypeVar
+from typing import Any, BinaryIO, NamedTuple
 
+from ssh_abduction.runtime.clock import POLL, STARVED
 from ssh_abduction.runtime.program import command, search_path
-from ssh_abduction.solver.asp.limits import POLL, STARVED, LimitError, Watch
-
-Result = TypeVar("Result")
 
 # A process may take this many seconds to start.
 STARTING = 10.0
@@ -216,58 +214,6 @@ def answers(
         over.set()
         _end([*filter(None, workers)], threads)
         _delete(folder)
-
-
-def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) -> Result:
-    """Call `work` in another process, or in this one if no other process can be started.
-
-    Args:
-        work: The function to call, with `arguments` and then a watch. The function, its arguments,
-            its result and its errors must be picklable.
-        arguments: The first arguments of `work`.
-        watch: The limits. At a limit the other process is killed. There, `work` gets a new watch
-            that has only the memory limit. In this process, it gets `watch` itself.
-
-    Returns:
-        The result of `work`.
-
-    Raises:
-        LimitError: A limit is reached, or the process ended without an answer.
-    """
-
-    def stopped() -> bool:
-        watch.check()
-        return False
-
-    # A program that embeds Python cannot be run as Python.
-    if "python" not in os.path.basename(sys.executable or "").lower():
-        return work(*arguments, watch)
-    tasks = [(0, work, arguments, watch.memory_left())]
-    try:
-        (answer,) = answers(_attempted, tasks, 1, stopped, None, 0.0)
-    except OSError:
-        return work(*arguments, watch)
-    if isinstance(answer, Lost):  # most likely the system is short of memory
-        raise LimitError("memory limit")
-    attempted: tuple[Result, Exception | None] = answer
-    result, error = attempted
-    if error is not None:
-        raise error
-    return result
-
-
-def _attempted(
-    _: int,
-    work: Callable[..., object],
-    arguments: tuple[object, ...],
-    memory: float | None,
-    __: Callable[[], bool],
-) -> tuple[object, Exception | None]:
-    """Call `work` in the other process. Return its result, or the exception that it raised."""
-    try:
-        return work(*arguments, Watch(memory=memory)), None
-    except Exception as error:
-        return None, error
 
 
 def end_all() -> None:
