@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from functools import lru_cache
-from itertools import pairwise
+from itertools import count, islice, pairwise
 from typing import TypeAlias
 
 import clingo
@@ -85,9 +85,6 @@ CONTRARY = 8
 # A linked list of the links that were followed since the last node that clingo named. The latest
 # link comes first.
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
-# A pinned node, as (-1, its number), or a spare name, as (its view, its number). These keys stay
-# the same when names are added.
-_Key: TypeAlias = tuple[int, int]
 
 
 class NamedLabels:
@@ -344,12 +341,10 @@ class NameProgram:
             self._may_be = [(~row).nonzero()[0].tolist() for row in apart]
         asker.watch.check()
         self._one = pairs_in(task.log.pairs.one)
-        self._spares: dict[int, int] = {}  # the number of spare names of each view, without rest
         # The spare names of each view, the last of which is the rest, and the names of each node.
         self._spare: dict[int, list[int]] = {}
         self._choices: list[list[int]] = []
-        # Dstates for whose paths clingo has the axioms of order and sides.
-        self._sides: dict[_Key, None] = {}
+        self._sides: list[int] = []  # names for whose paths clingo has the axioms of order, sides
         # What the present control was given: links and nodes; for each view the last node that may
         # have several names; and whether clingo has a node and has to choose its name.
         self._links: dict[Link, None] = {}
@@ -371,10 +366,10 @@ class NameProgram:
         seen = self.chart.seen
         found = Counter(dict(zip(given_map, seen, strict=False)).values())
         taken = Counter(seen[node] for node in self.clique)
-        self._spares = {
-            view: max(SPARES, found[view] - taken[view] + 1) if given_map else SPARES
-            for view in dict.fromkeys(seen)
-        }
+        names = count(len(self.clique))
+        for view in dict.fromkeys(seen):
+            spares = max(SPARES, found[view] - taken[view] + 1) if given_map else SPARES
+            self._spare[view] = list(islice(names, spares + 1))
         links: Iterable[Link] = self.chart.links
         if self._task.speedups.lazy:
             # Only links that begin at the first step or at a pinned one, and those at steps that
@@ -386,18 +381,15 @@ class NameProgram:
     def name_more(self, views: Collection[int]) -> None:
         """Add a name for dstates to each of these views, in a new control with the same links."""
         for view in views:
-            self._spares[view] += 1
+            rest = max(spare[-1] for spare in self._spare.values()) + 1
+            self._spare[view].append(rest)
         self._asker.watch.check()
         self._make_control(self._links)
 
     def _make_control(self, links: Iterable[Link]) -> None:
         """Make a control with the present names, some links, and the rules that exclude labels."""
         with self._asker.grounding_timed():
-            seen, number = self.chart.seen, len(self.clique)
-            self._spare = {}
-            for view, count in self._spares.items():
-                self._spare[view] = list(range(number, number + count + 1))
-                number += count + 1
+            seen = self.chart.seen
             # A node of the clique has one name. Other nodes may also have any spare name.
             self._choices = [
                 options
@@ -414,9 +406,9 @@ class NameProgram:
         self.add(links)
         for given in range(len(self._forbidden)):
             self.give_forbidden(given)
-        sides, self._sides = self._sides, {}
+        sides, self._sides = self._sides, []
         if sides:
-            self._ground_sides([key for key in self._names() if key in sides])
+            self._ground_sides(sides)
 
     def _name_facts(self) -> str:
         """Return the facts about names, and about where actions may lead."""
@@ -522,16 +514,14 @@ class NameProgram:
 
         Returns whether any of them are new. The dstates are given by their names.
         """
-        key_of = {name: key for key, name in self._names().items()}
-        keys = [key_of[name] for name in contrary if name in key_of]
-        new = [key for key in keys if key not in self._sides][:CONTRARY]
+        new = [name for name in contrary if name not in self._sides][:CONTRARY]
         if new:
             self._ground_sides(new)
         return bool(new)
 
-    def _ground_sides(self, keys: Sequence[_Key]) -> None:
-        """Ground the axioms of order and sides for dstates."""
-        control, names, task = self._asker.control, self._names(), self._task
+    def _ground_sides(self, names: Sequence[int]) -> None:
+        """Ground the axioms of order and sides for dstates, given by their names."""
+        control, task = self._asker.control, self._task
         with self._asker.grounding_timed():
             parts: list[tuple[str, list[clingo.Symbol]]] = []
             if not self._sides:
@@ -545,8 +535,8 @@ class NameProgram:
                 control.add("sides", [], "\n".join([*kinds, *facts.sides(task.theory)]))
                 parts.append(("sides", []))
             # One call for all parts halves the time to ground and to search.
-            control.ground(parts + [("path", number_symbols(names[key])) for key in keys])
-        self._sides.update(dict.fromkeys(keys))
+            control.ground(parts + [("path", number_symbols(name)) for name in names])
+        self._sides += names
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
         """Whether the dstates of a map agree with what is known about pairs of steps."""
@@ -555,15 +545,6 @@ class NameProgram:
         if any(labels[i] != labels[t] for i, t in self._one if t < len(labels)):
             return False
         return not self.chart.excluded or self.chart.is_map(labels)
-
-    def _names(self) -> dict[_Key, int]:
-        """Return the names of dstates, without the rests."""
-        pinned = {(-1, name): name for name in range(len(self.clique))}
-        return pinned | {
-            (view, i): name
-            for view, spare in self._spare.items()
-            for i, name in enumerate(spare[:-1])
-        }
 
     def rests(self, answer: dict[int, int]) -> set[int]:
         """Return the views whose rest an answer uses. The answer has the name of each node."""

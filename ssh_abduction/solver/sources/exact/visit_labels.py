@@ -27,6 +27,7 @@ relaxation, and an answer that locates all visits is an answer for all of them.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import (
     Callable,
     Collection,
@@ -350,12 +351,8 @@ class VisitProgram:
         self.visits: set[int] = set()
         self.place_of: dict[int, int] = {}
         self.fits: frozenset[Pair] = frozenset()
-        # The visits that end, the turns, and the pairs of visits that the user says are at one
-        # place, with and without a known rotation.
-        self._ends: set[int] = set()
-        self._turns: set[tuple[str, int, int, int]] = set()
-        self._pairs_said: set[Pair] = set()
-        self._places_said: set[tuple[int, int]] = set()
+        # The facts that clingo has: for each predicate, its arguments without the batch.
+        self._given: dict[str, set[tuple[int, ...]]] = defaultdict(set)
         self._closed = 0  # how often rules of transitivity were given
         # The paths for which sides_framed.lp is grounded, each by a visit and a slot.
         self._paths: dict[tuple[int, int], None] = {}
@@ -375,43 +372,30 @@ class VisitProgram:
             control.release_external(Function("listed", number_symbols(self.batch)))
         self.chart = chart
         self.batch += 1
-        added = sorted(visits - self.visits)
         self.visits |= visits
         nodes = []
         for node in order:
             if node not in self.place_of and chart.facing[node][0] in visits:
                 self.place_of[node] = len(self.place_of)
                 nodes.append((self.place_of[node], *chart.facing[node]))
-        leaves = [
-            (visit, *how)
-            for visit, how in chart.leaves.items()
-            if visit in visits and visit + 1 in visits and visit not in self._ends
-        ]
-        self._ends.update(visit for visit, *_ in leaves)
-        turns = [
-            turn
-            for turn in chart.turns(self._trace)
-            if turn not in self._turns and turn[1] in visits
-        ]
-        self._turns.update(turns)
-        # More of the trace may separate visits that fitted before.
-        new, unfit = sorted(fits - self.fits), sorted(self.fits - fits)
-        self.fits = fits
-        joined = sorted(self._joined() - self._pairs_said)
-        together = sorted(self._at_one_place() - self._places_said)
-        self._pairs_said.update(joined)
-        self._places_said.update(together)
-        part = f"visits_{self.batch}"
-        news: dict[str, Iterable[tuple[int, ...]]] = {
-            "visit": ((visit,) for visit in added),
+        turns = (turn for turn in chart.turns(self._trace) if turn[1] in visits)
+        rows: dict[str, Iterable[tuple[int, ...]]] = {
+            "visit": ((visit,) for visit in visits),
             "node": nodes,
-            "leaves": leaves,
-            "fits": new,
-            "unfit": unfit,
-            "joined": joined,
-            "together": together,
+            "leaves": (
+                (visit, *how) for visit, how in chart.leaves.items() if visits >= {visit, visit + 1}
+            ),
+            "fits": fits,
+            "unfit": self.fits - fits,  # more of the trace may separate visits that fitted before
+            "joined": self._joined(),
+            "together": self._at_one_place(),
             **gathered((kind, tuple(slots)) for kind, *slots in turns),
         }
+        self.fits = fits
+        news = {name: sorted({*some} - self._given[name]) for name, some in rows.items()}
+        for name, some in news.items():
+            self._given[name].update(some)
+        part = f"visits_{self.batch}"
         control.add(part, [], batch_facts(self.batch, news))
         control.ground([(part, []), ("more", number_symbols(self.batch))])
         control.assign_external(Function("listed", number_symbols(self.batch)), True)
