@@ -117,7 +117,7 @@ def joint_excess(returns: Returns, rows: np.ndarray, thresholds: dict[int, float
     ],
 )
 def test_bounds_on_returns_change_no_refusal(noise: str, bend: float) -> None:
-    """Each return in turn is the only new one.
+    """The later return of a pair ends at each step in turn, or later.
 
     The thresholds are so low that many pairs are refused though their single returns are not, and
     the map is true.
@@ -140,11 +140,13 @@ def test_bounds_on_returns_change_no_refusal(noise: str, bend: float) -> None:
             joint_excess(returns, rows, thresholds),
             Together(returns.reckoning, thresholds, rows),
         )
-        for new in np.eye(len(rows), dtype=bool):
-            worst, excess = together.worst(new), expected[new][0]
-            assert (worst is None) == (excess.max() <= 0)
+        for since in np.unique(rows[:, 1]).tolist():
+            is_later = np.triu(np.ones_like(expected, dtype=bool), 1) & (rows[:, 1] >= since)
+            excess = np.where(is_later, expected, -np.inf)
+            worst, pair = together.worst(since), np.unravel_index(excess.argmax(), excess.shape)
+            assert (worst is None) == (excess[pair] <= 0)
             if worst is not None:
-                best = rows[new][0], rows[int(excess.argmax())]
+                best = [rows[k] for k in pair]
                 assert worst == {
                     Equality(int(i), int(j), "dstate" if one_dstate else "place")
                     for i, j, one_dstate in best

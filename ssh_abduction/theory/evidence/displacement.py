@@ -41,15 +41,14 @@ from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.evidence.loops import Reckoning, Steps
-    from ssh_abduction.theory.evidence.together import Mask, Together
+    from ssh_abduction.theory.evidence.together import Together
     from ssh_abduction.theory.theory import Theory
 
 # The first and the last steps of returns to places (True) and to dstates (False).
 _Tested: TypeAlias = "dict[bool, tuple[Steps, Steps]]"
 # How many loops are computed at once. Their sums take some hundred megabytes.
 AT_A_TIME = 200_000
-# How many accepted maps, and how many rejected sets, are remembered. Accepted maps may be checked
-# again, or grow with the trace. The next maps mostly contain the same rejected sets.
+# How many accepted maps are remembered. They may be checked again, or grow with the trace.
 REMEMBERED = 64
 
 
@@ -221,24 +220,6 @@ class PlacedLabels(NamedTuple):
         return PlacedLabels(labels, places[: max(labels, default=-1) + 1])
 
 
-def hold(
-    equalities: Collection[Equality], labels: Sequence[int], places: Sequence[int | None]
-) -> bool:
-    """Whether all these equalities, the earlier step first, hold in a map.
-
-    `labels` has the dstate of each step, and `places` the place of each dstate.
-    """
-    return all(
-        equality.second < len(labels)
-        and (
-            labels[equality.first] == labels[equality.second]
-            if equality.of == "dstate"
-            else places[labels[equality.first]] == places[labels[equality.second]] is not None
-        )
-        for equality in equalities
-    )
-
-
 class Returns:
     """The possible returns of a trace (two steps at one place or dstate), and tests of them.
 
@@ -264,8 +245,6 @@ class Returns:
         )
         # Accepted maps, the last one last.
         self._accepted: dict[PlacedLabels, Together] = dict(before._accepted) if before else {}
-        # Sets of two returns, the last one last.
-        self._refused: list[frozenset[Equality]] = list(before._refused) if before else []
         self._pairs: Pairs | None = before._pairs if before else None
         self._likely: int | None = before._likely if before else None
         if before and (self._pairs is not None or self._likely is not None):
@@ -447,9 +426,8 @@ class Returns:
     def refused_together(self, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         """Find two returns of a map that are rejected together; None if there are none.
 
-        If such a set was rejected in an earlier map, return that one. Otherwise, return the
-        two that are rejected most clearly. The map of the first `since` steps is known to
-        be accepted, so only returns that end later are tested.
+        Return the two that are rejected most clearly. The map of the first `since` steps is known
+        to be accepted, so only returns that end later are tested.
         """
         import numpy as np
 
@@ -457,18 +435,14 @@ class Returns:
         tested = PlacedLabels.of(labels, places)
         if tested in self._accepted:
             return None
-        for known in reversed(self._refused):
-            if hold(known, labels, places):
-                return known
         before = self._accepted.pop(PlacedLabels.of(labels[:since], places), None)
         at = [places[label] for label in labels]
         rows = self._returns_among(labels, at, since if before else 0)
         if before:
             rows = np.concatenate([before.rows, rows])
         together = self._together(rows, before)
-        refused = together.worst(rows[:, 1] >= since if since else self._is_new(rows))
+        refused = together.worst(since)
         if refused is not None:
-            self._refused = [*self._refused[-REMEMBERED:], refused]
             return refused
         self._accepted[tested] = together
         if len(self._accepted) > REMEMBERED:
@@ -490,7 +464,7 @@ class Returns:
             for i, j, one_dstate in rows.tolist()
         ]
         rows = rows[[not is_refused for is_refused in refused]]
-        return self._together(rows).worst(rows[:, 1] == step)
+        return self._together(rows).worst(step)
 
     def refused_alone_at(
         self, labels: Sequence[int], places: Sequence[int | None], step: int
@@ -598,20 +572,6 @@ class Returns:
 
         thresholds = {freedom: self.threshold(freedom, together=True) for freedom in (4, 5, 6)}
         return Together(self.reckoning, thresholds, rows, before)
-
-    def _is_new(self, rows: Steps) -> Mask:
-        """Mark the returns that are not in the map that was accepted last."""
-        import numpy as np
-
-        if not self._accepted:
-            return np.ones(len(rows), dtype=bool)
-        known = next(reversed(self._accepted.values())).rows
-        size = len(self.trace)
-        codes, known_codes = (
-            (found[:, 0] * size + found[:, 1]) * 2 + found[:, 2] for found in (rows, known)
-        )
-        new: Mask = np.isin(codes, known_codes, invert=True)
-        return new
 
 
 def _parts(size: int, most: int = AT_A_TIME) -> Iterator[slice]:

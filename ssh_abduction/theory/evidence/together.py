@@ -22,16 +22,13 @@ look-ups in a table give it. Pairs that this bound does not accept are few.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.evidence.loops import Array, Loops, Reckoning, Steps
 from ssh_abduction.theory.evidence.protocol import Equality
-
-Mask: TypeAlias = NDArray[np.bool_]
 
 # A bound accepts a pair only with this margin, because sums are rounded.
 MARGIN = 1e-3
@@ -77,27 +74,23 @@ class Together:
         pairs = zip(before._alone, alone, strict=True) if before else ()
         self._alone: _ReturnsAlone = _ReturnsAlone(*map(np.concatenate, pairs)) if before else alone
 
-    def worst(self, new: Mask) -> frozenset[Equality] | None:
+    def worst(self, since: int = 0) -> frozenset[Equality] | None:
         """Return the pair of returns that is rejected most clearly; None if there is none.
 
-        Only pairs with a return that is `new` count.
+        Only pairs count in which the later return ends at step `since` or later.
         """
         rows = self.rows
         worst: frozenset[Equality] | None = None
         most = 0.0
-        if not new.any():
-            return None
         ends, starts = np.unique(rows[:, 1], return_index=True)
-        for end, start, stop in zip(
-            ends.tolist(), starts.tolist(), [*starts[1:].tolist(), len(rows)], strict=True
+        for end, later in zip(
+            ends.tolist(), np.split(np.arange(len(rows)), starts[1:]), strict=False
         ):
-            look_at_clock()
-            if not new[:stop].any():
+            if end < since:
                 continue
-            later = np.arange(start, stop)
-            for earlier in self._overlapping(later, new):
+            for earlier in self._overlapping(later):
                 look_at_clock()
-                pairs = self._unsafe(end, later, earlier, new)
+                pairs = self._unsafe(end, later, earlier)
                 excess = self._least_excess(*pairs)
                 if len(excess) and excess.max() > most:
                     best = int(excess.argmax())
@@ -108,17 +101,15 @@ class Together:
                     )
         return worst
 
-    def _overlapping(self, later: Steps, new: Mask) -> Sequence[Steps]:
+    def _overlapping(self, later: Steps) -> Sequence[Steps]:
         """List rows that may share displacements with `later` rows, in parts that fit in memory."""
         stop = int(later[-1]) + 1
         begin = int(np.searchsorted(self.rows[:stop, 1], self.rows[later, 0].min(), side="right"))
         earlier = np.arange(begin, stop)
-        if not new[later].any():
-            earlier = earlier[new[begin:stop]]
         size = max(AT_A_TIME // len(later), 1)
         return [earlier[at : at + size] for at in range(0, len(earlier), size)]
 
-    def _unsafe(self, end: int, later: Steps, earlier: Steps, new: Mask) -> tuple[Steps, Steps]:
+    def _unsafe(self, end: int, later: Steps, earlier: Steps) -> tuple[Steps, Steps]:
         """Find the pairs that the bound does not accept, without a drift of heading.
 
         Rows `later` end at step `end`. Returns the index of the later and of the earlier row of
@@ -142,7 +133,7 @@ class Together:
         left = 1 - squares / min(self._thresholds.values())
         unsafe = (left <= 0) | (share + MARGIN > left**2)
         unsafe &= rows[earlier, 1, None] > first
-        unsafe &= (earlier[:, None] < later) & (new[earlier, None] | new[later])
+        unsafe &= earlier[:, None] < later
         others, these = np.nonzero(unsafe)
         return later[these], earlier[others]
 
