@@ -26,7 +26,8 @@ from ssh_abduction.data import DState, Odometry, TheoryError
 from ssh_abduction.data.odometry import Closure
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.facts import causal_map
-from ssh_abduction.solver.geometry.fit import Poses, fit, inverse, least_squares, system_solved
+from ssh_abduction.solver.geometry.fit import fit, poses_of
+from ssh_abduction.solver.geometry.poses import Poses, inverse, least_squares, system_solved
 from ssh_abduction.solver.geometry.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns
@@ -201,9 +202,7 @@ def test_fit_estimates_scale_and_drift(scale: float, bend: float) -> None:
 @given(st.data())
 def test_jacobian_of_the_fit_equals_finite_differences(data: st.DataObject) -> None:
     trace = data.draw(traces().filter(lambda trace: trace.has_displacements), label="trace")
-    problem = Poses.of_map(
-        trace, solve(trace, Theory.causal().replace(displacement="none")).maps[0]
-    )
+    problem = poses_of(trace, solve(trace, Theory.causal().replace(displacement="none")).maps[0])
     assume(len(problem._moved))
     rng = np.random.default_rng(0)
     unknown = problem._begun() + 0.01 * rng.normal(size=problem._size)

@@ -49,7 +49,7 @@ from ssh_abduction.explain import explain_trace
 from ssh_abduction.rivals import DrivePair, Listing, compare, difference, joins_of_drives
 from ssh_abduction.rivals.listing import DriveJoin
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.sources.metric.beam import Beam, Extending
 from ssh_abduction.solver.sources.metric.hypothesis import Pieces, headings_by_turn
 from ssh_abduction.solver.steps.log import Log

@@ -33,7 +33,8 @@ from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.costs import beams, weighing
 from ssh_abduction.solver.costs.estimating import estimated, rivals_of
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.geometry.fit import Poses, fit
+from ssh_abduction.solver.geometry.fit import fit
+from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.solution.weighed import Rival, Weighed
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory import prior as prior_module

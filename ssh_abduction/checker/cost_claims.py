@@ -12,6 +12,10 @@ A displacement is missing where a drive starts, or where it was not logged. Betw
 dstate or two places in common, or if a closure connects them, this determines how their frames lie
 relative to each other. Such guesses of missing displacements are only a starting point: the misfit
 does not depend on them.
+
+An answer may say that closures are false. All false closures of one *alias* lay one part of the
+building on another, by one unknown motion. So a motion for each alias is an unknown, too, which no
+displacement restricts.
 """
 
 from __future__ import annotations
@@ -31,7 +35,7 @@ from threadpoolctl import threadpool_limits
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.odometry import Closure, Odometry
+from ssh_abduction.data.odometry import Closure, Covariance, Displacement, Odometry
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.theory import Theory
@@ -60,7 +64,7 @@ LONGEST = 400
 WORK = 5 * LONGEST**3
 # The building reaches this many metres beyond the poses of dead reckoning, on each side.
 MARGIN = 3.0
-# The nats of a fault that costs as much as a dstate.
+# The nats of a fault that costs as much as a dstate, and of an alias of false closures.
 FAULT = 5.0
 # The nats of a misread view that only a rival has, as the theory forbids it.
 SUSPECTED = 3.5
@@ -115,36 +119,57 @@ def false_costs(
     places = [maps[0].dstates[label].place for label in maps[0].dstate_at]
     here = [p if p is not None else s for p, s in zip(places, maps[0].dstate_at, strict=True)]
     of_map: Faults = [(fault.kind, fault.step) for fault in maps[0].faults]
-    courses = [("weighed.nats", nats, maps[0].dstate_at, here, of_map)]
     rivals = rivals if isinstance(rivals, list) else []
+    closures = (rivals[0].get("aliases") if rivals else None) or ()
+    courses = [("weighed.nats", nats, maps[0].dstate_at, here, of_map, closures)]
     for i in range(count_checked_rivals(len(trace), len(rivals))):
         rival = rivals[i]
         at = rival.get("places") or rival.get("dstates")
         of_rival = rival.get("faults", [])
         name = f"weighed.rivals[{i}]"
-        courses.append((name, rival.get("nats"), rival["dstates"], at, of_rival))
-    for name, claimed, dstates, at, faults in courses:
-        true, square = cost_of(trace, theory, dstates, at, faults)
+        aliases = rival.get("aliases") or ()
+        courses.append((name, rival.get("nats"), rival["dstates"], at, of_rival, aliases))
+    for name, claimed, dstates, at, faults, aliases in courses:
+        if not _are_numbered(aliases, len(trace.closures)):
+            yield (
+                f"{name}: expected aliases with a number for each of {len(trace.closures)} "
+                f"closures, from 1 without gaps, got {brief(aliases)}"
+            )
+            continue
+        true, square = cost_of(trace, theory, dstates, at, faults, aliases)
         linear = LINEAR if len(_off_dstates(trace)) else 0.0
         if abs(true - claimed) > EXACT + SHARE * square + linear:
             yield f"{name}: expected {true:.3f} nats, by the displacements, got {claimed}"
 
 
+def _are_numbered(aliases: Sequence[int], closures: int) -> bool:
+    """Whether aliases are empty, or one for each closure, numbered from 1; 0 for true closures."""
+    numbers = {abs(alias) for alias in aliases} - {0}
+    return len(aliases) in (0, closures) and numbers == {*range(1, len(numbers) + 1)}
+
+
 def cost_of(
-    trace: Trace, theory: Theory, dstates: Sequence[int], at: Sequence[int], faults: Faults
+    trace: Trace,
+    theory: Theory,
+    dstates: Sequence[int],
+    at: Sequence[int],
+    faults: Faults,
+    aliases: Sequence[int] = (),
 ) -> tuple[float, float]:
     """Compute the cost of a map in nats, and its misfit, if steps are at these dstates and places.
 
     The cost is the sum, over the steps, of what a new dstate and place would cost, and for each
     return the logarithm of two densities: that of a new pose, and that of the loop to close as the
-    displacements predict it.
+    displacements predict it. `aliases` has a number for each closure that is false: it moves the
+    last step of the closure, or the first step if the number is negative.
     """
     wrong = [step for kind, step in faults if kind == "jumped"]
-    errors = _Errors(trace.without_displacements_at(wrong), dstates, at)
+    errors = _Errors(trace.without_displacements_at(wrong), dstates, at, aliases)
     with threadpool_limits(1, user_api="blas"):  # more threads only wait for each other
         square = errors.least()
     model = _Occam(trace, theory)
     nats = square / 2 + errors.volume(model.wide) + model.of_steps()
+    nats += FAULT * max(map(abs, aliases), default=0)
     nats += model.crowd * (len(at) - len(set(at)))
     for of, names in enumerate((dstates, at)):
         for name in set(names):
@@ -224,7 +249,13 @@ class _Occam:
 class _Errors:
     """The errors of the displacements and closures that make the loops of a map close."""
 
-    def __init__(self, trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> None:
+    def __init__(
+        self,
+        trace: Trace,
+        dstates: Sequence[int],
+        places: Sequence[int],
+        aliases: Sequence[int] = (),
+    ) -> None:
         odometry = trace.odometry or Odometry()
         self._moved = np.zeros((len(trace), 3))
         self._root = np.tile(MISSING * np.identity(3), (len(trace), 1, 1))
@@ -239,14 +270,23 @@ class _Errors:
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
         self._scaled = np.array([step.displacement is not None for step in trace.steps])
         # If a heading after a gap is too far off, Gauss-Newton fails. So begin near the solution.
-        for t, likely in _likely_moves(self._moved, missing, dstates, places, trace.closures):
+        given = aliases or [0] * len(trace.closures)
+        believed = [c for c, alias in zip(trace.closures, given, strict=True) if not alias]
+        for t, likely in _likely_moves(self._moved, missing, dstates, places, believed):
             self._moved[t] = likely
+        self._alias = abs(np.array(given, dtype=int))
+        self._aliases = int(self._alias.max(initial=0))
         self._sigma = np.array([odometry.scale, odometry.bend])
         self._best: Array = np.zeros(0)
         self._off = _off_dstates(trace)
-        covariances = np.array([c.covariance for c in trace.closures]).reshape(-1, 3, 3)
-        self._doubt = np.linalg.cholesky(covariances)
-        self._told = np.array([c.displacement for c in trace.closures]).reshape(-1, 3)
+        closures = [(c.first, c.last, c.displacement, c.covariance) for c in trace.closures]
+        told = [
+            _backwards(*closure) if alias < 0 else closure
+            for closure, alias in zip(closures, given, strict=True)
+        ]
+        self._closures = np.array([ends for *ends, _, _ in told], dtype=int).reshape(-1, 2).T
+        self._told = np.array([moved for *_, moved, _ in told]).reshape(-1, 3)
+        self._doubt = np.linalg.cholesky(np.array([c for *_, c in told]).reshape(-1, 3, 3))
         # A loop leads from the last earlier step at the dstate or place of a step to this step.
         # At one place, only the position has to be the same.
         ends: list[tuple[int, int]] = []
@@ -260,11 +300,12 @@ class _Errors:
             last |= dict.fromkeys(here, t)
         self._loops = np.array(ends, dtype=int).reshape(-1, 2).T
         self._counts = np.array(counts, dtype=bool).reshape(-1, 3)
-        self._closures = np.array([(c.first, c.last) for c in trace.closures], int).reshape(-1, 2).T
 
     def least(self) -> float:
         """Compute the least sum of squares of the errors, in standard deviations."""
-        z: Array = np.zeros(3 * (len(self._moved) + len(self._doubt) + len(self._off)) + 2)
+        steps = len(self._moved) + len(self._doubt) + len(self._off)
+        z: Array = np.zeros(3 * (steps + self._aliases) + 2)
+        self._begin(z)
         for _ in range(ROUNDS if self._loops.size + self._closures.size else 0):
             look_at_clock()
             jacobian = self._derivatives(z)
@@ -275,6 +316,16 @@ class _Errors:
                 break
         self._best = z
         return float(z @ z)
+
+    def _begin(self, z: Array) -> None:
+        """Begin the motion of each alias with one of its closures."""
+        pose = self._poses(z)[0]
+        motions = z[len(z) - 2 - 3 * self._aliases : len(z) - 2].reshape(-1, 3)
+        for alias, (i, j), told in zip(self._alias, self._closures.T, self._told, strict=True):
+            angle = pose[i, 2] + told[2] - pose[j, 2]
+            gone = pose[i, :2] + _turned(told, pose[i, 2]) - _turned(pose[j], angle)
+            if alias:
+                motions[alias - 1] = np.append(gone, angle) / MISSING
 
     def volume(self, wide: Array) -> float:
         """Compute by how much the loops are less surely predicted than by the prior, in nats.
@@ -291,13 +342,16 @@ class _Errors:
             of = slice(3 * t, 3 * t + 3)
             root = np.sqrt(wide) if t in self._missing else stretch @ self._root[t]
             jacobian[:, of] = jacobian[:, of] @ np.linalg.solve(self._root[t], root)
+        # The motion of an alias has the density of the prior, wherever it is.
+        motion = float(np.linalg.slogdet(wide)[1]) / 2 - 3 * math.log(MISSING)
         counts = np.concatenate([self._counts, np.ones((len(self._doubt), 3), bool)])
         free = [np.linalg.cholesky(wide)] * len(self._counts) + [*self._doubt]
         expected = sum(
             float(np.log(np.diag(root)[count]).sum())
             for root, count in zip(free, counts, strict=True)
         )
-        return float(np.linalg.slogdet(jacobian @ jacobian.T)[1]) / 2 - expected
+        nats = float(np.linalg.slogdet(jacobian @ jacobian.T)[1]) / 2 - expected
+        return nats + self._aliases * motion
 
     def _derivatives(self, z: Array) -> Array:
         """Compute the derivatives J of c(z), of shape (numbers in c, unknowns).
@@ -311,16 +365,22 @@ class _Errors:
     def _closing(self, z: _Numbers) -> _Numbers:
         """Compute c(z), by how much loops and closures are off, for each row of unknowns."""
         pose, at = self._poses(z)
-        doubt = self._parts(z)[1]
+        doubt, motion = self._parts(z)[1], MISSING * self._parts(z)[3]
         off = _seen_from(at, *self._loops)[..., self._counts]
-        closed = _seen_from(pose, *self._closures) - self._told
+        first, last = (pose[..., steps, :] for steps in self._closures)
+        # Motion 0 is none.
+        motion = np.concatenate([np.zeros_like(pose[..., :1, :]), motion], axis=-2)
+        motion = motion[..., self._alias, :]
+        at = _turned(last, motion[..., 2]) + motion[..., :2]
+        last = np.concatenate([at, last[..., 2:] + motion[..., 2:]], axis=-1)
+        closed = _from_to(first, last) - self._told
         closed = closed - np.einsum("cij,...cj->...ci", self._doubt, doubt)
         closed[..., 2] = _remainder(closed[..., 2])
         return np.concatenate([off, closed.reshape(*z.shape[:-1], -1)], axis=-1)
 
     def _poses(self, z: _Numbers) -> tuple[_Numbers, _Numbers]:
         """Compute the poses of the robot, by dead reckoning, and of the dstates: (…, steps, 3)."""
-        noise, _, off = self._parts(z)
+        noise, _, off, _ = self._parts(z)
         scale, bend = (self._sigma[k] * z[..., k - 2, None] for k in (0, 1))
         moved = self._moved + np.einsum("tij,...tj->...ti", self._root, noise)
         turned = moved[..., 2] - bend * self._way
@@ -339,10 +399,10 @@ class _Errors:
         """Split unknowns, (…, unknowns), into errors, (…, n, 3).
 
         They are those of the displacements, and of the closures, and how far the robot is off its
-        dstate at each step: metres ahead and left, and radians.
+        dstate at each step: metres ahead and left, and radians. The motions of aliases come last.
         """
-        ends = 3 * np.cumsum([len(self._moved), len(self._doubt), len(self._off)])
-        parts = np.split(z, ends, axis=-1)[:3]
+        sizes = len(self._moved), len(self._doubt), len(self._off), self._aliases
+        parts = np.split(z, 3 * np.cumsum(sizes), axis=-1)[:4]
         return [part.reshape(*z.shape[:-1], -1, 3) for part in parts]
 
 
@@ -354,14 +414,30 @@ def _turned(vectors: _Numbers, angle: _Numbers) -> _Numbers:
 
 def _seen_from(pose: _Numbers, first: NDArray[np.int_], last: NDArray[np.int_]) -> _Numbers:
     """Compute the poses of the last steps in the frames of the first ones."""
-    gap = pose[..., last, :] - pose[..., first, :]
-    there = _turned(gap, -pose[..., first, 2])
+    return _from_to(pose[..., first, :], pose[..., last, :])
+
+
+def _from_to(first: _Numbers, last: _Numbers) -> _Numbers:
+    """Compute poses in the frames of other poses, all (…, 3)."""
+    gap = last - first
+    there = _turned(gap, -first[..., 2])
     return np.concatenate([there, _remainder(gap[..., 2:])], axis=-1)
 
 
 def _remainder(angle: _Numbers) -> _Numbers:
     """Return angles in radians between -pi and pi."""
     return angle - math.tau * np.round(angle.real / math.tau)
+
+
+def _backwards(
+    first: int, last: int, moved: Displacement, covariance: Covariance
+) -> tuple[int, int, Displacement, Array]:
+    """Return the displacement from the last step to the first one, and its covariance."""
+    x, y, angle = moved
+    back = -cmath.rect(1, -angle) * complex(x, y)
+    cos, sin = math.cos(angle), math.sin(angle)
+    by = np.array([[-cos, -sin, back.imag], [sin, -cos, -back.real], [0, 0, -1]])
+    return last, first, (back.real, back.imag, -angle), by @ np.array(covariance) @ by.T
 
 
 def _off_dstates(trace: Trace) -> Array:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Set
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -62,7 +63,7 @@ class Candidates:
     ) -> None:
         self._task, self._known, self._judging = task, known, judging
         self._report = report
-        self._beams: dict[int, Beam] = {}  # by their widths
+        self._beams: dict[tuple[int, Set[int]], Beam] = {}
         self.contradicting: dict[int, None] = {}
         # A snapshot waits for a sketch under way instead of making another one.
         self._sketching = threading.Lock()
@@ -72,9 +73,10 @@ class Candidates:
         if self._task.speedups.greedy and self._task.theory.level == "causal":
             self.offer(facts.causal_map(self._task.log.merged(), self._task.trace))
 
-    def beam(self, width: int) -> Beam | None:
+    def beam(self, width: int, believed: Set[int] | None = None) -> Beam | None:
         """Return the beam of this many hypotheses about dstates and places.
 
+        It uses only the closures that are `believed`, given by their numbers; None means all.
         Later calls return the same beam, which goes on where it stopped. None without the speed-up
         `greedy`, if the trace is long, or if the checker cannot check all axioms. Also None
         if the trace has neither displacements nor stars at any angles, as sketches are better then.
@@ -89,9 +91,14 @@ class Candidates:
             return None
         from ssh_abduction.solver.sources.metric.beam import Beam  # loads numpy
 
-        if width not in self._beams:
-            self._beams[width] = Beam(self._task.problem, self._task.log, width)
-        return self._beams[width]
+        trace = self._task.trace
+        believed = {*range(len(trace.closures))} if believed is None else believed
+        key = width, frozenset(believed)
+        if key not in self._beams:
+            closures = tuple(trace.closures[i] for i in sorted(believed))
+            problem = self._task.problem.changed(replace(trace, closures=closures))
+            self._beams[key] = Beam(problem, self._task.log, width)
+        return self._beams[key]
 
     def maps_of(self, search: Beam | Joining) -> Iterator[SSHMap]:
         """Yield the maps that a search finds and the checker accepts, in its order."""

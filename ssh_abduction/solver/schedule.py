@@ -102,6 +102,12 @@ WEIGHED = (
     ),
     SourceTurn("beam of 1", "up to 2,000 steps", "It finds most true maps.", until=0.7),
     SourceTurn(
+        "false closures",
+        "traces with closures",
+        "If closures are false, later beams have to know which ones.",
+        share=0.3,
+    ),
+    SourceTurn(
         "beam of 4",
         "up to 2,000 steps",
         "A map that a broad beam ends with is nearly always the best one.",

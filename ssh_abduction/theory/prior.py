@@ -70,7 +70,7 @@ class Prior:
     def __init__(self, trace: Trace, theory: Theory) -> None:
         """Compute the priors of a trace."""
         self.area = _area(trace)
-        self.wide: Array = np.array([self.area / math.tau, self.area / math.tau, math.tau])
+        self.wide = wide_of(trace)
         self._has_places = theory.level == "topological"
         ways = travels_of(trace)
         usual = median(ways) ** 2 if ways else self.area
@@ -173,6 +173,12 @@ class Prior:
             (dstates[some] + FAULT * (tenths / 10 - some)).min(),
         )
         return float(nats + places[min(counts.get("places", 0), len(places) - 1)])
+
+
+def wide_of(trace: Trace) -> Array:
+    """Compute the covariance of a Gaussian with the density of the prior at its mean, (3,)."""
+    area = _area(trace)
+    return np.array([area / math.tau, area / math.tau, math.tau])
 
 
 def spreads_of(trace: Trace) -> Array:

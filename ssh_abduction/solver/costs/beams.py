@@ -3,12 +3,15 @@
 Places are first merged at poses that fit all closures (`sources/metric/overlay.py`). After a long
 way this is better than a beam of hypotheses, which goes through the trace once. Then come beams,
 narrow ones first. The places of the best map of a broad beam are merged in the same way.
+
+A narrow beam believes all closures, and another one believes none. Each later beam believes those
+that the best map believes (`geometry/fit.py`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from contextlib import suppress
 from dataclasses import replace
 
@@ -23,6 +26,8 @@ from ssh_abduction.theory.prior import spreads_of
 
 # The numbers of hypotheses of the beams, in their order.
 WIDTHS = (1, 4, 16)
+# The number of hypotheses of the beams that sort closures.
+NARROW = 4
 # A beam of this width or more nearly always ends with the map of least cost.
 BROAD = 4
 
@@ -36,18 +41,22 @@ class Beams:
     """
 
     def __init__(
-        self, parts: Parts, add: Callable[[SSHMap], float], has_map: Callable[[], bool]
+        self,
+        parts: Parts,
+        add: Callable[[SSHMap], float],
+        has_map: Callable[[], bool],
+        believed: Callable[[], Set[int]],
     ) -> None:
         """Prepare the guesses.
 
         `add` returns the cost of a map in nats, and keeps the map if this cost is small. `has_map`
-        says whether a map is known.
+        says whether a map is known, and `believed` which closures the best map believes.
         """
-        self._parts, self._add, self._has_map = parts, add, has_map
+        self._parts, self._add, self._has_map, self._believed = parts, add, has_map, believed
         # The cost of the best map of smoothing or a broad beam, and the estimate of it by a beam.
         self._best = math.inf, math.inf
         self.broken = -math.inf
-        self._ended = 0  # the width of the widest beam that ended
+        self._ended: Beam | None = None  # the widest beam that ended
         self._first = math.inf  # the time of the first beam
 
     def found(self, nats: float) -> bool:
@@ -88,7 +97,13 @@ class Beams:
         return [
             Source(turn("smoothing"), lambda: True, self._smooth),
             Source(turn("joint drives"), lambda: several, self._join),
-            *map(beam, widths),
+            beam(widths[0]),
+            Source(
+                turn("false closures"),
+                lambda: bool(self._parts.task.trace.closures),
+                self._sort_closures,
+            ),
+            *map(beam, widths[1:]),
             Source(
                 turn("beam without axioms"),
                 lambda: self._best[1] < math.inf and math.isinf(self.broken),
@@ -108,6 +123,18 @@ class Beams:
             nats = min(map(self._add, maps), default=math.inf)
             self._take(nats, -math.inf, joining.broken)
 
+    def _sort_closures(self) -> None:
+        """Map the trace without closures, and then with those that the best map believes."""
+        closures = self._parts.task.trace.closures
+        believed: Set[int] = frozenset()
+        tried = {frozenset(range(len(closures)))}
+        while believed not in tried:
+            tried.add(frozenset(believed))
+            if beam := self._parts.candidates.beam(NARROW, believed):
+                for ssh_map in self._parts.candidates.maps_of(beam):
+                    self._add(ssh_map)
+            believed = self._believed()
+
     def _is_time_for(self, width: int, last: int, left: float) -> bool:
         """Whether to search with this beam. If only one of both has time, the last one goes first.
 
@@ -119,7 +146,7 @@ class Beams:
     def _search(self, width: int, clashes: Callable[[], bool]) -> None:
         """Search with one beam. If no beam has ended in time, extend what this one has."""
         parts, began = self._parts, self._parts.watch.elapsed()
-        if (beam := parts.candidates.beam(width)) is None:
+        if (beam := parts.candidates.beam(width, self._believed())) is None:
             return
         try:
             self._finish(beam, width)
@@ -134,7 +161,7 @@ class Beams:
     def _finish(self, beam: Beam, width: int) -> None:
         """Keep the maps that a beam ends with. Raises StageTimeError if it does not end in time."""
         found = {self._add(one): one for one in self._parts.candidates.maps_of(beam)}
-        self._ended = width
+        self._ended = beam
         if width < BROAD:
             return
         with suppress(StageTimeError):
@@ -148,8 +175,8 @@ class Beams:
 
     def _break_axioms(self) -> None:
         """Find `broken` with the widest beam that ended."""
-        if beam := self._parts.candidates.beam(self._ended):
-            self.broken = self._best[1] - beam.nats_without_axioms()
+        if self._ended:
+            self.broken = self._best[1] - self._ended.nats_without_axioms()
 
     def _take(self, nats: float, estimate: float, broken: float) -> None:
         """Keep what a broad beam, or joining the maps of drives, says about its best map."""

@@ -15,6 +15,10 @@ A visit to a place has several steps, as turns stay at their place. So these ste
 in each topological map, also without a return. But if displacements may be wrong, the
 displacement of a turn may be wrong, too. Then each step is a visit of its own, and a turn is a
 return, too.
+
+Closures may be false (`solver/geometry.fit.py`). The misfit of a complete map is that of the
+best explanation of its closures. A set of returns has a lower bound: either all closures are true,
+or one at least is of an alias, and then the misfit is at least that without closures.
 """
 
 from __future__ import annotations
@@ -24,8 +28,8 @@ from typing import TypeAlias
 
 from ssh_abduction.data.groups import NodeClasses, minimal_part, numbered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.geometry.equations import Equations, visits_by_turns
-from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.geometry.equations import Aliases, Equations, visits_by_turns
+from ssh_abduction.solver.geometry.fit import Explaining
 from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
@@ -50,10 +54,13 @@ class Misfit:
         self.visit = visits_by_turns(self.trace, problem.theory)
         self._equations = Equations.of(self.trace)
         self._known: dict[_Groups, float] = {}
-        self._likelihood: dict[_Groups, float] = {}
+        self._likelihood: dict[_Groups, tuple[float, float, Aliases]] = {}
 
     def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
-        """Return the misfit (a chi-square) of returns, ignoring displacements to `wrong` steps."""
+        """Return a lower bound on the misfit of maps with returns, ignoring `wrong` moves.
+
+        It includes what aliases cost. Without closures, it is the misfit (a chi-square).
+        """
         headings, visits = NodeClasses[int](), NodeClasses[int]()
         for found in returns:
             if found.of == "dstate":
@@ -65,33 +72,44 @@ class Misfit:
     def of_course(
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
     ) -> float:
-        """Return the misfit if steps are at these dstates and places, without `wrong` moves."""
+        """Return what `of_returns` does if steps are at these dstates and places."""
         groups = _groups_of(dstates, places, wrong)
         if groups not in self._known:
-            self._known[groups] = self._poses(groups).misfit()
+            self._known[groups] = self._explaining(groups).least()
         return self._known[groups]
 
-    def of_map(self, ssh_map: SSHMap) -> float:
-        """Compute the misfit (a chi-square) of a map of the whole trace."""
-        return self.of_returns(self.returns_of(ssh_map), jumped(ssh_map))
+    def of_closing(self, ssh_map: SSHMap) -> float:
+        """Compute by how much the returns of a map of the whole trace raise its misfit."""
+        dstates, places, wrong = _course_of(ssh_map)
+        square, _, aliases = self._explained(dstates, places, wrong)
+        apart = self._explaining(_groups_of(range(len(dstates)), self.visit, wrong))
+        return square - apart.misfit(aliases)
 
     def nats_of(self, ssh_map: SSHMap) -> float:
         """Compute the cost of a map of the whole trace in nats."""
-        places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
-        names = places if None not in places else ssh_map.dstate_at
-        nats = FAULT * Cost.of(ssh_map).faults
-        return nats + self.nats_of_course(ssh_map.dstate_at, names, jumped(ssh_map))
+        return FAULT * Cost.of(ssh_map).faults + self.nats_of_course(*_course_of(ssh_map))
 
     def nats_of_course(
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
     ) -> float:
         """Return -log of the marginal likelihood if steps are at these dstates and places."""
+        prior, nats = self._prior, self._explained(dstates, places, wrong)[1]
+        return nats + float(prior.base[-1]) + prior.lost(wrong) + prior.shown(dstates, places)
+
+    def aliases_of(
+        self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
+    ) -> Aliases:
+        """Return the alias of each closure in the best explanation; empty if all are true."""
+        aliases = self._explained(dstates, places, wrong)[2]
+        return aliases if any(aliases) else ()
+
+    def _explained(
+        self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int]
+    ) -> tuple[float, float, Aliases]:
+        """Return the misfit, the nats, and the aliases of the best explanation of the closures."""
         groups = _groups_of(dstates, places, wrong)
         if groups not in self._likelihood:
-            prior, poses = self._prior, self._poses(groups)
-            self._known[groups], nats = poses.likelihood(prior.wide)
-            nats += float(prior.base[-1]) + prior.lost(wrong) + prior.shown(dstates, places)
-            self._likelihood[groups] = nats
+            self._likelihood[groups] = self._explaining(groups).best()
         return self._likelihood[groups]
 
     def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
@@ -126,11 +144,20 @@ class Misfit:
 
         return [] if suffices([]) else minimal_part(suffices, list(returns))
 
-    def _poses(self, groups: _Groups) -> Poses:
+    def _explaining(self, groups: _Groups) -> Explaining:
         """Collect the equations for the poses that steps share."""
         headings, positions, wrong = groups
-        said = self.trace.without_displacements_at(wrong) if wrong else self._equations
-        return Poses(said, headings, _of_headings(headings, positions))
+        said = self._equations
+        if wrong:
+            said = Equations.of(self.trace.without_displacements_at(wrong))
+        return Explaining(said, headings, _of_headings(headings, positions), self._prior.wide)
+
+
+def _course_of(ssh_map: SSHMap) -> tuple[Sequence[int], Sequence[Hashable], tuple[int, ...]]:
+    """Return the dstates and places of steps, and the steps with wrong displacements."""
+    places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]
+    names = places if None not in places else ssh_map.dstate_at
+    return ssh_map.dstate_at, names, jumped(ssh_map)
 
 
 def _groups_of(

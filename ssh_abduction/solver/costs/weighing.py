@@ -25,7 +25,7 @@ one: the size of a set of steps that are pairwise at different places.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeAlias
@@ -125,7 +125,9 @@ class Weighing:
         self.bound = 0.0
         self.proven = False
         self.of_labels: OfLabels | None = None
-        self.beams = Beams(parts, self.add, lambda: bool(self.candidates or parts.known.best))
+        self.beams = Beams(
+            parts, self.add, lambda: bool(self.candidates or parts.known.best), self._believed
+        )
         self._task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         self._forced: list[tuple[int, int]] = []  # pairs of steps at one dstate in all cheap maps
         # Faults need the readable encodings, which take too much memory for a long trace.
@@ -379,16 +381,29 @@ class Weighing:
             problem, self._misfit, self.candidates[0].map, self._estimating
         )
         suspected = [rival for rival in misread if rival.nats < found[0].nats + CERTAIN]
+        every = (*found, *self._estimated(found[0], set(rivals)), *suspected)
         return Weighed(
             bound=self.bound,
             within=self._within if self.proven else 0.0,
-            rivals=(*found, *self._estimated(found[0], set(rivals)), *suspected),
+            rivals=tuple(map(self._with_aliases, every)),
             searched=is_likely and self.beams.found(self._nats),
             broken=self.beams.broken,
             excess=excess if excess < math.inf else 1.0,
             doubt=doubt,
             drives=drives_of(problem.trace),
         )
+
+    def _believed(self) -> Set[int]:
+        """Return the numbers of the closures that the best map believes."""
+        closures = range(len(self._task.trace.closures))
+        if not self.candidates:
+            return frozenset(closures)
+        best = self._with_aliases(rival_of(self.candidates[0].map, 0.0))
+        return {i for i in closures if not (best.aliases and best.aliases[i])}
+
+    def _with_aliases(self, rival: Rival) -> Rival:
+        wrong = [step for kind, step in rival.faults if kind == "jumped"]
+        return replace(rival, aliases=self._misfit.aliases_of(rival.dstates, rival.at, wrong))
 
     def _excess(self) -> float:
         """Return the misfit of the returns of the best map, divided by its expected value.
@@ -397,7 +412,7 @@ class Weighing:
         """
         best = self.candidates[0].map
         returns = self._misfit.returns_of(best)
-        square = self._misfit.of_map(best) - self._misfit.of_returns([], jumped(best))
+        square = self._misfit.of_closing(best)
         freedom = sum(3 if found.of == "dstate" else 2 for found in returns)
         if not freedom or gammaincc(freedom / 2, max(square, 0.0) / 2) >= IMPROBABLE:
             return 1.0

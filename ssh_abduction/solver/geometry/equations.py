@@ -4,11 +4,14 @@ A displacement relates a step to the step before, and a closure relates any two 
 three equations, with a covariance. If the robot may be off the pose of its dstate, each step gives
 three more. All displacements share two errors: their scale, and a steady drift of heading. Closures
 have neither error, as they do not depend on how the robot drove.
+
+A closure may be false: a part of the building looks like another one. Then it does not say where
+its last step is, but where this step would be if one part were laid on the other (`Aliases`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -21,6 +24,9 @@ from ssh_abduction.theory.prior import spreads_of
 from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.float64]
+# For each closure of a trace, 0 if it is believed, else the number of the alias that it is of. The
+# closures of one alias lay one part of the building on another part, by one unknown motion.
+Aliases: TypeAlias = tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +42,7 @@ class Equations:
         way: The metres over which the shared drift of heading applies, (n,).
         sigma: The standard deviations of scale and drift, (2,).
         spreads: The variances of the pose at each step, relative to its dstate (`spreads_of`).
+        alias: The alias of each closure, and 0 for each displacement (`Aliases`), (n,).
     """
 
     first: NDArray[np.int_]
@@ -46,10 +53,11 @@ class Equations:
     way: Array
     sigma: Array
     spreads: Array
+    alias: NDArray[np.int_]
 
     @staticmethod
     def of(trace: Trace) -> Equations:
-        """Collect the equations of a trace."""
+        """Collect the equations of a trace. All its closures are believed."""
         odometry = trace.odometry or Odometry()
         steps = [t for t in range(1, len(trace)) if trace.steps[t].displacement is not None]
         matched = trace.closures
@@ -72,6 +80,36 @@ class Equations:
             way=scaled * np.hypot(moved[:, 0], moved[:, 1]),
             sigma=np.array([odometry.scale, odometry.bend]),
             spreads=spreads_of(trace),
+            alias=np.zeros(len(moved), dtype=int),
+        )
+
+    def doubting(self, aliases: Aliases, kept: Collection[int]) -> Equations:
+        """Return the equations with these aliases of closures, and without closures not in `kept`.
+
+        If the alias is negative, it moves the first step of the closure instead of the last one.
+        Then the equation is that of the inverse displacement.
+        """
+        moves = len(self.first) - len(aliases)
+        alias = np.array([0] * moves + [*aliases], dtype=int)
+        back = alias < 0
+        x, y, turned = self.moved.T
+        cos, sin = np.cos(turned), np.sin(turned)
+        inverse = np.stack([-cos * x - sin * y, sin * x - cos * y, -turned], 1)
+        # How an error of a displacement, in its own axes, moves the inverse one.
+        zero, one = np.zeros_like(x), np.ones_like(x)
+        by = -np.array([[cos, sin, -inverse[:, 1]], [-sin, cos, inverse[:, 0]], [zero, zero, one]])
+        by = by.transpose(2, 0, 1)
+        noise = np.where(back[:, None, None], by @ self.noise @ by.transpose(0, 2, 1), self.noise)
+        there = np.array([*range(moves), *(moves + i for i in sorted(kept))], dtype=int)
+        return replace(
+            self,
+            first=np.where(back, self.last, self.first)[there],
+            last=np.where(back, self.first, self.last)[there],
+            moved=np.where(back[:, None], inverse, self.moved)[there],
+            noise=noise[there],
+            scaled=self.scaled[there],
+            way=self.way[there],
+            alias=abs(alias)[there],
         )
 
     def beside(self, labels: NDArray[np.int_], size: int) -> Equations:
@@ -91,6 +129,7 @@ class Equations:
             noise=np.concatenate([self.noise, self.spreads[:, :, None] * np.identity(3)]),
             scaled=np.concatenate([self.scaled, np.zeros(n)]),
             way=np.concatenate([self.way, np.zeros(n)]),
+            alias=np.concatenate([self.alias, np.zeros(n, dtype=int)]),
         )
 
 

@@ -41,6 +41,9 @@ class Rival:
         estimated: Whether the map was made from the best one by giving visits a new place. It fits
             the displacements, but may break an axiom.
         faults: The kind and the step of each fault, such as ("jumped", 7).
+        aliases: For each closure of the trace, 0 if it is true, else the number of the alias that
+            it is of; negative if the alias moves the first step of the closure, not the last one.
+            Empty if all closures are true.
     """
 
     nats: float
@@ -48,6 +51,7 @@ class Rival:
     places: tuple[int, ...] = ()
     estimated: bool = False
     faults: tuple[tuple[str, int], ...] = ()
+    aliases: tuple[int, ...] = ()
 
     @property
     def at(self) -> tuple[int, ...]:
@@ -59,6 +63,7 @@ class Rival:
         written: dict[str, Any] = {"nats": round(self.nats, 6), "dstates": list(self.dstates)}
         written |= {"places": list(self.places)} if self.places else {}
         written |= {"faults": [list(fault) for fault in self.faults]} if self.faults else {}
+        written |= {"aliases": list(self.aliases)} if self.aliases else {}
         return written | ({"estimated": True} if self.estimated else {})
 
 
@@ -219,6 +224,9 @@ class Weighed:
             least = math.floor(100 * self.bound / self.nats)
             text += f" (not proven: no map costs less than {least} % of this one)"
         text += self._misread
+        if aliases := self.rivals[0].aliases:
+            false = sum(map(bool, aliases))
+            text += f"; {false} of {len(aliases)} closures are false, as parts look alike"
         # Name one pair of steps: the one for which it is least sure whether they are one dstate.
         doubted = 1 - self.joins[0][2] if self.joins else 0.0
         if self.missed and self.missed[2] > max(doubted, DOUBTED):
@@ -341,6 +349,7 @@ def _rival(read: FieldReader, steps: int, value: Any, name: str) -> Rival:
         places=read.integers,
         nats=read.number,
         faults=faults,
+        aliases=read.integers,
         estimated=lambda value, _: bool(value),
     )
     if len(rival.dstates) != steps or len(rival.places) not in (0, steps):

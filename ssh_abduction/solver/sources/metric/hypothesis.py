@@ -34,7 +34,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Closure, Displacement, Odometry
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.geometry.equations import noises
-from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.sources.metric.completing import valid_map
 from ssh_abduction.solver.sources.metric.sights import Sight, Sights
 from ssh_abduction.solver.steps.log import Log

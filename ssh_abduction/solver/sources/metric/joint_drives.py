@@ -38,7 +38,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.threads import one_thread
-from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.geometry.fit import poses_of
 from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.solver.sources.metric.hypothesis import Array, Hypothesis, parts_of
 from ssh_abduction.solver.sources.metric.overlay import Overlay, denied_pairs, smoothed
@@ -401,7 +401,7 @@ class ExistingMap:
         """Fit the poses to the old drives and their map."""
         self.broken = 0.0
         with one_thread("blas"):
-            self._fitted = Poses.of_map(old, ssh_map).gaussian()
+            self._fitted = poses_of(old, ssh_map).gaussian()
         self._piece = ssh_map.piece_of
         self._places = numbered(-1 - s.id if s.place is None else s.place for s in ssh_map.dstates)
 

@@ -28,7 +28,7 @@ from ssh_abduction.data.groups import firsts, gathered, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.geometry.equations import visits_by_turns
-from ssh_abduction.solver.geometry.fit import Poses
+from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.sources.metric.hypothesis import (
     BLUR,
     Array,

@@ -1,0 +1,592 @@
+"""Find the poses of dstates that agree best with displacements, by least squares.
+
+A displacement is how the robot moved from one step to the next, by its odometry. A closure is how
+two steps lie relative to each other, by a match of local maps. The unknowns are the position of
+each place (of each dstate, if the map has no places), the heading of each dstate, and two errors
+that all displacements share: their scale, and a steady drift of heading. These two errors have a
+prior. Each displacement and each closure gives three equations (`equations.py`). The best poses
+have the least sum of squares (Lu & Milios 1997, "Globally consistent range scan alignment"). If the
+map is true and the odometry is as good as it claims, this sum is chi-square distributed. The sum
+ranks equally minimal maps, and may cause a warning. It rejects no map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from contextlib import suppress
+from copy import copy
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.linalg import splu
+from scipy.special import gammaincc
+
+from ssh_abduction.data.groups import first_index_of
+from ssh_abduction.data.maps import Fit, Pose
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.solver.geometry.equations import Equations
+from ssh_abduction.solver.work import FIT, FIT_OF_ONE
+from ssh_abduction.theory.evidence.loops import vectors_turned
+
+Array: TypeAlias = NDArray[np.float64]
+
+# With a standard deviation below this, in metres or radians, a displacement counts as exact.
+EXACT = 2e-3
+# But if the mean square error of such displacements is above NOISELESS variances, they have noise.
+NOISELESS = 0.1
+# SWEEPS is the number of iterations of the power method. HELD is the weight that keeps a rotation
+# at its old value. It is small compared with a metre, which has a weight of some hundreds.
+SWEEPS, HELD = 20, 1e-2
+# Levenberg-Marquardt: the least and the highest damping, and the most rounds. It ends if a round
+# lowers the sum of squares by less than the share STILL, or NEARLY for a hypothesis. HELD_STILL is
+# a weight that keeps poses in place if no equation determines them.
+LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-12, 1e8, 100, 1e-10, 1e-4
+HELD_STILL = 1e-9
+# With at most this many unknowns, compute an inverse from a dense matrix.
+DENSE_INVERSE = 3000
+# The share of the diagonal that least squares add to it, far above the rounding errors.
+DAMPING = 1e-10
+
+
+class Poses:
+    """Least squares over positions and headings that the steps of a trace share.
+
+    The vector of unknowns has x and y of each position in metres, then the heading of each dstate
+    in radians, then the motion (x, y, turn) of each alias, then the scale and the drift as
+    multiples of their standard deviations. If the robot is off the poses of dstates, its pose at
+    each step has a position and a heading of its own.
+    """
+
+    def __init__(
+        self, said: Trace | Equations, headings: Sequence[int], positions: Sequence[Hashable]
+    ) -> None:
+        """Collect the equations. Nothing is solved yet.
+
+        `said` is the trace, or the equations of its steps. For each step, `headings` has the number
+        of its unknown heading (mostly its dstate), from 0 without gaps. `positions` has, for each
+        of these headings, the name of the position that it belongs to (mostly the place of the
+        dstate).
+        """
+        self._dstates = len(positions)
+        labels = np.asarray(headings, dtype=int)
+        of_steps = said if isinstance(said, Equations) else Equations.of(said)
+        said = of_steps.beside(labels, self._dstates)
+        if said.spreads.any():
+            positions = [*positions, *((t, "robot") for t in range(len(labels)))]
+        self._from, self._to = said.first, said.last
+        self._moved, self._way, self._sigma = said.moved, said.way, said.sigma
+        self._scaled, self._alias = said.scaled, said.alias
+        self._whitening = np.linalg.inv(np.linalg.cholesky(said.noise))
+        number = {position: i for i, position in enumerate(dict.fromkeys(positions))}
+        self._place = np.array([number[position] for position in positions], dtype=int)
+        self._positions, self._headings = len(number), len(positions)
+        self._known = 2 * self._positions + self._headings
+        self._size = self._known + 3 * int(self._alias.max(initial=0)) + 2
+        # A group is the headings that displacements connect. A part of the map is the positions
+        # that they connect.
+        sure = self._alias == 0
+        graph = _graph(self._from[sure], self._to[sure], self._headings)
+        # The poses on both sides of each missing displacement, and the pose of the first step.
+        steps = np.arange(self._dstates, self._headings) if said.spreads.any() else labels
+        missing = np.setdiff1d(range(1, len(labels)), of_steps.last[of_steps.scaled == 1])
+        self._missing, self._origin = (steps[missing - 1], steps[missing]), int(labels[0])
+        self._group = connected_components(graph, directed=False)[1]
+
+    @cached_property
+    def best(self) -> tuple[Array, float]:
+        """The unknowns with the least sum of squares, and this sum."""
+        return self._best()
+
+    def misfit(self, near: Poses | None = None) -> float:
+        """Compute the least chi-square; only about, if begun at poses with the same unknowns."""
+        return self._best(near.best[0], NEARLY)[1] if near else self.best[1]
+
+    def likelihood(self, wide: Array) -> tuple[float, float]:
+        """Compute the least chi-square, and -log of the marginal likelihood of the displacements.
+
+        `wide` has the variances of x, y and heading of the prior (`Prior`).
+        """
+        unknown, square = self.best
+        return square, square / 2 + self._volume(unknown, wide)
+
+    def predicting(
+        self, others: Sequence[Poses], rows: NDArray[np.int_], wide: Array
+    ) -> tuple[Array, Array]:
+        """Compute how well the best poses predict some equations that they were not fitted to.
+
+        Args:
+            others: Poses with the same unknowns, (m,). They have these equations in different ways.
+            rows: The numbers of these equations, (n,).
+            wide: As in `likelihood`.
+
+        Returns:
+            The chi-squares, and the nats by which the equations are less surely predicted than by
+            their own covariance, each (m, n).
+        """
+        unknown = self.best[0]
+        factor = self._factored(unknown, wide)
+        squares, nats = np.zeros((2, len(others), len(rows)))
+        for i, other in enumerate(others):
+            by = other._jacobian(unknown, of_world=True)[: 3 * len(other._moved)]
+            off = other._residuals(unknown)[: by.shape[0]].reshape(-1, 3)[rows]
+            by = by.toarray().reshape(-1, 3, self._size)[rows]
+            spread = factor.solve(by.reshape(-1, self._size).T).T.reshape(by.shape)
+            whole = np.identity(3) + np.einsum("nij,nkj->nik", by, spread)
+            squares[i] = np.einsum("ni,ni->n", off, np.linalg.solve(whole, off[..., None])[..., 0])
+            nats[i] = np.linalg.slogdet(whole)[1] / 2
+        return squares, nats
+
+    def settled(
+        self, start: Array, fixed: Sequence[int], wanted: Sequence[int], wide: Array
+    ) -> tuple[float, Array, Array]:
+        """Find the unknowns with the least chi-square, and the covariance of the wanted ones.
+
+        `start` has unknowns to begin with. `fixed` and `wanted` are indices of unknowns: those
+        whose values are known, and those whose covariance is wanted. The likelihood is returned
+        first, as in `likelihood`.
+        """
+        unknown, square = self._best(start, NEARLY)
+        nats = square / 2 + self._volume(unknown, wide)
+        return nats, unknown, self._covariance(unknown, fixed, wanted)
+
+    def gaussian(self) -> tuple[list[int], Array, Array, Array]:
+        """Find the poses of the dstates and their covariance, relative to a dstate of each part.
+
+        Returns, for each dstate, its part of the map; the means, as one vector; the covariance; and
+        the chi-square of each part. The vector has x and y of each place, in the order of the first
+        dstates there, and then the heading of each dstate.
+        """
+        part, _, fixed = self._origins()
+        facing = 2 * self._positions
+        xy = range(2 * int(self._place[: self._dstates].max()) + 2)
+        entries = [*xy, *range(facing, facing + self._dstates)]
+        unknown, of = self.best[0], self._parts()
+        errors = (self._residuals(unknown)[:-2] ** 2).reshape(-1, 3).sum(axis=1)
+        squares = np.zeros(int(of.max()) + 1)
+        np.add.at(squares, of[self._place[self._from]], errors)
+        covariance = self._covariance(unknown, fixed, entries)
+        return part, unknown[entries], covariance, squares
+
+    def _best(self, start: Array | None = None, still: float = STILL) -> tuple[Array, float]:
+        """Find the unknowns with the least sum of squares, and this sum.
+
+        `start` has unknowns to begin with; None to compute some. End if a round lowers the sum of
+        squares by less than the share `still`.
+        """
+        unknown = self._begun() if start is None else start
+        off = self._residuals(unknown)
+        # Levenberg-Marquardt: damp a step more until it lowers the sum of squares.
+        damping = LEAST_DAMPING
+        for _ in range(ROUNDS if len(self._moved) else 0):
+            jacobian = self._jacobian(unknown)
+            normal, gradient = jacobian.T @ jacobian, jacobian.T @ off
+            scale = normal.diagonal() + HELD_STILL
+            while True:
+                step = system_solved(normal, damping * scale, -gradient)
+                better = self._residuals(unknown + step)
+                gain = float(off @ off - better @ better)
+                if gain >= 0 or damping > MOST_DAMPING:
+                    break
+                damping *= 10
+            if gain < 0:
+                break
+            unknown, off, damping = unknown + step, better, max(damping / 10, LEAST_DAMPING)
+            if gain <= still * (1 + float(off @ off)):
+                break
+        return unknown, float(off @ off)
+
+    def fit(self) -> Fit:
+        """Find the best poses, and compute how well they agree with the displacements."""
+        unknown, square = self.best
+        freedom = self._freedom(unknown)
+        p = float(gammaincc(freedom / 2, square / 2)) if freedom > 0 else 1.0
+        scale, bend = (float(x) for x in unknown[-2:] * self._sigma)
+        return Fit(square, freedom, p, scale, bend, self._poses(unknown))
+
+    def _begun(self) -> Array:
+        """Compute initial values of the unknowns, as one vector."""
+        unknown = np.zeros(self._size)
+        # Solve for the headings first: that is linear, except for whole turns. Once the headings
+        # are known, solving for the positions is linear, too (Carlone et al. 2014).
+        reckoned = self._reckoned()
+        off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
+        off -= math.tau * np.round(off / math.tau)
+        heading = reckoned + least_squares(
+            _differences(self._from, self._to, self._headings), off, self._weights(2)
+        )
+        if self._group.max() > 0:
+            onward = vectors_turned(self._moved[:, :2], heading[self._from])
+            heading += self._rotations(onward)[self._group]
+        onward = vectors_turned(self._moved[:, :2], heading[self._from])
+        at, facing, _ = self._split(unknown)
+        at[:], facing[:] = least_squares(self._moves(), onward, self._weights(0)), heading
+        # Begin the motion of an alias with one of its closures.
+        for c in np.flatnonzero(self._alias).tolist():
+            turn = heading[self._from[c]] + self._moved[c, 2] - heading[self._to[c]]
+            there = vectors_turned(at[self._place[self._to[c]]][None], np.array([turn]))[0]
+            gone = at[self._place[self._from[c]]] + onward[c] - there
+            x = self._known + 3 * (int(self._alias[c]) - 1)
+            unknown[x : x + 3] = *gone, turn
+        return unknown
+
+    def _reckoned(self) -> Array:
+        """Compute the heading of each dstate in radians, relative to the first one of its group.
+
+        Turns are added up along the fewest displacements. A group is the dstates that displacements
+        connect.
+        """
+        heading = np.zeros(self._headings)
+        rotated: dict[tuple[int, int], float] = {}
+        sure = self._alias == 0
+        first, last, angles = (of[sure] for of in (self._from, self._to, self._moved[:, 2]))
+        graph = _graph(first, last, self._headings)
+        for s, x, angle in zip(first.tolist(), last.tolist(), angles.tolist(), strict=True):
+            rotated[x, s], rotated[s, x] = -angle, angle
+        for start in np.unique(self._group, return_index=True)[1].tolist():
+            order, before = breadth_first_order(graph, start, directed=False)
+            for x, s in zip(order[1:].tolist(), before[order[1:]].tolist(), strict=True):
+                heading[x] = heading[s] + rotated[s, x]
+        return heading
+
+    def _rotations(self, onward: Array) -> Array:
+        """Find how to rotate each group of headings so that positions agree best, in radians.
+
+        The rotations are complex numbers on the unit circle that minimise a quadratic form. The
+        power method for its inverse finds them (Boumal 2016, "Nonconvex phase synchronization"). If
+        positions do not determine a rotation, it is arbitrary. `onward` has the displacements in
+        metres, (n, 2), turned by the present headings.
+        """
+        size = int(self._group.max()) + 1
+        inverse = np.linalg.inv(self._misfit(onward) + HELD * np.identity(size))
+        rotation: NDArray[np.complex128] = np.exp(
+            1j * np.random.default_rng(0).uniform(-math.pi, math.pi, size)
+        )
+        for _ in range(SWEEPS):
+            look_at_clock()
+            rotation = inverse @ rotation
+            rotation /= np.maximum(abs(rotation), 1e-300)
+        angles: Array = np.angle(rotation)
+        return angles
+
+    def _misfit(self, onward: Array) -> NDArray[np.complex128]:
+        """Compute the matrix of the quadratic form that says how badly rotations of groups fit.
+
+        For given rotations, the form is the least sum of squares that any positions have. Vectors
+        in the plane are complex numbers. `onward` has the displacements in metres, (n, 2), turned
+        by the headings before the rotations.
+        """
+        weights = self._weights(0)
+        vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
+        columns = np.arange(len(vectors)), self._group[self._from]
+        turns = csr_array((vectors, columns), shape=(len(vectors), int(self._group.max()) + 1))
+        moves = diags_array(weights) @ self._moves()
+        mixed = (moves.T @ turns).toarray()
+        square = moves.T @ moves
+        held = 1e-9 * max(float(square.diagonal().max()), 1.0)
+        best = system_solved(square, np.full(self._positions, held), mixed)
+        form: NDArray[np.complex128] = (turns.conj().T @ turns).toarray() - mixed.conj().T @ best
+        return form
+
+    def _moves(self) -> Any:
+        """Make the matrix that maps the x (or y) of positions to the x (or y) of displacements."""
+        return _differences(self._place[self._from], self._place[self._to], self._positions)
+
+    def _weights(self, axis: int) -> Array:
+        """Return about 1 / the standard deviation of displacements in x, y or turn (0, 1, 2).
+
+        Closures that are not believed have weight 0.
+        """
+        weights: Array = np.sqrt((self._whitening[:, :, axis] ** 2).sum(1)) * (self._alias == 0)
+        return weights
+
+    def _split(self, unknown: Array) -> tuple[Array, Array, Array]:
+        """Return views of the positions, (n, 2), and headings, and the motion of each equation.
+
+        The motion (x, y, turn) is that of its alias; 0 without one, (equations, 3).
+        """
+        at, facing, motions, _ = np.split(unknown, [2 * self._positions, self._known, -2])
+        motions = np.concatenate([np.zeros((1, 3)), motions.reshape(-1, 3)])
+        return at.reshape(-1, 2), facing, motions[self._alias]
+
+    def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
+        """Predict the displacements from the unknowns, in metres and radians, (n, 3).
+
+        Also return the cosine and sine of the heading halfway through each displacement.
+        """
+        _, heading, motions = self._split(unknown)
+        scale, bend = unknown[-2:] * self._sigma
+        gone = self._gone(unknown)
+        facing = heading[self._from] - bend * self._way / 2
+        cos, sin = np.cos(facing), np.sin(facing)
+        ahead, left = cos * gone[:, 0] + sin * gone[:, 1], cos * gone[:, 1] - sin * gone[:, 0]
+        rotated = heading[self._to] - heading[self._from] + bend * self._way + motions[:, 2]
+        scale = 1 + scale * self._scaled
+        return np.stack([scale * ahead, scale * left, rotated], axis=1), cos, sin
+
+    def _residuals(self, unknown: Array) -> Array:
+        """Compute predicted minus actual displacements, and the priors, in standard deviations."""
+        look_at_clock(FIT + FIT_OF_ONE * len(self._moved))
+        predicted = self._predicted(unknown)[0]
+        off = predicted - self._moved
+        off[:, 2] -= math.tau * np.round(off[:, 2] / math.tau)
+        return np.concatenate([np.einsum("nij,nj->ni", self._whitening, off).ravel(), unknown[-2:]])
+
+    def _jacobian(self, unknown: Array, of_world: bool = False) -> Any:
+        """Compute the derivative of the residuals with respect to the unknowns.
+
+        If `of_world`, the errors of displacements are in metres of the world, without the scale.
+        """
+        predicted, cos, sin = self._predicted(unknown)
+        # Unknowns are the positions of places (two each), the headings of dstates, scale and drift.
+        scale = 1 + unknown[-2] * self._sigma[0] * self._scaled
+        if of_world:
+            predicted[:, :2] /= scale[:, None]
+        m, heading = len(self._moved), 2 * self._positions
+        zero, turn = np.zeros(m), np.tile([0.0, 0.0, 1.0], (m, 1))
+        ahead, left = predicted[:, 0], predicted[:, 1]
+        by_x = np.stack([scale * cos, -scale * sin, zero], 1)
+        by_y = np.stack([scale * sin, scale * cos, zero], 1)
+        by_facing = np.stack([left, -ahead, zero], 1)
+        by_scale = np.stack([ahead, left, zero], 1)
+        by_scale *= (self._sigma[0] * self._scaled / scale)[:, None]
+        if of_world:
+            by_x, by_y = by_x / scale[:, None], by_y / scale[:, None]
+        by_bend = (-by_facing / 2 + turn) * self._way[:, None] * self._sigma[1]
+        # An alias moves the last step of a closure. So x there moves it along the turned axes.
+        c = np.flatnonzero(self._alias)
+        motion = self._known + 3 * (self._alias[c] - 1)
+        at, _, motions = self._split(unknown)
+        angle = motions[:, 2:]
+        to_x = np.cos(angle) * by_x + np.sin(angle) * by_y
+        to_y = np.cos(angle) * by_y - np.sin(angle) * by_x
+        x, y = at[self._place[self._to[c]]].T[..., None]
+        columns = [
+            (2 * self._place[self._to], to_x),
+            (2 * self._place[self._to] + 1, to_y),
+            (2 * self._place[self._from], -by_x),
+            (2 * self._place[self._from] + 1, -by_y),
+            (heading + self._from, by_facing - turn),
+            (heading + self._to, turn),
+            (np.full(m, self._size - 2), by_scale),
+            (np.full(m, self._size - 1), by_bend),
+        ]
+        values = np.einsum("nij,knj->kni", self._whitening, [by for _, by in columns]).ravel()
+        rows = np.tile(np.arange(3 * m), len(columns))
+        of = np.repeat(np.concatenate([column for column, _ in columns]), 3)
+        if len(c):
+            by_motion = [by_x[c], by_y[c], x * to_y[c] - y * to_x[c] + turn[c]]
+            more = np.einsum("nij,knj->kni", self._whitening[c], by_motion)
+            values = np.append(values, more)
+            rows = np.append(rows, np.tile((3 * c[:, None] + np.arange(3)).ravel(), 3))
+            of = np.append(of, np.repeat(np.concatenate([motion + k for k in range(3)]), 3))
+        # Scale and drift have a prior each: a last row with a single 1.
+        rows, of = np.append(rows, [3 * m, 3 * m + 1]), np.append(of, self._size - np.array([2, 1]))
+        return csr_array((np.append(values, [1.0, 1.0]), (rows, of)), shape=(3 * m + 2, self._size))
+
+    def _factored(self, unknown: Array, wide: Array) -> Any:
+        """Factor the information matrix of the unknowns.
+
+        Where a displacement is missing, the prior connects the poses on both sides. So the matrix
+        is regular.
+        """
+        whole, missing = copy(self), self._missing
+        none = np.zeros(len(missing[0]))
+        whole._from = np.concatenate([self._from, missing[0]])
+        whole._to = np.concatenate([self._to, missing[1]])
+        whole._way = np.concatenate([self._way, none])
+        whole._scaled = np.concatenate([self._scaled, none])
+        whole._alias = np.concatenate([self._alias, none.astype(int)])
+        roots = np.tile(np.diag(wide**-0.5), (len(none), 1, 1))
+        whole._whitening = np.concatenate([self._whitening, roots])
+        whole._moved = np.zeros((len(whole._from), 3))
+        jacobian = whole._jacobian(unknown, of_world=True)
+        first = np.zeros(self._size)
+        x = 2 * int(self._place[self._origin])
+        first[[x, x + 1, 2 * self._positions + self._origin]] = 1 / wide
+        return splu((jacobian.T @ jacobian + diags_array(first)).tocsc())
+
+    def _volume(self, unknown: Array, wide: Array) -> float:
+        """Compute -log of the marginal likelihood without the misfit.
+
+        The result lacks what does not depend on the map (`Prior.base`).
+        By Laplace's approximation, the integral over the poses is a Gaussian around the best ones
+        (MacKay 2003, chapter 28).
+        """
+        factor = self._factored(unknown, wide)
+        size = float(np.log(np.abs(factor.U.diagonal())).sum()) / 2
+        places, robots = (
+            len({*self._place[: self._dstates].tolist()}),
+            self._headings - self._dstates,
+        )
+        size += int(self._alias.max(initial=0)) * float(np.log(wide).sum()) / 2
+        each = math.log(wide[0]), math.log(wide[2]) / 2, -1.5 * math.log(math.tau)
+        return size + places * each[0] + self._dstates * each[1] + robots * each[2]
+
+    def _parts(self) -> NDArray[np.int_]:
+        """For each position, find its part of the map. No displacement connects two parts."""
+        sure = self._alias == 0
+        graph = _graph(self._place[self._from[sure]], self._place[self._to[sure]], self._positions)
+        part: NDArray[np.int_] = connected_components(graph, directed=False)[1]
+        return part
+
+    def _freedom(self, unknown: Array) -> int:
+        """Count the degrees of freedom: equations minus the unknowns that they determine.
+
+        The equations determine neither where each part of the map is nor how it is turned, nor how
+        some groups of headings are turned. A displacement with hardly any noise (EXACT) determines
+        as many unknowns as it has equations. So it adds no freedom, unless such displacements have
+        the little noise that they claim.
+        """
+        said = np.union1d(self._from, self._to)
+        used = np.unique(self._place[said])
+        parts = len(np.unique(self._parts()[used]))
+        exact = (1 / np.sqrt((self._whitening**2).sum(1)) < EXACT).ravel()
+        errors = self._residuals(unknown)[: len(exact)][exact]
+        if exact.any() and (errors**2).mean() > NOISELESS:
+            exact[:] = False
+        settled = 0
+        if exact.any():
+            look_at_clock()
+            rows = self._jacobian(unknown)[: len(exact)][exact].toarray()
+            # Turns at one place say nothing about positions. So most rows and columns are zero.
+            rows = rows[rows.any(axis=1)][:, rows.any(axis=0)]
+            settled = int(np.linalg.matrix_rank(rows)) if rows.size else 0
+        open_ones = 2 * parts + self._open_rotations(unknown, said, parts)
+        determined = 2 * len(used) + len(said) - open_ones
+        motions = int(self._alias.max(initial=0))  # each has three unknowns
+        return len(exact) - int(exact.sum()) - (determined + 3 * motions - settled)
+
+    def _open_rotations(self, unknown: Array, said: NDArray[np.int_], parts: int) -> int:
+        """Count the independent rotations of groups of headings that displacements leave open."""
+        groups = np.unique(self._group[said])
+        if len(groups) == parts:
+            return parts
+        form = self._misfit(self._gone(unknown)).real[np.ix_(groups, groups)]
+        return int((np.linalg.eigvalsh(form) < 1e-6 * max(float(form.diagonal().max()), 1.0)).sum())
+
+    def _gone(self, unknown: Array) -> Array:
+        """Return how far positions lie from each other along each displacement, (n, 2)."""
+        at, _, motions = self._split(unknown)
+        there = at[self._place[self._to]]
+        if motions.any():
+            there = vectors_turned(there, motions[:, 2]) + motions[:, :2]
+        gone: Array = there - at[self._place[self._from]]
+        return gone
+
+    def _origins(self) -> tuple[list[int], list[int], list[int]]:
+        """Return for each dstate its part of the map, and the first dstate of this part.
+
+        Also list the unknowns of the poses of these first dstates.
+        """
+        part = self._parts()[self._place[: self._dstates]].tolist()
+        first = first_index_of(part)
+        xs = [2 * int(self._place[s]) for s in first.values()]
+        headings = [2 * self._positions + s for s in first.values()]
+        return part, [first[of] for of in part], [*xs, *(x + 1 for x in xs), *headings]
+
+    def _poses(self, unknown: Array) -> tuple[Pose, ...]:
+        """Compute the pose and covariance of each dstate, relative to the first of its part."""
+        _, origin, fixed = self._origins()
+        place, heading = self._place[: self._dstates], self._split(unknown)[1]
+        at, back = self._split(unknown)[0][place], -heading[origin]
+        moved = vectors_turned(at - at[origin], back)
+        facing = heading[: self._dstates] + back
+        # Turn both the rows and the columns of the covariance of each position.
+        whole = self._covariance(unknown, fixed, range(2 * int(place.max()) + 2))
+        xy = 2 * place[:, None] + [0, 1]
+        spreads = whole[xy[:, :, None], xy[:, None, :]]
+        for _ in range(2):
+            spreads = vectors_turned(spreads, back[:, None]).transpose(0, 2, 1)
+        return tuple(
+            Pose(float(x), float(y), math.remainder(float(angle), math.tau), covariance)
+            for (x, y), angle, covariance in zip(
+                moved, facing, map(tuple, spreads[:, [0, 0, 1], [0, 1, 1]].tolist()), strict=True
+            )
+        )
+
+    def _covariance(self, unknown: Array, fixed: Sequence[int], wanted: Sequence[int]) -> Array:
+        """Compute the covariance of the wanted unknowns, given that the fixed ones are known."""
+        look_at_clock()
+        jacobian = self._jacobian(unknown)
+        free = np.setdiff1d(np.arange(self._size), fixed)
+        information = (jacobian.T @ jacobian)[free][:, free]
+        held = 1e-12 * max(float(information.diagonal().max()), 1.0) if len(free) else 0.0
+        is_free = ~np.isin(wanted, fixed)
+        rows = np.searchsorted(free, np.asarray(wanted)[is_free])
+        covariance: Array = np.zeros((len(wanted), len(wanted)))
+        covariance[np.ix_(is_free, is_free)] = inverse(information, np.full(len(free), held), rows)
+        return covariance
+
+
+def _graph(first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
+    """Make a graph of `size` nodes from the ends of its edges, as a sparse matrix."""
+    return csr_array((np.ones(len(first)), (first, second)), shape=(size, size))
+
+
+def _differences(first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> Any:
+    """Make the matrix that maps a vector x to the differences x[second] - x[first]."""
+    identity = eye_array(size, format="csr")
+    return identity[second] - identity[first]
+
+
+def system_solved(square: Any, added: Array, right: Any) -> Any:
+    """Solve a linear system after adding n numbers to the diagonal of its n x n matrix."""
+    whole = (square + diags_array(added)).tocsc()
+    return splu(whole.astype(right.dtype)).solve(right)
+
+
+def least_squares(some: Any, values: Array, weights: Array) -> Array:
+    """Solve a system by weighted least squares. Of several solutions return nearly the smallest.
+
+    `values` may have several columns. Each is solved for by itself.
+    """
+    squared = some.T @ diags_array(weights**2)
+    normal = squared @ some
+    scale = normal.diagonal()
+    # A little damping makes the matrix regular, even if there are no equations.
+    damping = DAMPING * (scale + (scale.max() or 1.0))
+    found: Array = system_solved(normal, damping, squared @ values)
+    return found
+
+
+def inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
+    """Compute some rows, and the same columns, of the inverse of a symmetric n x n matrix.
+
+    The n numbers in `added` are added to its diagonal.
+    """
+    block = connected_components(csr_array(square), directed=False)[1]
+    found = np.zeros((len(rows), len(rows)))
+    for name in np.unique(block[rows]):
+        look_at_clock()
+        own, wanted = np.flatnonzero(block == name), np.flatnonzero(block[rows] == name)
+        part = square[own][:, own]
+        found[np.ix_(wanted, wanted)] = _block_inverse(
+            part, added[own], np.searchsorted(own, rows[wanted])
+        )
+    return found
+
+
+def _block_inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
+    """Compute the same as `inverse` at once."""
+    if square.shape[0] <= DENSE_INVERSE:
+        # If these rows come last, the wanted part of the inverse depends only on the last block of
+        # the Cholesky factor.
+        order = np.concatenate([np.setdiff1d(np.arange(len(added)), rows), rows])
+        with suppress(np.linalg.LinAlgError):
+            whole = square.toarray() + np.diag(added)
+            factor = np.linalg.cholesky(whole[np.ix_(order, order)])
+            first = len(order) - len(rows)
+            root = solve_triangular(factor[first:, first:], np.identity(len(rows)), lower=True)
+            part: Array = root.T @ root
+            return part
+    columns = np.zeros((len(added), len(rows)))
+    columns[rows, np.arange(len(rows))] = 1.0
+    found: Array = system_solved(square, added, columns)[rows]
+    return found
