@@ -591,3 +591,19 @@ def test_assertions_enlarge_the_pinned_clique() -> None:
     )  # steps 0, 2 and 4, and so 1 and 3, from which the same action leads to two of these
     assert solution.cost == solve(trace, theory, speedups=Speedups.without(SPEEDUPS)).cost
     assert check(trace, solution.maps[0], theory) == ()
+
+
+def test_rule_that_can_never_fire_is_warned_of() -> None:
+    """Views are texts, so view(t,v0) without quotes matches no step."""
+    rules = Rules(
+        "own.lp",
+        "% @axiom(m) x.\n#program step(t).\nviolation(m,t) :- view(t,v0), view(t-1,_).\n"
+        'violation(m,t) :- view(t,"v0"), act(t-1,stay), not view(t-1,v1), same(I,t).\n',
+    )
+    trace = Trace.from_steps(["v0", "v1", "v0"], ["go", "go"])
+    solution = solve(trace, Theory.causal().replace(rules=[rules]))
+    assert solution.warnings == (
+        'own.lp:3: view(t,v0) holds at no step of this trace, so its rule has no effect; write "v0" '
+        "in quotes",
+        "own.lp:4: act((t-1),stay) holds at no step of this trace, so its rule has no effect",
+    )

@@ -14,6 +14,7 @@ from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
 from ssh_abduction.runtime.loggers import PROGRESS
 from ssh_abduction.solver.asp.limits import Stop, Watch, check_limit
+from ssh_abduction.solver.asp.own_rules import never_true
 from ssh_abduction.solver.board import Judging, Known
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.geometry.ranking import in_order, noise_warning, units_warning
@@ -310,7 +311,8 @@ class Answer:
         warning = None
         if self._first and self._first.fit:
             warning = units_warning(trace) or noise_warning(self._first, trace)
-        return Support(self._basis or self._basis_of(size)).warning_of(warning)
+        silent = never_true(parts.task.problem)
+        return Support(self._basis or self._basis_of(size)).warning_of(warning, *silent)
 
     def in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:
         """Sort the maps of each level into an order that is the same in each run.

@@ -25,11 +25,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from itertools import combinations
 from typing import NamedTuple
 
-from clingo import ast
+from clingo import Function, ast
 
 from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.groups import first_index_of, indices_of
@@ -367,6 +368,40 @@ def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
         while not handle.wait(POLL):
             look_at_clock()
         return bool(handle.get().satisfiable)
+
+
+def never_true(problem: Problem) -> Iterator[str]:
+    """Yield a warning for each atom in a user's rules that no fact of the trace matches.
+
+    A rule with such an atom has no effect. Facts of a trace are known before the search, so clingo
+    only has to ground a rule with this atom alone. The parameter of a part stands for any step.
+    """
+    trace, theory = problem.trace, problem.theory
+    control = Control(check=look_at_clock, logger=lambda *_: None)
+    control.add("base", [], facts.trace_facts(problem, 0, len(trace) if theory.rules else 0))
+    control.ground([("base", [])])
+    for rules in theory.rules:
+        for statement in _statements(rules):
+            for atom in (atom for atom, positive in statement.read if positive):
+                if atom.name not in OF_TRACE - READABLE - {"query"}:
+                    continue
+                some_step = rf"\b{statement.parameter}\b" if statement.parameter else "(?!)"
+                alone, line = re.sub(some_step, "Step__", str(atom)), atom.location.begin.line
+                name = f"holds_{len(rules.name)}_{line}_{atom.location.begin.column}"
+                with suppress(RuntimeError):  # clingo cannot bind a step that is computed
+                    control.add(name, [], f"{name} :- {alone}.")
+                    control.ground([(name, [])])
+                    if control.symbolic_atoms[Function(name)] is None:
+                        hint = _as_text(atom, trace)
+                        yield f"{rules.name}:{line}: {atom} holds at no step of this trace{hint}"
+
+
+def _as_text(atom: ast.AST, trace: Trace) -> str:
+    """Make a hint if a constant in an atom is a view or an action of the trace without quotes."""
+    given = {str(part) for part in atom.arguments}
+    names = {*map(str, trace.views), *(action.name for action in trace.actions)}
+    some = next((f'; write "{name}" in quotes' for name in sorted(given & names)), "")
+    return f", so its rule has no effect{some}"
 
 
 def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
