@@ -14,8 +14,10 @@ import pytest
 from perception.places.passages import STEP, doors_in, openings_in, resampled
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.building.derive import with_building
+from ssh_abduction.building.directions import directions_to
 from ssh_abduction.building.telling import told
-from ssh_abduction.data.maps import DState, Fit, Pose
+from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.maps import DState, Fit, Name, Pose
 from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.solver.derived_paths import PRICE, best_pairings, chains_of, sides_of
 
@@ -300,3 +302,40 @@ def test_sides_are_disjoint() -> None:
     beside, around = sides_of([(0, 1), (0, 2)], [(0, 1, "left", 5), (0, 2, "right", 6)], joined)
     assert beside == set()
     assert around == {(0, 5), (0, 6), (0, 7), (0, 8)}
+
+
+def test_routes_are_told_in_words() -> None:
+    doors = [(1, 4), (2, 5)]
+    ssh_map, trace = drive(CROSS, TOUR, doors=doors)
+    found = with_building(ssh_map, trace)
+    named = replace(found, names=(Name("place", 5, "kitchen"), Name("corridor", 0, "main street")))
+    assert directions_to(named, trace, [0], [5]) == (
+        "go 10 m along main street, past a door on your left, to the first opening on the right",
+        "turn right",
+        "go 6 m on, through the door, to place 5 (kitchen)",
+    )
+    assert directions_to(named, trace, [4], [5]) == (
+        "go 6 m on, through the door, to the first opening on the left",
+        "turn left into main street",
+        "go 5 m along main street, to the first opening on the right",
+        "turn right",
+        "go 6 m on, through the door, to place 5 (kitchen)",
+    )
+    assert directions_to(named, trace, [0], [0, 3]) == (
+        "there is nothing to do: the start is at the goal",
+    )
+    with pytest.raises(MapError, match="poses"):
+        directions_to(replace(named, fit=None), trace, [0], [5])
+
+
+def test_an_opening_that_was_never_driven_through_is_counted() -> None:
+    ssh_map, trace = drive(CROSS, TOUR)
+    first = trace.steps[0]
+    seen = {**first.extra, "doors": [{"at": 2.5, "width": 0.9, "side": "right"}]}
+    trace = Trace((replace(first, extra=seen), *trace.steps[1:]))
+    found = with_building(ssh_map, trace)
+    corridor = found.corridors[0]
+    (opening,) = (o for o in corridor.openings if o.place is None)
+    assert opening.metres in (2.5, 12.5)
+    first_leg, *_ = directions_to(found, trace, [0], [5])
+    assert first_leg.endswith("to the second opening on the right")

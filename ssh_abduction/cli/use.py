@@ -191,6 +191,14 @@ def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
             "made. With places, it may use any move along a path of the map, and drive back where "
             "it came from (default: actions or, if none lead there, places)"
         ),
+        "--words": (
+            "tell the shortest way in words: distances, turns, doors, and counted openings; needs "
+            "the trace of the map"
+        ),
+        "--trace TRACE": (
+            "with --words, the trace that was mapped (default: the trace that solve -o or map "
+            "wrote with the maps)"
+        ),
         **shared.ONE_MAP,
         **shared.JSON,
     }
@@ -210,6 +218,8 @@ def run_route(options: argparse.Namespace) -> int:
     listing = Listing.load(options.maps)
     given = {name.text for ssh_map in listing.maps for name in ssh_map.names}
     avoid = _names(options.avoid, given)
+    if options.words:
+        return _tell_way(options, listing)
     with said_of(listing.source, MapError):
         how: dict[str, Any] = {"by": options.by, "map": options.map}
         found = route(listing, options.start, options.goal, avoid=avoid, **how)
@@ -238,6 +248,36 @@ def run_route(options: argparse.Namespace) -> int:
         ]
         metres = [] if found.metres is None else ["metres"]
         print(table(["action", "dstate", "expect", "place", "path", *metres, ""], rows))
+    return 0
+
+
+def _tell_way(options: argparse.Namespace, listing: Listing) -> int:
+    """Print a route in words."""
+    from ssh_abduction.building.directions import directions_to
+    from ssh_abduction.online.routes import MoveGraph
+
+    if options.avoid or options.by:
+        flag = "--avoid" if options.avoid else "--by"
+        raise MapError(f"{flag}: expected none with --words, which tells the shortest way; drop it")
+    ssh_map = _built(options, listing, listing.maps[listing.number(options.map)])
+    trace = shared.mapped_trace(options.maps, options.trace)
+    if trace is None:
+        raise MapError(
+            f"{named(options.maps)}: --words: expected the trace of the map, got none; name it "
+            "with --trace"
+        )
+    with said_of(listing.source, MapError):
+        graph = MoveGraph(ssh_map, "actions", listing.drives)
+        last = f"d{ssh_map.dstate_at[-1]}"
+        ends = graph.nodes(options.start or last, "from"), graph.nodes(options.goal, "to")
+        here, there = (
+            [p for node in nodes if (p := graph.course(node)[0]) is not None] for nodes, _ in ends
+        )
+        told = directions_to(ssh_map, trace, here, there)
+    if options.json:
+        print(json_line({"from": ends[0][1], "to": ends[1][1], "words": list(told)}))
+    else:
+        print(printable("; ".join(told)))
     return 0
 
 

@@ -417,6 +417,12 @@ class MoveGraph:
                 raise MapError(f"{field}: {error}") from None
         region = next((r for r in self.map.regions or () if r.id == number), None)
         places = {"place": {number}, "region": {*region.places} if region else set()}
+        for room in self.map.rooms:
+            if (kind, number) == ("room", room.id):
+                places["room"] = {*room.places}
+        for corridor in self.map.corridors:
+            if (kind, number) == ("corridor", corridor.id):
+                places["corridor"] = {*corridor.order}
         found: set[Node] = {
             s.id
             for s in self.map.dstates
@@ -428,7 +434,9 @@ class MoveGraph:
             return found, self.map.called(kind, number)
         known = f", or a place as p{self.map.places[0]}" if self.map.places else ""
         known += ", or a region as region0" if self.map.regions else ""
-        names = [n.text for n in self.map.names if n.kind in ("place", "region")]
+        names = [
+            n.text for n in self.map.names if n.kind in ("place", "region", "room", "corridor")
+        ]
         known += f", or {', '.join(names)}" if names else ""
         raise MapError(
             f"{field}: expected a dstate, 0 to {len(self.map.dstates) - 1}{known}, got "
