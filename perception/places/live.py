@@ -311,7 +311,7 @@ class Teller:
     """Tells each kind of note once to a function `tell`, as soon as it is known."""
 
     def __init__(self, tell: Tell) -> None:
-        self._tell = tell
+        self.to = tell  # where the notes go
         self.notes: list[str] = []  # the notes so far
         self.kinds: set[str] = set()
 
@@ -322,7 +322,7 @@ class Teller:
             if kind not in self.kinds:
                 self.kinds.add(kind)
                 self.notes.append(note)
-                self._tell(note)
+                self.to(note)
 
 
 def watched(scans: Iterable[Scan], tell: Teller, source: str = "") -> Iterator[Scan]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ from ssh_abduction.cli import import_log
 from ssh_abduction.cli.outcome import StopFlag, warn
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted
-from ssh_abduction.data.errors import AbductionError, named
+from ssh_abduction.data.errors import named
 
 if TYPE_CHECKING:
     from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper
@@ -36,6 +37,12 @@ def positive(text: str) -> float:
         "--replay LOG": f"replay a log instead of listening to ROS 2: {import_log.LOG_SAID}",
         "--speed X": (
             "replay this many times as fast as the robot drove (default: as fast as possible)",
+            {"type": positive},
+        ),
+        "--scan TOPIC=/scan": "topic of the LaserScan",
+        "--odom TOPIC=/odom": "topic of the Odometry",
+        "--idle S": (
+            "end when no message came for S seconds (default: never)",
             {"type": positive},
         ),
         "--save FOLDER": (
@@ -68,10 +75,33 @@ def run_live(options: argparse.Namespace) -> int:
         mapper = OnlineLogMapper(options.width or import_log.WIDTH, tell)
     session = LiveSession(mapper, folder, lambda line: print(line, flush=True), options.work)
     if options.replay is None:
-        raise AbductionError("live: expected --replay LOG; give the file of a log")
-    _replay(options, session)
+        _listen(options, session)
+    else:
+        _replay(options, session)
     _say_map(mapper)
     return 0
+
+
+def _listen(options: argparse.Namespace, session: LiveSession) -> None:
+    """Give the scans that ROS 2 brings to a session."""
+    from ssh_abduction.robot_logs.log_mapper import OnlineLogMapper
+    from ssh_abduction.robot_logs.ros_node import run_node
+
+    mount = None
+    if options.mount is not None:
+        x, y, degrees = options.mount
+        mount = (x, y, math.radians(degrees))
+    width, tell = options.width or import_log.WIDTH, session.mapper.live.tell.to
+    run_node(
+        session,
+        lambda: OnlineLogMapper(width, tell),
+        options.scan,
+        options.odom,
+        mount,
+        options.idle,
+        lambda line: print(line, flush=True),
+    )
+    session.end()
 
 
 def _replay(options: argparse.Namespace, session: LiveSession) -> None:

@@ -436,6 +436,11 @@ class LiveSession:
             self.save()
         return found is not None
 
+    def restart(self, mapper: OnlineLogMapper) -> None:
+        """Begin a new drive. The search ends, and the next save replaces the old state."""
+        self._search.end()
+        self.mapper, self.seen = mapper, None
+
     def save(self) -> None:
         """Save the state. If the folder cannot be written, say so once."""
         self._saved = time.monotonic()

@@ -1,0 +1,90 @@
+"""Pairs the scans of a laser with the poses of an odometer by their times.
+
+>>> from ssh_abduction.robot_logs.pairing import StampPairing
+>>> pairing = StampPairing()
+>>> pairing.add_pose(0.0, (0.0, 0.0, 0.0))
+>>> pairing.add_scan(0.5, "scan")
+>>> list(pairing.ready())  # the pose after the scan has not come yet
+[]
+>>> pairing.add_pose(1.0, (2.0, 0.0, 0.0))
+>>> list(pairing.ready())
+[(0.5, 'scan', (1.0, 0.0, 0.0))]
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect
+from collections import Counter, deque
+from collections.abc import Iterator
+from typing import Any
+
+from ssh_abduction.data.odometry import Pose
+
+# The largest numbers of scans and poses that wait.
+MOST_SCANS, MOST_POSES = 2000, 20_000
+# A clock that goes back by more than this many seconds has started anew.
+BACK = 1.0
+
+
+class StampPairing:
+    """Scans wait for poses on both sides of their time. Their pose is interpolated.
+
+    Attributes:
+        lost: How many scans were lost, by the reason.
+        restarts: How often the clock went back.
+    """
+
+    def __init__(self) -> None:
+        self.lost: Counter[str] = Counter()
+        self.restarts = 0
+        self._scans: deque[tuple[float, Any]] = deque()
+        self._times: list[float] = []
+        self._poses: list[Pose] = []
+        self._last = -math.inf
+
+    def add_pose(self, time: float, pose: Pose) -> None:
+        """Add a pose at a time in seconds. A pose that comes late is dropped."""
+        if self._times and time <= self._times[-1]:
+            if self._times[-1] - time <= BACK:
+                return
+            self.restarts += 1
+            self.lost["no odometry"] += len(self._scans)
+            self._scans.clear()
+            self._times, self._poses, self._last = [], [], -math.inf
+        self._times.append(time)
+        self._poses.append(pose)
+        if len(self._times) > MOST_POSES:
+            del self._times[: MOST_POSES // 2], self._poses[: MOST_POSES // 2]
+
+    def add_scan(self, time: float, scan: Any) -> None:
+        """Add a scan at a time in seconds."""
+        if time == self._last:
+            self.lost["doubled"] += 1
+        elif time < self._last and self._last - time <= BACK:
+            self.lost["out of order"] += 1
+        else:
+            self._last = time
+            self._scans.append((time, scan))
+            if len(self._scans) > MOST_SCANS:
+                self._scans.popleft()
+                self.lost["too many"] += 1
+
+    def ready(self) -> Iterator[tuple[float, Any, Pose]]:
+        """Yield the scans whose poses are known: the time, the scan and its pose."""
+        while self._scans and self._times and self._scans[0][0] <= self._times[-1]:
+            time, scan = self._scans.popleft()
+            k = bisect(self._times, time)
+            if k == 0:
+                self.lost["no odometry"] += 1
+            else:
+                yield time, scan, self._at(k - 1, time)
+
+    def _at(self, k: int, time: float) -> Pose:
+        """The pose at a time that is not before pose k."""
+        if self._times[k] == time:
+            return self._poses[k]
+        a, b = self._poses[k], self._poses[k + 1]
+        share = (time - self._times[k]) / (self._times[k + 1] - self._times[k])
+        turn = math.remainder(b[2] - a[2], math.tau)
+        return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * turn
