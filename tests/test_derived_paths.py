@@ -16,9 +16,12 @@ from ssh_abduction import SSHMap, Trace
 from ssh_abduction.building.derive import with_building
 from ssh_abduction.building.directions import directions_to
 from ssh_abduction.building.telling import told
+from ssh_abduction.checker.buildings import faults_of_corridors, faults_of_paths
+from ssh_abduction.checker.checker import check
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import DState, Fit, Name, Pose
 from ssh_abduction.data.trace import Action, Step
+from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solver.derived_paths import PRICE, best_pairings, chains_of, sides_of
 
 Point = tuple[float, float]
@@ -339,3 +342,31 @@ def test_an_opening_that_was_never_driven_through_is_counted() -> None:
     assert opening.metres in (2.5, 12.5)
     first_leg, *_ = directions_to(found, trace, [0], [5])
     assert first_leg.endswith("to the second opening on the right")
+
+
+def test_checker_accepts_derived_buildings_and_finds_faults() -> None:
+    ssh_map, trace = drive(CROSS, TOUR, doors=[(1, 4), (2, 5)])
+    found = with_building(ssh_map, trace)
+    theory = BARE.replace(displacement="none")
+
+    def rules(wrong: SSHMap) -> set[str]:
+        return {v.message for v in check(trace, wrong, theory) if "map_explains" in v.axiom}
+
+    before = rules(ssh_map)
+    assert rules(found) == before
+    street = next(path for path in found.paths if len(path.order) == 4)
+    others = [path for path in found.paths if path != street]
+    for path, why in (
+        (replace(street, order=(0, 1, 0, 3)), "lists a place twice"),
+        (replace(street, left=(0,)), "on it, left, right or around"),
+        (replace(street, right=(99,)), "which the map does not have"),
+    ):
+        wrong = replace(found, paths=(path, *others))
+        assert any(why in message for message in faults_of_paths(wrong))
+        assert any(why in message for message in rules(wrong))
+    assert found.building
+    corridor = replace(found.corridors[0], order=(0, 2))
+    shuffled = replace(found, building=replace(found.building, corridors=(corridor,)))
+    assert [*faults_of_corridors(shuffled)] == [f"Corridor 0 is no part of path {street.id}."]
+    doorless = replace(found, building=replace(found.building, doors=()))
+    assert any("no door between" in message for message in rules(doorless))

@@ -30,7 +30,7 @@ COUNT = ("no", "a", "two", "three", "four", "five", "six")
 
 
 @dataclass(frozen=True)
-class Beside:
+class SideOpening:
     """An opening beside a leg."""
 
     metres: float  # from the beginning of the leg
@@ -143,14 +143,14 @@ def _leg(ssh_map: SSHMap, plan: FloorPlan, leg: Sequence[int], turn: str | None)
     return ", ".join(said)
 
 
-def _beside(plan: FloorPlan, leg: Sequence[int]) -> Iterator[Beside]:
+def _beside(plan: FloorPlan, leg: Sequence[int]) -> Iterator[SideOpening]:
     """Yield the openings beside a leg, without those at its beginning and at its end."""
     far, own = 0.0, {e // 2 for e in leg}
     for e, onward in pairwise([*leg, -1]):
         edge = plan.edges[e // 2].turned() if e % 2 else plan.edges[e // 2]
         for gap in edge.passages:
             if gap.side != "through":
-                yield Beside(far + gap.at * STEP, gap.side, False)
+                yield SideOpening(far + gap.at * STEP, gap.side, False)
         far += edge.length
         if onward < 0:
             return
@@ -160,12 +160,12 @@ def _beside(plan: FloorPlan, leg: Sequence[int]) -> Iterator[Beside]:
                 if other.ends[k] == edge.ends[1] and x not in own:
                     turn = (leaving(plan, 2 * x + k).bearing - ahead) % math.tau
                     side = "left" if turn < (back - ahead) % math.tau else "right"
-                    yield Beside(far, side, bool(other.doors))
+                    yield SideOpening(far, side, bool(other.doors))
 
 
-def _merged(beside: Sequence[Beside]) -> list[Beside]:
+def _merged(beside: Sequence[SideOpening]) -> list[SideOpening]:
     """Count openings of one side that are close together once."""
-    kept: list[Beside] = []
+    kept: list[SideOpening] = []
     for one in beside:
         if all(k.side != one.side or one.metres - k.metres > ONE for k in kept):
             kept.append(one)

@@ -197,7 +197,7 @@ def rooms_of(
     return tuple(
         MapRoom(
             k,
-            tuple(sorted(p for p, own in room.items() if own == k and p >= 0)),
+            tuple(sorted(p for p, name in plan.name.items() if room[name] == k)),
             tuple(door.id for door in doors if k in door.rooms),
             tuple(c.id for c in corridors if any(room[p] == k for p in c.order)),
             _outline(plan, {p for p, own in room.items() if own == k}),

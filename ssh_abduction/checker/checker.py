@@ -31,6 +31,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from ssh_abduction.checker import evidence, sides, topological
+from ssh_abduction.checker.buildings import building_follows_from_map
 from ssh_abduction.checker.evidence import floors_are_listed
 from ssh_abduction.checker.reading import Check, Found, Reading, course_of, heading_of
 from ssh_abduction.checker.sides import is_pair
@@ -353,6 +354,7 @@ COHERENT: tuple[Check, ...] = (
     has_what_the_theory_has,
     excused_are_pairs_of_paths,
     orders_list_places_once,
+    building_follows_from_map,
     frames_start_at_first_visit,
     floors_are_listed,
 )
