@@ -15,9 +15,9 @@ from coarse import every_second_beam, hall
 
 from perception.readers.writers import write_carmen
 from ssh_abduction.cli import main
-from ssh_abduction.robot_logs import pairing
+from ssh_abduction.robot_logs import stamps
 from ssh_abduction.robot_logs.log_mapper import OnlineLogMapper
-from ssh_abduction.robot_logs.pairing import StampPairing
+from ssh_abduction.robot_logs.stamps import StampPairing
 
 TESTS = Path(__file__).parent
 needs_ros = pytest.mark.skipif(find_spec("rclpy") is None, reason="ROS 2 is not installed")
@@ -63,8 +63,8 @@ def test_scans_get_the_pose_of_their_time(
 
 
 def test_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pairing, "MOST_SCANS", 5)
-    monkeypatch.setattr(pairing, "MOST_POSES", 10)
+    monkeypatch.setattr(stamps, "MOST_SCANS", 5)
+    monkeypatch.setattr(stamps, "MOST_POSES", 10)
     found, lost = fed(*(("s", k / 10) for k in range(8)), *(("p", k / 10) for k in range(30)))
     assert (len(found), lost) == (5, {"too many": 3})
 

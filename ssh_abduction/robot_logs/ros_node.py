@@ -11,18 +11,20 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import networkx as nx
 import numpy as np
 
 from perception.errors import LogError
-from perception.readers.scans import Scan, laser_of
+from perception.readers.bag_frames import flat_pose, frame_name, stamp_of
+from perception.readers.scans import Damaged, Scan, laser_of
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.odometry import Pose
 from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper
-from ssh_abduction.robot_logs.pairing import StampPairing
+from ssh_abduction.robot_logs.stamps import StampPairing
 
 # Seconds to wait for a topic before that is said, and from one look at the topics to the next.
 PATIENCE, LOOK = 5.0, 1.0
@@ -68,17 +70,6 @@ def run_node(
         rclpy.try_shutdown()
 
 
-def stamp_of(header: Any) -> float:
-    """The time of a message in seconds."""
-    return float(header.stamp.sec + header.stamp.nanosec * 1e-9)
-
-
-def yaw_of(rotation: Any) -> float:
-    """The heading of a quaternion, in radians."""
-    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
-    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
 def scan_of(message: Any, mount: Pose, odometry: Pose, number: int) -> Scan:
     """Make a Scan of a LaserScan."""
     ranges = np.array(message.ranges, np.float64)
@@ -114,7 +105,7 @@ class _LiveNode:
         self.node, self.session, self._say = node, session, say
         self.pairing, self.heard = StampPairing(), time.monotonic()
         self._new_mapper, self._mount = new_mapper, mount
-        self._mounts: dict[str, tuple[str, Pose]] = {}
+        self._mounts: dict[str, Pose] = {}
         self._begun, self._said, self._paused = time.monotonic(), set[str](), False
         self._kinds = {
             scan_topic: (LaserScan, self._on_scan),
@@ -141,6 +132,14 @@ class _LiveNode:
             self._said.add(text)
             self._say(text)
 
+    @contextmanager
+    def _told(self, what: str) -> Iterator[None]:
+        """Say once what is wrong with a message."""
+        try:
+            yield
+        except Damaged as error:
+            self._once(f"{what}: a message was dropped: {error}")
+
     def _listen_to_frames(self, mount: Pose | None) -> None:
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -158,9 +157,9 @@ class _LiveNode:
 
     def _on_frames(self, message: Any) -> None:
         for one in message.transforms:
-            at = one.transform.translation
-            pose = (at.x, at.y, yaw_of(one.transform.rotation))
-            self._mounts[one.child_frame_id] = (one.header.frame_id, pose)
+            with self._told("/tf_static"):
+                at = flat_pose(one.transform.translation, one.transform.rotation)
+                self._mounts[frame_name(one.child_frame_id)] = at
 
     def _look(self) -> None:
         """Listen to the topics that are there, and say what is missing."""
@@ -189,10 +188,10 @@ class _LiveNode:
 
     def _on_odom(self, message: Any) -> None:
         self.heard = time.monotonic()
-        pose = message.pose.pose
-        at = (pose.position.x, pose.position.y, yaw_of(pose.orientation))
         before = self.pairing.restarts
-        self.pairing.add_pose(stamp_of(message.header), at)
+        with self._told("odometry"):
+            at = flat_pose(message.pose.pose.position, message.pose.pose.orientation)
+            self.pairing.add_pose(stamp_of(message.header), at)
         if self.pairing.restarts > before:
             self._after = -math.inf
             self._say("the clock went back: it started anew")
@@ -210,8 +209,8 @@ class _LiveNode:
         for at, message, pose in self.pairing.ready():
             if at <= self._after or self._paused:  # known from the saved state
                 continue
-            frame = message.header.frame_id
-            mount = self._mount or self._mounts.get(frame, ("", (0.0, 0.0, 0.0)))[1]
+            frame = frame_name(message.header.frame_id)
+            mount = self._mount or self._mounts.get(frame, (0.0, 0.0, 0.0))
             if self._mount is None and self._mounts and frame not in self._mounts:
                 self._once(
                     f"/tf_static: expected the frame {frame}, got {', '.join(self._mounts)}; the "

@@ -1,6 +1,6 @@
 """Pairs the scans of a laser with the poses of an odometer by their times.
 
->>> from ssh_abduction.robot_logs.pairing import StampPairing
+>>> from ssh_abduction.robot_logs.stamps import StampPairing
 >>> pairing = StampPairing()
 >>> pairing.add_pose(0.0, (0.0, 0.0, 0.0))
 >>> pairing.add_scan(0.5, "scan")
