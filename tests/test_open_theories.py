@@ -603,7 +603,7 @@ def test_rule_that_can_never_fire_is_warned_of() -> None:
     trace = Trace.from_steps(["v0", "v1", "v0"], ["go", "go"])
     solution = solve(trace, Theory.causal().replace(rules=[rules]))
     assert solution.warnings == (
-        'own.lp:3: view(t,v0) holds at no step of this trace, so its rule has no effect; write "v0" '
-        "in quotes",
+        "own.lp:3: view(t,v0) holds at no step of this trace, so its rule has no effect; write "
+        '"v0" in quotes',
         "own.lp:4: act((t-1),stay) holds at no step of this trace, so its rule has no effect",
     )

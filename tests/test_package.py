@@ -158,10 +158,8 @@ def test_citation_and_changelog_have_the_package_version() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text()
     changelog = (ROOT / "CHANGELOG.md").read_text()
-    assert f"\n## [{project['version']}]" in changelog
-    assert re.search(r"^## \[[\d.]+\] \(unreleased\)$", changelog, re.MULTILINE)
-    assert all(url.startswith(project["urls"]["Source"]) for url in project["urls"].values())
-    assert f'repository-code: "{project["urls"]["Source"]}"' in (ROOT / "CITATION.cff").read_text()
+    assert f"\n## {project['version']} " in changelog
+    assert re.search(r"^## [\d.]+ \(unreleased\)$", changelog, re.MULTILINE)
 
 
 def test_import_linter_sees_all_imports_of_the_package() -> None:

@@ -34,6 +34,7 @@ from ssh_abduction.cli import (
     learn,
     live_map,
     mapping,
+    repair,
     simulate,
     solve,
     use,
@@ -69,6 +70,7 @@ VERBS: Mapping[str, tuple[Verb, ...]] = {
         compare.run_evaluate,
         compare.run_ladder,
         compare.run_next,
+        repair.run_repair,
     ),
     "use: drive and localise by a map": (
         use.run_localise,

@@ -30,7 +30,7 @@ from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
 Step = TypeVar("Step")  # a step by its number or its name
 
 # The arguments that name files to read, and the options that name files to write.
-READ = ("trace", "traces", "log", "logs", "maps", "other", "world")
+READ = ("trace", "traces", "log", "logs", "maps", "other", "world", "graph")
 WRITTEN = ("output", "joint_trace")
 # Endings that say what is in a file.
 ENDINGS = re.compile(r"\.(bag|mcap|log|clf|html?|png|pdf|svg|jsonl|ya?ml|geojson|graphml|dot|gv)")

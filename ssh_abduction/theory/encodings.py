@@ -112,7 +112,7 @@ def folder() -> Path:
 
 def path(name: str) -> str:
     """Return the path of an encoding by its name, in the folder of axioms or a subfolder."""
-    files = [folder() / part / f"{name}.lp" for part in ("", "fast", "derived")]
+    files = [folder() / part / f"{name}.lp" for part in ("", "fast", "derived", "graphs")]
     return str(next((file for file in files if file.exists()), files[-1]))
 
 
