@@ -29,7 +29,6 @@ from ssh_abduction.solver import Status
 from ssh_abduction.solver.entry import fault_front
 from ssh_abduction.solver.sources.exact import choosing, faulty
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.exact.viterbi import Explainer, PartialMachine
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import Problem
 
@@ -226,8 +225,6 @@ def test_solve_finds_the_faults_of_machines(seed: int) -> None:
 @settings(max_examples=10)
 @given(st.data())
 def test_bounds_by_blocks_do_not_exceed_the_minimum(data: st.DataObject) -> None:
-    """Any map may be known: here it has one dstate for each view, or one for each step. All
-    disagreements are faults."""
     trace = data.draw(small_traces(max_steps=7))
     theory = Theory.causal().replace(
         misread=data.draw(st.sampled_from([0.4, 1.0])),
@@ -238,20 +235,12 @@ def test_bounds_by_blocks_do_not_exceed_the_minimum(data: st.DataObject) -> None
         kind: [theory.fault_tenths(kind, step) for step in trace.steps]
         for kind in ("misread", "slipped")
     }
-    seen, actions = task.log.seen, task.log.actions
-    labels = data.draw(st.sampled_from([seen, range(len(trace))]))
-    shows = dict(zip(labels, seen, strict=True))
-    goes = {(labels[t], action): labels[t + 1] for t, action in enumerate(actions)}
-    machine = PartialMachine([shows[s] for s in sorted(shows)], goes)
-    known = Explainer(seen, actions, price).completed(machine)
-    dstates = len(set(known.labels))
-    blocks = faulty.Blocks(seen, actions, price, sorted(known.faults), dstates, task.watch)
+    blocks = faulty.Blocks(task.log.seen, task.log.actions, price, task.watch)
     cost, _ = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))
     assert cost is not None
-    assert blocks.bound(known.tenths) <= cost <= known.tenths
-    assert all(
-        blocks.least_faults(most) <= known.tenths for most in range(len(set(known.labels)), 8)
-    )
+    assert blocks.bound(cost + data.draw(st.integers(0, 20))) <= cost
+    assert blocks.bound(cost - 1) <= cost - 1
+    assert blocks.least_faults(len(trace)) == 0
 
 
 @pytest.mark.parametrize("kind", ["misread", pytest.param("slipped", marks=pytest.mark.slow)])

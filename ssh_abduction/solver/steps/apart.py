@@ -27,7 +27,6 @@ finds all steps that are apart from a given step.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,20 +118,21 @@ class Continuations:
     def clique(self) -> list[int]:
         """Find a largest clique: a sorted list of steps that are pairwise apart.
 
-        Of several largest cliques, take one whose steps are apart from the most other steps. With
-        evidence, the graph is no longer a cograph. Then also grow a clique greedily, and return the
-        larger of both. It need not be a largest one.
+        With evidence, the graph is no longer a cograph. Then also grow a clique greedily, and
+        return the larger of both. It need not be a largest one.
         """
         # The nested groups that the current step is in. Each pair is the length of the prefix that
         # the steps of the group share, and a largest clique of its steps so far.
-        begun: list[tuple[int, _Clique]] = []
+        begun: list[tuple[int, tuple[int, ...]]] = []
         for step, shared in zip(self._sorted.tolist(), [*self._shared.tolist(), -1], strict=True):
-            so_far = _Clique((step,), 0, 1)
+            so_far = (step,)
             while begun and begun[-1][0] >= shared:
                 common, before = begun.pop()
-                so_far = before.joined(so_far, apart=common % 2 == 0)
+                # After an even number of common views and actions, the next to differ is a view.
+                larger = max(before, so_far, key=lambda some: (len(some), -some[0]))
+                so_far = before + so_far if common % 2 == 0 else larger
             begun.append((shared, so_far))
-        largest = sorted(begun[0][1].steps)
+        largest = sorted(begun[0][1])
         if self._excluded is not None:
             return max(largest, clique(self.apart(), self._seen), key=len)
         return largest
@@ -150,35 +150,6 @@ def _spread(excluded: Collection[tuple[int, int]], done: NDArray[np.int_]) -> Ma
     for step in range(len(done) - 2, -1, -1):
         found[step, :-1] |= (done[:-1] == done[step]) & found[step + 1, 1:]
     return found
-
-
-@dataclass(frozen=True, slots=True)
-class _Clique:
-    """A largest clique of a group of steps.
-
-    Attributes:
-        steps: The steps of the clique.
-        apart: The number of pairs of a step of the clique and a step of the group that are apart.
-        group: The number of steps in the group.
-    """
-
-    steps: tuple[int, ...]
-    apart: int
-    group: int
-
-    def joined(self, other: _Clique, *, apart: bool) -> _Clique:
-        """Return a largest clique of two groups.
-
-        If `apart`, each step of one group is apart from each step of the other; else none is.
-        """
-        group = self.group + other.group
-        if apart:
-            more = len(self.steps) * other.group + len(other.steps) * self.group
-            return _Clique(self.steps + other.steps, self.apart + other.apart + more, group)
-        best = max(
-            self, other, key=lambda clique: (len(clique.steps), clique.apart, -clique.steps[0])
-        )
-        return _Clique(best.steps, best.apart, group)
 
 
 def _ranked(keys: NDArray[np.int_]) -> NDArray[np.int_]:

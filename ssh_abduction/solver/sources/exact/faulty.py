@@ -137,13 +137,10 @@ class FaultyEngine:
         return True
 
     def _bound_by_blocks(self) -> None:
-        """Raise the bound by blocks of a long trace, with the help of the incumbent."""
-        if self.size < LONG or self._known is None or self._most_faults is not None:
-            return
-        places = sorted(fault.step for fault in self._known.faults if fault.kind in self._price)
-        dstates, watch = len(self._known.dstates), self.asker.watch
-        blocks = Blocks(self._seen, self._actions, self._price, places, dstates, watch)
-        self._raise_bound([blocks.bound(self._best or 0)])
+        """Raise the bound by blocks of a long trace, up to the cost of the incumbent."""
+        if self.size >= LONG and self._best is not None and self._most_faults is None:
+            blocks = Blocks(self._seen, self._actions, self._price, self.asker.watch)
+            self._raise_bound([blocks.bound(self._best)])
 
     def _cost_of(self, found: Found) -> int:
         """Return the cost of a map as clingo counts it, in tenths of dstates."""
@@ -455,21 +452,18 @@ def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
 
 @dataclass
 class Blocks:
-    """Lower bounds on the cost of a trace, found with the help of a known map.
+    """Lower bounds on the cost of a trace.
 
     Attributes:
         seen: The observation at each step, as an integer.
         actions: The action after each step but the last, as an integer.
         price: For each kind of fault that is allowed, its cost at each step in tenths of dstates.
-        faults: The steps at which the known map has a fault, in order.
-        dstates: The number of dstates of the known map.
+        watch: The limits of the search.
     """
 
     seen: Sequence[int]
     actions: Sequence[int]
     price: Mapping[str, Sequence[int]]
-    faults: Sequence[int]
-    dstates: int
     watch: Watch
 
     def bound(self, cost: int) -> int:
@@ -490,27 +484,19 @@ class Blocks:
         The trace is divided into blocks from its first step on. Each block ends as soon as it needs
         a fault. The least costs of the faults of all blocks are added up.
         """
-        total = begin = reach = 0  # a block ended `reach` steps after its first fault
-        while True:
-            first = begin
-            if most >= self.dstates:  # then a block in which the known map has no fault needs none
-                number = bisect_left(self.faults, begin)
-                if number == len(self.faults):
-                    return total
-                first = self.faults[number]
-            end = self._shortest(begin, first, reach, most)
-            if end is None:
-                return total
+        total = begin = 0
+        while (end := self._shortest(begin, most)) is not None:
             total += min(
                 min(price[begin : end - (kind == "slipped")]) for kind, price in self.price.items()
             )
-            begin, reach = end, end - first
+            begin = end
+        return total
 
-    def _shortest(self, begin: int, fault: int, reach: int, most: int) -> int | None:
-        """Return the end of the shortest block from `begin` on that includes `fault` and needs one.
+    def _shortest(self, begin: int, most: int) -> int | None:
+        """Return the end of the shortest block from `begin` on that needs a fault.
 
-        The end is the step after the block. The search starts at the expected end, `reach` steps
-        after `fault`. Returns None if even the block to the end of the trace needs no fault.
+        The end is the step after the block. Returns None if even the block to the end of the trace
+        needs no fault.
         """
 
         def takes_fault(end: int) -> bool:
@@ -520,8 +506,8 @@ class Blocks:
             return end - begin > most and len(Continuations(seen, actions).clique()) > most
 
         steps = len(self.seen)
-        low, stride = max(fault, begin + most), 1
-        high = min(max(fault + reach, low + 1), steps)
+        low, stride = begin + most, 1
+        high = min(low + 1, steps)
         while not takes_fault(high):
             if high == steps:
                 return None

@@ -8,8 +8,7 @@ Pairwise distinct steps, a clique (`steps/apart.py`), are *pinned*: each gets a 
 Their number is a lower bound on the dstates. Pinning leaves only one way to name these dstates. Any
 other step may have the name of a pinned step that it can share a dstate with, or a *spare* name of
 its view. A spare name costs one dstate. Each view also has a *rest*, one name that all its other
-dstates share. If there are several largest cliques, pin the one with which the other steps have the
-fewest names to choose from.
+dstates share.
 
 *Claim.* An answer of minimal cost that uses no rest is a minimal map.
 *Proof.* Name the dstates of any map. The pinned steps have their names. The other dstates get spare

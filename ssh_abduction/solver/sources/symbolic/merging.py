@@ -61,20 +61,7 @@ from ssh_abduction.theory.theory import Theory
 # The demands on the merge of a step with a known dstate, from strict to lenient. The first number
 # is by how much its evidence has to exceed that for the next best merge of the step. The second
 # number is how many known dstates may fit the step at most. The last demand allows anything.
-DEMANDS = (
-    (10, 1),
-    (5, 1),
-    (5, 2),
-    (3, 1),
-    (3, 3),
-    (2, 2),
-    (2, 10),
-    (1, 3),
-    (1, 100),
-    (0, 1),
-    (0, 2),
-    (0, 10**9),
-)
+DEMANDS = ((5, 1), (2, 2), (1, 10), (0, 10**9))
 # Compare at most this many pairs of visits. Pairs with the most visits in between are left out.
 MOST_PAIRS = 60_000
 DSTATE = 10  # cost of a dstate, in tenths
