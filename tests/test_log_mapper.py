@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from http.client import HTTPConnection
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +17,14 @@ from perception.places.saved import SCANS, STATE
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_carmen
 from ssh_abduction.cli import main
+from ssh_abduction.data.errors import MapError, TraceError
+from ssh_abduction.robot_logs import log_mapper
+from ssh_abduction.robot_logs.live_page import LivePage
 from ssh_abduction.robot_logs.log_mapper import (
     Event,
     FoundMap,
     LiveSession,
+    MapSearch,
     OnlineLogMapper,
     RobotSeen,
     solved,
@@ -165,3 +171,42 @@ def test_replayed_log_is_mapped_and_goes_on(
     }
     assert main(call) == 0
     assert "the drive goes on after 50 scans" in capsys.readouterr().out
+
+
+def test_page_shows_the_robot_to_this_computer_only(scans: tuple[Scan, ...]) -> None:
+    session = LiveSession(OnlineLogMapper(), None, print)
+    session.mapper.accept(found(0, 1, 2))
+    page = LivePage(0, session.state, lambda: None)
+    port = page.server_address[1]
+
+    def answer(path: str, host: str) -> tuple[int, bytes]:
+        asked = HTTPConnection("127.0.0.1", port)
+        asked.request("GET", path, headers={"Host": host})
+        given = asked.getresponse()
+        return given.status, given.read()
+
+    here = f"127.0.0.1:{port}"
+    assert b"<svg" in answer("/", here)[1]
+    assert json.loads(answer("/state", here)[1])["robot"] is None
+    session.take(scans[0])
+    state = json.loads(answer("/state", here)[1])
+    assert state["robot"] == [0.0, 0.0, 0.0]
+    assert state["edges"] == [[0, 1], [1, 2]]
+    assert answer("/page.html", here)[0] == 404
+    assert answer("/state", "example.org")[0] == 404
+    with pytest.raises(MapError, match="expected a free port"):
+        LivePage(port, session.state, lambda: None)
+    page.shutdown()
+    page.server_close()
+
+
+def test_error_of_a_search_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, watch: object) -> None:
+        raise TraceError("no such step")
+
+    monkeypatch.setattr(log_mapper, "in_process", fails)
+    search = MapSearch()
+    search.begin(OnlineLogMapper().task())
+    assert search.taken(5.0) is None
+    assert search.error == "no such step"
+    assert not search.is_busy

@@ -49,6 +49,10 @@ def positive(text: str) -> float:
             "folder to save the state to, each second, with the files of the last map; if it has a "
             "state, the drive goes on from there"
         ),
+        "--page PORT": (
+            "serve a page on this computer that follows the robot; 0 takes any free port",
+            {"type": int},
+        ),
         "--work W": (
             "units of work for each search, each about a second of a quiet core (default: 5)",
             {"type": positive, "default": 5.0},
@@ -74,6 +78,12 @@ def run_live(options: argparse.Namespace) -> int:
     else:
         mapper = OnlineLogMapper(options.width or import_log.WIDTH, tell)
     session = LiveSession(mapper, folder, lambda line: print(line, flush=True), options.work)
+    if options.page is not None:
+        from ssh_abduction.robot_logs.live_page import LivePage
+
+        print(
+            f"page: {LivePage(options.page, session.state, lambda: session.page).url}", flush=True
+        )
     if options.replay is None:
         _listen(options, session)
     else:

@@ -18,7 +18,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -358,9 +358,14 @@ class OnlineLogMapper:
 
 
 class MapSearch:
-    """Searches for maps in another process, one at a time. It ends with this program."""
+    """Searches for maps in another process, one at a time. It ends with this program.
+
+    Attributes:
+        error: Why the last search failed; empty if it did not.
+    """
 
     def __init__(self) -> None:
+        self.error = ""
         self._thread: threading.Thread | None = None
         self._watch, self._found = Watch(None), list[FoundMap | None]()
 
@@ -372,11 +377,15 @@ class MapSearch:
     def begin(self, task: MapTask) -> None:
         """Begin a search. None may be busy."""
         assert self._thread is None
-        self._watch, self._found = Watch(None), []
+        self._watch, self._found, self.error = Watch(None), [], ""
 
         def search() -> None:
-            with suppress(LimitError):  # the search was ended
+            try:
                 self._found.append(in_process(solved, task, watch=self._watch))
+            except LimitError as error:
+                self.error = "" if self._watch.interrupted else f"the search ended: {error.reason}"
+            except Exception as error:  # the robot drives on without a new map
+                self.error = str(error)
 
         self._thread = threading.Thread(target=search, daemon=True)
         self._thread.start()
@@ -415,6 +424,8 @@ class LiveSession:
         self.mapper, self.folder, self.work = mapper, folder, work
         self.seen: RobotSeen | None = None
         self.maps = 0  # the number of maps so far
+        self.events: list[str] = []  # what was said of the maps
+        self.page: bytes | None = None  # of the last map
         self._say, self._search, self._saved, self._failed = say, MapSearch(), 0.0, False
 
     def take(self, scan: Scan) -> RobotSeen:
@@ -425,16 +436,32 @@ class LiveSession:
     def tick(self, wait: float = 0.0) -> bool:
         """Do what is due: take a map, begin a search, save. Return whether there is a new map."""
         found = self._search.taken(wait)
+        if self._search.error:
+            self._say(f"no new map: {self._search.error}")
+            self._search.error = ""
         if found is not None:
             for event in self.mapper.accept(found):
-                self._say(str(event))
+                self.events.append(str(event))
+                self._say(self.events[-1])
             self.maps += 1
+            self.page = found.files.get("page.html")
             self._keep(found.files)
         if self.mapper.is_due and not self._search.is_busy:
             self._search.begin(self.mapper.task(self.work))
         if time.monotonic() - self._saved > EVERY:
             self.save()
         return found is not None
+
+    def state(self) -> dict[str, Any]:
+        """The map, the robot and what was said, as plain data for a page."""
+        seen, found = self.seen, self.mapper.to_dict()
+        robot = (seen.on_map or seen.pose) if seen else None
+        return {
+            **found,
+            "robot": robot,
+            "belief": seen.belief if seen else {},
+            "events": self.events,
+        }
 
     def restart(self, mapper: OnlineLogMapper) -> None:
         """Begin a new drive. The search ends, and the next save replaces the old state."""
