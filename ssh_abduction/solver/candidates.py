@@ -105,6 +105,10 @@ class Candidates:
         maps = (projected(ssh_map, self._task.theory) for ssh_map in search.maps())
         yield from filter(self._judging.accepts, maps)
 
+    def accepts(self, ssh_map: SSHMap) -> bool:
+        """Whether the checker accepts a map."""
+        return self._judging.accepts(projected(ssh_map, self._task.theory))
+
     def map_without(self, wrong: Collection[int], most: float = math.inf) -> SSHMap | None:
         """Find a map by a narrow beam if only the displacements to `wrong` steps are wrong.
 

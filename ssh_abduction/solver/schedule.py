@@ -138,6 +138,12 @@ WEIGHED = (
         until=0.8,
     ),
     SourceTurn(
+        "local changes",
+        "displacements, no faults",
+        "A map that a beam has missed mostly differs from the best one in one visit.",
+        share=0.3,
+    ),
+    SourceTurn(
         "fewest dstates, map known",
         "a map is known, and no faults are allowed",
         "It only finds the least number of dstates, if that is easy.",

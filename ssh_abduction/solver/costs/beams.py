@@ -69,6 +69,11 @@ class Beams:
         is_sound = math.isfinite(self.broken) and not self._parts.task.theory.jumped
         return is_sound and self._best[0] <= nats + EQUAL
 
+    def improved(self, nats: float) -> None:
+        """Take note that local changes lead from the best map of a broad beam to a cheaper one."""
+        if (saved := self._best[0] - nats) > 0 and saved < math.inf:
+            self._best = nats, self._best[1] - saved
+
     def sources(self, clashes: Callable[[], bool]) -> list[Source]:
         """List the guesses as sources, in the order of the schedule.
 

@@ -30,6 +30,7 @@ from ssh_abduction.data.groups import NodeClasses, minimal_part, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.geometry.equations import Aliases, Equations, visits_by_turns
 from ssh_abduction.solver.geometry.fit import Explaining
+from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
@@ -102,6 +103,13 @@ class Misfit:
         """Return the alias of each closure in the best explanation; empty if all are true."""
         aliases = self._explained(dstates, places, wrong)[2]
         return aliases if any(aliases) else ()
+
+    def poses(
+        self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
+    ) -> Poses:
+        """Collect the equations of the best explanation of the closures."""
+        aliases = self._explained(dstates, places, wrong)[2]
+        return self._explaining(_groups_of(dstates, places, wrong)).poses(aliases)
 
     def _explained(
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int]

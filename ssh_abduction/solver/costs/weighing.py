@@ -59,6 +59,7 @@ from ssh_abduction.solver.solution.weighed import EQUAL, IMPROBABLE, Rival, Weig
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
+from ssh_abduction.solver.sources.metric.changing import improved
 from ssh_abduction.solver.sources.metric.wrong_displacements import search_jumps
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Found, Status
@@ -156,6 +157,25 @@ class Weighing:
     def _raise_bound(self, nats: float) -> None:
         """Raise the bound, unless it is higher. The best map costs as much as the bound or more."""
         self.bound = max(self.bound, min(nats, self._nats))
+
+    def changes(self) -> Source:
+        """Return the source of local changes of the best map."""
+        theory, task = self._task.theory, self._task
+
+        def change() -> None:
+            improved(task.problem, self._misfit, self.candidates[0].map, self._add_valid, WITHIN)
+            self.beams.improved(self._nats)
+
+        return Source(
+            turn("local changes"),
+            lambda: bool(self.candidates) and not theory.has_faults,
+            change,
+        )
+
+    def _add_valid(self, ssh_map: SSHMap) -> float:
+        """Return the cost of a map in nats; infinite if the evidence excludes it."""
+        accepts = self._parts.candidates.accepts
+        return self.add(ssh_map) if accepts(ssh_map) else math.inf
 
     def proofs(self) -> list[Source]:
         """List the sources that bound the cost of all maps, in the order of the schedule.
