@@ -113,7 +113,7 @@ def repair(moves: Iterable[GraphMove], *, without: Collection[str] = (), most: i
             known = ", ".join(axiom_names())
             hint = meant(name, axiom_names())
             raise MapError(f"axiom: expected {known}, got {brief(name)}; name one of these{hint}")
-    question = _Axioms(tuple(dict.fromkeys(moves)), [*set(axiom_names()).difference(without)])
+    question = _GraphAxioms(tuple(dict.fromkeys(moves)), [*set(axiom_names()).difference(without)])
     fewest, repairs, complete, blamed = question.smallest(most)
     return Repairs(
         question.moves,
@@ -126,7 +126,7 @@ def repair(moves: Iterable[GraphMove], *, without: Collection[str] = (), most: i
     )
 
 
-class _Axioms:
+class _GraphAxioms:
     """A graph in clingo."""
 
     def __init__(self, moves: tuple[GraphMove, ...], axioms: Sequence[str]) -> None:
@@ -190,7 +190,7 @@ class _Axioms:
     def _axioms_of(self, edges: Sequence[int]) -> tuple[str, ...]:
         """Name the axioms that these edges break."""
         some = tuple(self.moves[e] for e in edges)
-        alone = (_Axioms(some, [name]) for name in sorted(self._axioms))
+        alone = (_GraphAxioms(some, [name]) for name in sorted(self._axioms))
         found = zip(sorted(self._axioms), alone, strict=True)
         return tuple(name for name, one in found if one._clash(range(len(some))))
 
