@@ -11,8 +11,8 @@ from ssh_abduction import Theory
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver.costs.changing import improved
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.sources.metric.changing import improved
 from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.theory.settle import settle
 

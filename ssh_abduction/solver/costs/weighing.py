@@ -41,6 +41,7 @@ from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.costs.beams import Beams
+from ssh_abduction.solver.costs.changing import improved
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
     Course,
@@ -59,7 +60,6 @@ from ssh_abduction.solver.solution.weighed import EQUAL, IMPROBABLE, Rival, Weig
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
-from ssh_abduction.solver.sources.metric.changing import improved
 from ssh_abduction.solver.sources.metric.wrong_displacements import search_jumps
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.solver.values import Cost, Found, Status
