@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ssh_abduction.building.edges import FloorPlan
-from ssh_abduction.building.pairing import paths_of, ways_of
 from ssh_abduction.building.rooms import corridors_of, room_of_places, rooms_of, with_doors
+from ssh_abduction.building.straight_paths import paths_of, ways_of
 from ssh_abduction.data.building import Indoors
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_map

@@ -16,7 +16,7 @@ import networkx as nx
 from perception.places.passages import STEP
 from perception.places.track import wrapped
 from ssh_abduction.building.edges import FloorPlan, PlanEdge
-from ssh_abduction.building.pairing import leaving, ways_of
+from ssh_abduction.building.straight_paths import leaving, ways_of
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace

@@ -15,7 +15,7 @@ import networkx as nx
 import numpy as np
 
 from ssh_abduction.building.edges import FloorPlan, walls_beside
-from ssh_abduction.building.pairing import PairedWay, branches, chain_points
+from ssh_abduction.building.straight_paths import PairedWay, branches, chain_points
 from ssh_abduction.building.travels import Array
 from ssh_abduction.data.building import Corridor, MapDoor, MapRoom, WayOut
 from ssh_abduction.data.map_parts import MapPath
@@ -25,7 +25,7 @@ from ssh_abduction.data.maps import SSHMap
 HALF = 1.5
 # A corridor is at least LONG metres long, and SLIM times as long as wide. Its ends are at least
 # STRAIGHT of its length apart.
-LONG, SLIM, STRAIGHT = 6.0, 2.5, 0.8
+LONG, SLIM, STRAIGHT = 6.0, 3.0, 0.8
 # A part of a path between two doors is a room if it is shorter than SHORT metres, or than SQUARE
 # widths; at an end of the path, than END widths. Its width is exceeded on WIDEST per cent of it.
 SHORT, SQUARE, END, WIDEST = 2.0, 1.3, 2.0, 30

@@ -212,6 +212,7 @@ def nav2(roads: Roads, name: str, frame: str) -> str:
             "metadata": {
                 "travelled": road.action is not None,
                 **only_known(**way, path_name=road.name),
+                **road.indoors,
             },
         }
         features.append(_feature("LineString", [at[road.start], at[road.end]], edge))

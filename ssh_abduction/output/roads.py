@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise, product
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.map_parts import ids_at
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.output.layout import Layout, Turns, layout, travelled
 
@@ -43,6 +44,8 @@ class Stop:
         name: The name that a person gave to its place; None if it has none.
         regions: The ids of the regions that contain it.
         region_names: The names that a person gave to these regions.
+        room: The name or number of its room, such as "room 3"; None if it has none.
+        corridor: The name or number of its corridor; None if it has none.
     """
 
     id: int
@@ -54,13 +57,16 @@ class Stop:
     name: str | None = None
     regions: tuple[int, ...] = ()
     region_names: tuple[str, ...] = ()
+    room: str | None = None
+    corridor: str | None = None
 
     @property
     def properties(self) -> dict[str, str]:
         """The views of the stop, and its regions if there are any, as texts for files."""
         regions = {"regions": " ".join(map(str, self.regions))} if self.regions else {}
         names = {"region_names": ", ".join(self.region_names)} if self.region_names else {}
-        return {"views": " ".join(map(str, self.views)), **regions, **names}
+        indoors = only_known(room=self.room, corridor=self.corridor)
+        return {"views": " ".join(map(str, self.views)), **regions, **names, **indoors}
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +84,8 @@ class Road:
         turns: Whether the road is a turn on the spot: both stops are dstates of one place or, if a
             place is unknown, at one point.
         name: The name that a person gave to its path; None if it has none.
+        indoors: The `corridor` along which it leads, the `door` through which it leads, and the
+            `width` of the narrower one in metres, as far as they are known.
     """
 
     start: int
@@ -88,6 +96,7 @@ class Road:
     direction: int | None
     turns: bool = False
     name: str | None = None
+    indoors: Mapping[str, str | float] = field(default_factory=dict, hash=False)
 
     @property
     def cost(self) -> float:
@@ -146,6 +155,7 @@ class Roads:
                 turns=floor[a] == floor[b]
                 and (length < LEAST if {a, b} - place.keys() else place[a] == place[b]),
                 name=ssh_map.name_of("path", what[1]),
+                indoors=_indoors(ssh_map, a, b) if level == "places" else {},
             )
             for (a, b), what in sorted(ends.items())
         )
@@ -217,7 +227,28 @@ def _stops(ssh_map: SSHMap, drawn: Layout, level: str) -> Iterator[Stop]:
             ssh_map.name_of("place", place),
             regions,
             tuple(name for name in names if name is not None),
+            _short(ssh_map, "room", ssh_map.building and ssh_map.building.room_of(place)),
+            _short(ssh_map, "corridor", ssh_map.building and ssh_map.building.corridor_of(place)),
         )
+
+
+def _short(ssh_map: SSHMap, kind: str, number: Any) -> str | None:
+    """The name of a room, corridor or door, or its kind and number; None without a number."""
+    if number is None:
+        return None
+    return ssh_map.name_of(kind, number) or f"{kind} {number}"
+
+
+def _indoors(ssh_map: SSHMap, a: int, b: int) -> dict[str, str | float]:
+    """Find the corridor and the door on the way between two places, and the least width."""
+    corridor = next((c for c in ssh_map.corridors if {a, b} <= {*c.order}), None)
+    door = next((d for d in ssh_map.doors if {a, b} == {*d.places}), None)
+    widths = [thing.width for thing in (corridor, door) if thing is not None]
+    return only_known(
+        corridor=_short(ssh_map, "corridor", corridor and corridor.id),
+        door=_short(ssh_map, "door", door and door.id),
+        width=min(widths, default=None),
+    )
 
 
 def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:

@@ -75,6 +75,8 @@ BROAD = 2.0
 SURE = 0.95
 # The colour of edges that belong to no meaningful path, of walls, and of the robot's way.
 EDGE, WALL, WAY = "#0072b2", "#8a8a8a", "#c9d4df"
+INDOORS = "Broad pale lines are corridors, C0, C1 and so on, and red dots are doors. "
+CORRIDOR = 14.0  # width of the line of a corridor, in units of the page
 ASIDE = 5.0  # metres between drives that no map joins
 
 
@@ -106,6 +108,7 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
             "and lines the edges along the robot's course, drawn once where several run together. "
             f"{colours}North, in corrections, is up. Dots are places at which the robot only "
             "passed through. Bands are regions that, as far as known, have only one entrance. "
+            f"{INDOORS if solution.maps[0].building else ''}"
             + (
                 "Red shows the probability of a doubtful join."
                 if trusted(solution.weighed) or not solution.weighed
@@ -193,6 +196,8 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     shown = {place: middle for place, middle in middles.items() if place not in hidden}
     edges = list(_edges(sheet, imported, ssh_map, visit_of, middles))
     yield from _bands(sheet, ssh_map, middles, [(places[t], places[t + 1], c) for t, c in edges])
+    if drawable_poses(ssh_map):
+        yield from _corridors(sheet, ssh_map)
     lines: dict[str, list[Array]] = defaultdict(list)
     for step, course in edges:
         path = ssh_map.dstates[ssh_map.dstate_at[step]].path
@@ -203,6 +208,8 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
     for colour, courses in lines.items():
         for part in drawn_once(courses):
             yield Line((_points(part),), colour, 4.0, 0.8)
+    for door in ssh_map.doors if drawable_poses(ssh_map) else ():
+        yield Titled(ssh_map.called("door", door.id), (Disc(door.at, (4, 4), ALARM),))
     at: dict[int, Point] = {p: (float(x), float(y)) for p, (x, y) in middles.items()}
     for place in visits:
         if place in hidden:
@@ -217,6 +224,16 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
         if name := ssh_map.name_of("place", place):
             x, y = at[place]
             yield Label((x, y - 18 / sheet.unit), name, size=11, is_bold=True)
+
+
+def _corridors(sheet: _Sheet, ssh_map: SSHMap) -> Iterator[Mark]:
+    """Draw corridors as broad lines with their names."""
+    for corridor in ssh_map.corridors:
+        name = ssh_map.name_of("corridor", corridor.id) or f"C{corridor.id}"
+        line = Line((corridor.line,), colour_of(corridor.path), CORRIDOR, 0.3)
+        yield Titled(ssh_map.called("corridor", corridor.id), (line,))
+        x, y = corridor.line[len(corridor.line) // 2]
+        yield Label((x, y + 18 / sheet.unit), name, size=12, is_bold=True)
 
 
 def _bands(

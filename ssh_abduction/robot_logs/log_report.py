@@ -15,6 +15,7 @@ from typing import Any
 
 from perception.places.importing import Imported
 from perception.readers.scans import RobotLog
+from ssh_abduction.building.telling import told
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.files import filled
@@ -43,6 +44,7 @@ def report(
         *map(paragraph, [_summary(solution, run), *run["notes"], *solution.warnings]),
         figure(log, imported, solution),
         *_drives(imported, solution, run),
+        *_building(solution),
         "<h2>Doubtful joins</h2>" + _doubts(solution)
         if solution.weighed and not solution.weighed.doubt
         else "",
@@ -109,6 +111,13 @@ def _drives(imported: Imported, solution: Solution, run: Mapping[str, Any]) -> I
     head = ("drive", "scans", "way", "visits", "steps", "places", "shared with other drives")
     yield "<h2>Drives</h2>" + _table(head, rows) + paragraph(f"{joined}.")
     yield "<h2>Joins between drives</h2>" + _joins_of_drives(solution)
+
+
+def _building(solution: Solution) -> Iterator[str]:
+    """List the corridors, rooms and doors of the first map."""
+    if solution.maps and (lines := [line.strip() for line in told(solution.maps[0])]):
+        items = "".join(f"<li>{html_text(line)}</li>" for line in lines)
+        yield f"<h2>Corridors, rooms and doors</h2><ul>{items}</ul>"
 
 
 def _joins_of_drives(solution: Solution) -> str:

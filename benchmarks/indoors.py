@@ -1,0 +1,87 @@
+"""Whether the rooms, doors and corridors of a map are those of the floor plan.
+
+A robot drives through a floor plan. The simulator says in which room each scan was taken, and which
+doors the robot drove through. Usage:
+
+    python benchmarks/indoors.py PLAN.xml LOG.log MAPS [PLAN.xml LOG.log MAPS ...]
+
+LOG.log is a log that `simulate --format carmen` wrote, with its truth beside it. MAPS is the folder
+that `map` wrote. A corridor of the plan counts if the robot visited three of its places or more. It
+is whole if one corridor of the map, and no other, has at least two of them, and all but one.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import xml.etree.ElementTree as ET
+from collections import Counter, defaultdict
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+from ssh_abduction import SSHMap, Trace
+from ssh_abduction.building.derive import with_building
+from ssh_abduction.output.roads import place_of_steps
+from ssh_abduction.solver import Solution
+
+
+def judged(ssh_map: SSHMap, trace: Trace, told: dict[str, Any], labels: list[str]) -> Counter[str]:
+    """Count what is right, by the truth of the drive and the labels of the rooms of the plan."""
+    places, counts = place_of_steps(ssh_map), Counter[str]()
+    scans = [int(step.extra["scan"]) for step in trace.steps]
+    seen: dict[int, Counter[str]] = defaultdict(Counter)
+    for t, (place, scan) in enumerate(zip(places, scans, strict=True)):
+        arrived = t == 0 or trace.actions[t - 1].kind != "turn"
+        if arrived and place is not None and told["scans"][scan]:
+            seen[place][told["scans"][scan]] += 1
+    true = {p: rooms.most_common(1)[0][0] for p, rooms in seen.items()}
+    room = {p: r.id for r in ssh_map.rooms for p in r.places}
+    for p, q in combinations(true, 2):
+        found, right = room.get(p) == room.get(q), true[p] == true[q]
+        counts += Counter({"pairs found": found, "pairs true": right, "pairs": found and right})
+    counts["exact"] = int(
+        all((room.get(p) == room.get(q)) == (true[p] == true[q]) for p, q in combinations(true, 2))
+    )
+    for t, action in enumerate(trace.actions):
+        if action.kind == "travel":
+            passed = any(scans[t] < x["scan"] <= scans[t + 1] for x in told["crossings"])
+            found = any(d["side"] == "through" for d in trace[t].extra.get("doors", ()))
+            more = {"doors found": found, "doors true": passed, "doors": found and passed}
+            counts += Counter(more)
+    corridors = [{*c.order} for c in ssh_map.corridors]
+
+    def label(name: str) -> str:
+        return labels[int(name.split()[1])] or ""
+
+    for name, count in Counter(true.values()).items():
+        if count >= 3 and "CORR" in label(name):
+            own = {p for p in true if true[p] == name}
+            shared = [len(own & other) for other in corridors if len(own & other) > 1]
+            counts["corridors true"] += 1
+            counts["corridors whole"] += len(shared) == 1 and shared[0] >= len(own) - 1
+            counts["corridors missed"] += not shared
+    for other in corridors:
+        names = Counter(true[p] for p in other if p in true)
+        counts["corridors named"] += 1
+        counts["corridors false"] += not names or "CORR" not in label(names.most_common(1)[0][0])
+    return counts
+
+
+def main(arguments: list[str]) -> None:
+    """Print a line for each map, and one for all."""
+    total, maps = Counter[str](), 0
+    for plan, log, folder in zip(*(iter(arguments),) * 3, strict=True):
+        spaces = ET.parse(plan).getroot().iter("space")
+        labels = [space.findtext(".//labels/label") or "" for space in spaces]
+        trace = Trace.load(Path(folder) / "trace.jsonl")
+        ssh_map = with_building(Solution.load(Path(folder) / "maps.json").maps[0], trace)
+        told = json.loads(Path(log).with_suffix(".truth.json").read_text())
+        counts = judged(ssh_map, trace, told, labels)
+        total, maps = total + counts, maps + 1
+        print(folder, dict(counts))
+    print(maps, "maps", dict(total))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
