@@ -78,7 +78,10 @@ class Passages:
             return {}
         walls, free = self._beside(way, first.scan, last.scan)
         before = self._beyond(way[::-1], first.scan)[::-1]
-        wide = np.concatenate([before, walls, self._beyond(way, last.scan)]).sum(axis=1)
+        beyond = self._beyond(way, last.scan)
+        # Clutter shows at one point of a side, and a jamb at two: a course may cross it aslant.
+        sides = ndimage.median_filter(np.concatenate([before, walls, beyond]), (3, 1))
+        wide = sides.sum(axis=1)
         through = [
             {"at": round(k * STEP, 2), "width": round(float(walls[k].sum()), 2), "side": "through"}
             for k in (k - len(before) for k in doors_in(wide))
