@@ -298,3 +298,19 @@ def test_bootstrap_learner_logs_its_stages(caplog: pytest.LogCaptureFixture) -> 
         f"a recogniser of {len(run)} images",
     ]
     assert np.all(learner.labels_ >= 0)
+
+
+@pytest.mark.slow
+def test_demo_maps_a_simulated_drive_and_opens_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr("ssh_abduction.cli.demo.WORLD", "triangle")
+    monkeypatch.setattr("ssh_abduction.cli.demo.WORK", 1)
+    assert main(["demo", "-o", str(tmp_path)]) == 0
+    page = tmp_path / "house" / "page.html"
+    assert opened == [page.as_uri()]
+    assert page.is_file()
+    out = capsys.readouterr().out
+    assert f"$ ssh-abduction map {tmp_path}/drive.log -o {tmp_path}/house" in out
