@@ -210,3 +210,19 @@ def test_error_of_a_search_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert search.taken(5.0) is None
     assert search.error == "no such step"
     assert not search.is_busy
+
+
+def test_lifted_robot_has_no_position_until_closures_show_it(scans: tuple[Scan, ...]) -> None:
+    mapper = OnlineLogMapper()
+    for scan in scans[:30]:
+        mapper.observe(scan)
+    mapper.accept(found(0, 1, 2))
+    assert mapper.observe(scans[30]).on_map is not None
+    mapper.lift()
+    for located in (False, True):
+        seen = mapper.observe(scans[10])  # another place, and the odometry starts there
+        assert (seen.on_map, dict(seen.belief)) == (None, {})
+        mapper.accept(replace(found(0, 1, 2, 0), located=located))
+    assert mapper.observe(scans[10]).on_map is not None
+    assert mapper.live.grown().track.breaks == (31,)
+    assert mapper.finish().track.breaks == (31,)

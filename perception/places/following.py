@@ -102,6 +102,8 @@ def follow(log: RobotLog, known: tuple[Mapping[int, Doubt], Track] | None = None
     doubts; it saves time.
     """
     doubts, still = doubts_of(log)
+    # Somebody who lifted the robot knows it.
+    doubts |= {k: one for k, one in (known[0] if known else {}).items() if one is Doubt.CARRIED}
     track = known[1] if known and _is_of(log, *known, doubts) else _track_of(log, doubts)
     # People or an arm of the robot can change what the laser sees while the robot stands.
     standing = {
@@ -217,6 +219,7 @@ class Follower:
         says how far this motion can be trusted.
         """
         self.doubts: dict[int, Doubt] = {}  # of the scans whose odometry was doubted
+        self.lifted = False  # whether the robot may be anywhere at the next scan
         self._doubt_of, self._count = doubt_of, 0
         self._recent: deque[Surfaces] = deque(maxlen=RECENT)
         self._last: Followed | None = None
@@ -231,7 +234,7 @@ class Follower:
         else:
             onward = displacement_between(last.scan.odometry, scan.odometry)
             step = ScanMotion(scan, seen, recent, last.pose, onward, self._before)
-            doubt = self._doubt_of(self._count, onward)
+            doubt = Doubt.CARRIED if self.lifted else self._doubt_of(self._count, onward)
             if doubt is Doubt.NONE and scan.laser.mount not in self._mounts:
                 # The first scan of another laser may show none of the known walls.
                 one = Followed(scan, moved(last.pose, onward), odometer_covariance(onward))
@@ -247,7 +250,7 @@ class Follower:
         # Walls are remembered while the laser sees none.
         if len(seen) or not recent:
             recent.append(seen.moved(one.pose))
-        self._last, self._count = one, self._count + 1
+        self._last, self._count, self.lifted = one, self._count + 1, False
         return one
 
 

@@ -176,7 +176,9 @@ def assembled(
             closings = closures.find_closures(track, visits, 2 * WINDOW)
         track, visits, closings = placed(track, visits, closings)
         poses = closures.fitted_poses(track, visits, closings)
-        closings += closures.closures_across_cuts(track, visits, poses)
+        if across := closures.closures_across_cuts(track, visits, poses):
+            closings += across
+            poses = closures.fitted_poses(track, visits, closings)
         trace = to_trace(log, track, visits, closings, name)
     with _timed(seconds, "views"):
         trace = with_views(trace)

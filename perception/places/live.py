@@ -204,6 +204,10 @@ class LiveLog:
         self.visits += found
         return one, found
 
+    def lift(self) -> None:
+        """Say that the robot may be anywhere at the next scan. A new trajectory begins there."""
+        self._follower.lifted = len(self) > 0
+
     @property
     def log(self) -> RobotLog:
         """The log so far."""

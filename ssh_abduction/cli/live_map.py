@@ -49,6 +49,10 @@ def positive(text: str) -> float:
             "folder to save the state to, each second, with the files of the last map; if it has a "
             "state, the drive goes on from there"
         ),
+        "--onto FOLDER": (
+            "go on with the map that was saved in this folder, from anywhere: no position is told "
+            "until the scans show where the robot is; saves to this folder unless --save is given"
+        ),
         "--page PORT": (
             "serve a page on this computer that follows the robot; 0 takes any free port",
             {"type": int},
@@ -68,11 +72,15 @@ def run_live(options: argparse.Namespace) -> int:
     """
     from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper
 
-    folder = None if options.save is None else Path(options.save)
+    where = options.save if options.save is not None else options.onto
+    folder = None if where is None else Path(where)
     if folder is not None:
         import_log.check_folder(folder)
     tell = lambda note: warn([note])  # noqa: E731
-    if folder is not None and OnlineLogMapper.is_saved(folder):
+    if options.onto is not None:
+        mapper = OnlineLogMapper.load(options.onto, tell)
+        mapper.lift()
+    elif folder is not None and OnlineLogMapper.is_saved(folder):
         mapper = OnlineLogMapper.load(folder, tell)
         print(f"{named(folder)}: the drive goes on after {counted(len(mapper), 'scans')}")
     else:
@@ -120,7 +128,8 @@ def _replay(options: argparse.Namespace, session: LiveSession) -> None:
     for warning in log.warnings:
         warn([warning])
     due, last = time.monotonic(), None
-    with import_log.until_ctrl_c(iter(log.scans[len(session.mapper) :]), StopFlag()) as scans:
+    known = 0 if options.onto is not None else len(session.mapper)
+    with import_log.until_ctrl_c(iter(log.scans[known:]), StopFlag()) as scans:
         for scan in scans:
             if options.speed and last is not None and scan.time is not None:
                 due += min(max(scan.time - last, 0.0), PAUSE) / options.speed

@@ -114,6 +114,8 @@ class FoundMap:
         poses: (n, 3) the fitted pose of each visit: the middle of its place in metres, and by how
             many radians the track is turned there.
         middles: (n, 2) the middle of each visit by the track, in metres.
+        located: Whether the map says where the robot is. If it was lifted, closures have to connect
+            the new trajectory with the old map first.
         said: How good the map is: its status and its probability.
         files: The files of the map, by name.
     """
@@ -124,6 +126,7 @@ class FoundMap:
     middles: np.ndarray[Any, np.dtype[np.float64]]
     said: str
     files: Mapping[str, bytes]
+    located: bool = True
 
 
 def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
@@ -157,7 +160,18 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
         np.array([visit.middle for visit in done.visits]).reshape(-1, 2),
         ", ".join(part for part in parts if part),
         files,
+        _is_located(done),
     )
+
+
+def _is_located(done: Imported) -> bool:
+    """Whether closures connect the last unbroken part of a drive with an earlier part."""
+    if not done.track.breaks:
+        return True
+    scan_of = [int(step.extra["scan"]) for step in done.trace.steps]
+    begin = done.track.breaks[-1]
+    pairs = ((scan_of[one.first], scan_of[one.last]) for one in done.trace.closures)
+    return any(min(pair) < begin <= max(pair) for pair in pairs)
 
 
 @dataclass
@@ -204,7 +218,7 @@ class _Names:
             if number in before and math.dist(before[number], middle) > MOVED
         ]
         (ahead, left), (x, y, turn) = found.middles[-1].tolist(), found.poses[-1].tolist()
-        self.anchor = (ahead, left, 0.0), (x, y, turn)
+        self.anchor = ((ahead, left, 0.0), (x, y, turn)) if found.located else None
         return events
 
 
@@ -252,6 +266,14 @@ class OnlineLogMapper:
         self._last = one.pose
         on_map = self._on_map(one.pose)
         return RobotSeen(one.pose, on_map, self._belief(on_map), tuple(visits))
+
+    def lift(self) -> None:
+        """Say that the robot may be anywhere at the next scan, for example after it was off.
+
+        Until closures show where it is on the map, `observe` returns no pose on the map.
+        """
+        self.live.lift()
+        self._names.anchor = None
 
     def _on_map(self, pose: Pose) -> Pose | None:
         if self._names.anchor is None:
