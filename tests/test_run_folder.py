@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 from perception.readers.logs import read_log
-from ssh_abduction import Trace
+from ssh_abduction import Solution, Trace
 from ssh_abduction.cli import main
 from ssh_abduction.robot_logs.log_maps import map_log
 from ssh_abduction.robot_logs.run_folder import NOTICE, with_notice
@@ -70,3 +71,11 @@ def test_notice_replaces_an_earlier_one_and_escapes() -> None:
     assert "a &lt; b</p>\n<h1>map" in once
     assert with_notice(once, "c").count("<p ") == 1
     assert with_notice(once, "") == page
+
+
+def test_each_place_has_its_number_in_the_report(house: Path) -> None:
+    """Those that the robot only passed show it when pointed at."""
+    (ssh_map, *_) = Solution.load(house / "maps.json").maps
+    text = (house / "report.html").read_text()
+    for place in ssh_map.places:
+        assert f"<title>place {place}</title>" in text or re.search(rf">{place}</text>", text)

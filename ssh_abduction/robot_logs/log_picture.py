@@ -107,7 +107,8 @@ def figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
             f"The first map over the scans, at {poses}. Numbers are places, ticks their gateways, "
             "and lines the edges along the robot's course, drawn once where several run together. "
             f"{colours}North, in corrections, is up. Dots are places at which the robot only "
-            "passed through. Bands are regions that, as far as known, have only one entrance. "
+            "passed through; point at one to see its number. Bands are regions that, as far as "
+            "known, have only one entrance. "
             f"{INDOORS if solution.maps[0].building else ''}"
             + (
                 "Red shows the probability of a doubtful join."

@@ -377,8 +377,10 @@ def never_true(problem: Problem) -> Iterator[str]:
     only has to ground a rule with this atom alone. The parameter of a part stands for any step.
     """
     trace, theory = problem.trace, problem.theory
+    if not theory.rules:
+        return
     control = Control(check=look_at_clock, logger=lambda *_: None)
-    control.add("base", [], facts.trace_facts(problem, 0, len(trace) if theory.rules else 0))
+    control.add("base", [], facts.trace_facts(problem, 0, len(trace)))
     control.ground([("base", [])])
     for rules in theory.rules:
         for statement in _statements(rules):
