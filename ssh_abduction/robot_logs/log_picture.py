@@ -73,9 +73,9 @@ BESIDE = 0.75
 BROAD = 2.0
 # A join with a smaller probability is doubtful.
 SURE = 0.95
-# The colour of edges that belong to no meaningful path, of walls, and of the robot's way.
-EDGE, WALL, WAY = "#0072b2", "#8a8a8a", "#c9d4df"
-INDOORS = "Broad pale lines are corridors, C0, C1 and so on, and red dots are doors. "
+# The colour of edges that belong to no meaningful path, of walls, of the robot's way, and of doors.
+EDGE, WALL, WAY, DOOR = "#0072b2", "#8a8a8a", "#c9d4df", "#8b4513"
+INDOORS = "Broad pale lines are corridors, C0, C1 and so on, and brown dots are doors. "
 CORRIDOR = 14.0  # width of the line of a corridor, in units of the page
 ASIDE = 5.0  # metres between drives that no map joins
 
@@ -210,7 +210,7 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
         for part in drawn_once(courses):
             yield Line((_points(part),), colour, 4.0, 0.8)
     for door in ssh_map.doors if drawable_poses(ssh_map) else ():
-        yield Titled(ssh_map.called("door", door.id), (Disc(door.at, (4, 4), ALARM),))
+        yield Titled(ssh_map.called("door", door.id), (Disc(door.at, (4, 4), DOOR),))
     at: dict[int, Point] = {p: (float(x), float(y)) for p, (x, y) in middles.items()}
     for place in visits:
         if place in hidden:
