@@ -120,7 +120,10 @@ def import_log(
     with _timed(seconds, "places"):
         visits = known.visits if known and is_known else find_visits(log, track, width)
     found = known.closings if known and is_known else None
-    return assembled((log, track, notes), visits, found, width, name, seconds)
+    imported = assembled((log, track, notes), visits, found, width, name, seconds)
+    said = () if imported.trace.closures else log_checks.describe_missing_closures(track)
+    _say(log, said, tell)
+    return replace(imported, notes=(*notes, *said))
 
 
 def _refuse_bad(
@@ -195,6 +198,13 @@ def placed(
     return track, *with_partings(track, visits, closings)
 
 
+def _say(log: RobotLog, notes: Sequence[str], tell: Tell) -> None:
+    """Log and tell notes on a robot's log."""
+    for note in notes:
+        _log.warning("%s: %s", named(log.source), note)
+        tell(note)
+
+
 def tracked(log: RobotLog, tell: Tell = tell_nobody, known: Grown | None = None) -> Tracked:
     """Compute the trajectory of a robot from its log.
 
@@ -206,9 +216,7 @@ def tracked(log: RobotLog, tell: Tell = tell_nobody, known: Grown | None = None)
 
     def say(more: Sequence[str]) -> None:
         notes.extend(more)
-        for note in more:
-            _log.warning("%s: %s", named(log.source), note)
-            tell(note)
+        _say(log, more, tell)
 
     logged = log
     log, corrected, whole = log_checks.checked(log)

@@ -222,7 +222,7 @@ def judged(log: RobotLog, track: Track, explained: bool) -> tuple[Track, list[st
             f"map each part.{_about_gaps(log, contradictions)}"
         )
         is_reliable = False
-    if track.way[-1] > 2 * AWAY and not _returns(track):
+    if track.way[-1] > 2 * AWAY and not returns(track):
         notes.append(
             f"In {track.way[-1]:.0f} m the robot never comes back to where it was before, at least "
             f"{AWAY:.0f} m earlier on its way. So no loop is closed, and nothing confirms the map. "
@@ -302,14 +302,24 @@ def _overriding(log: RobotLog, track: Track) -> float:
     return count / max(len(log) - 1, 1)
 
 
-def _returns(track: Track) -> bool:
-    """Whether the robot comes back to where it was before."""
+def describe_missing_closures(track: Track) -> list[str]:
+    """Say in a note that no closure was found, if the robot comes back to where it was."""
+    said = (
+        "By its track, the robot comes back to where it was, but no scans there match: no loop "
+        "closure is found. So nothing corrects the drift of the track, and the map may show one "
+        "place twice. If the robot did come back, check the scans and the odometry."
+    )
+    return [said] if returns(track, 2 * AWAY) else []
+
+
+def returns(track: Track, away: float = AWAY) -> bool:
+    """Whether the robot comes back to where it was at least `away` metres earlier on its way."""
     some = np.unique(np.searchsorted(track.way, np.arange(0.0, track.way[-1], 1.0)))
     places, way = track.poses[some, :2], track.way[some]
     for i in range(len(some)):
         gap = way[i] - way[:i]
         far = np.hypot(*(places[:i] - places[i]).T)
-        if ((gap >= AWAY) & (far <= NEAR + DRIFT * gap)).any():
+        if ((gap >= away) & (far <= NEAR + DRIFT * gap)).any():
             return True
     return False
 
