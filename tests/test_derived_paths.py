@@ -199,6 +199,70 @@ def test_files_keep_paths_and_buildings() -> None:
     assert [len(c.order) for c in new.corridors] == [len(c.order) for c in found.corridors]
 
 
+def in_frames(parts: Sequence[tuple[SSHMap, Trace]], floors: bool) -> tuple[SSHMap, Trace]:
+    """One map of some drives that share no place: on floors joined by lifts, or in pieces."""
+    steps: list[Step] = []
+    labels: list[int] = []
+    states: list[DState] = []
+    links: list[tuple[int, str, int]] = []
+    for k, (part, trace) in enumerate(parts):
+        between = Action("up", "lift") if floors else Action(f"drive {k}", "start")
+        if steps:
+            steps[-1] = replace(steps[-1], action=between)
+            links += [(labels[-1], "up", len(states))] if floors else []
+        s, p = len(states), len({state.place for state in states})
+        labels += [s + label for label in part.dstate_at]
+        links += [(s + a, name, s + b) for a, name, b in part.links]
+        steps += trace.steps
+        states += [
+            replace(x, id=s + x.id, place=p + (x.place or 0), floor=k if floors else None)
+            for x in part.dstates
+        ]
+    places = tuple(sorted({state.place for state in states if state.place is not None}))
+    poses = tuple(pose for part, _ in parts if part.fit for pose in part.fit.poses)
+    fit = Fit(0.0, 0, 1.0, poses=poses)
+    return SSHMap(tuple(labels), tuple(states), tuple(links), places, fit=fit), Trace(tuple(steps))
+
+
+# A hall that the robot crosses straight, by way of place 2, and once in a lane 1.2 m beside.
+HALL = [(0.0, 0.0), (10.0, 0.0), (5.0, 0.0)]
+LANE = {(1, 0): [(9.0, 1.2), (1.0, 1.2)]}
+# A narrow corridor along the middle between both.
+BETWEEN = [(0.0, 0.6), (10.0, 0.6)]
+
+
+@pytest.mark.parametrize("floors", [False, True])
+def test_pieces_and_floors_are_kept_apart(floors: bool) -> None:
+    """Places and walls that lie at one point of two frames have nothing to do with each other."""
+    one = drive(HALL, [0, 2, 1, 0], width=9.0, courses=LANE)
+    other = drive(BETWEEN, [0, 1], width=0.4)
+    found = with_building(*in_frames([one, other, drive(CROSS, TOUR, doors=[(1, 4)])], floors))
+    assert len(found.floors if floors else found.pieces) == 3
+    alone = orders(with_building(*one))
+    assert alone == {(0, 2, 1)}, "the lane is no edge of its own"
+    third = {tuple(p + 5 for p in order) for order in orders(with_building(*drive(CROSS, TOUR)))}
+    assert orders(found) == alone | {(3, 4)} | third
+    assert [room.places for room in found.rooms] == [(0, 1, 2), (3, 4), (5, 6, 7, 8, 10), (9,)]
+    street = next(path for path in found.paths if len(path.order) == 4)
+    assert {*street.left, *street.right} == {9, 10}
+
+
+def test_drives_that_share_places_have_common_paths() -> None:
+    """Each of two drives sees one half of the corridor."""
+    ssh_map, trace = drive(LINE, [0, 1, 2, 3, 2])
+    labels, steps = ssh_map.dstate_at, list(trace.steps)
+    steps[1] = replace(steps[1], action=Action("tuesday", "start"))
+    links = tuple((a, "travel", b) for t, (a, b) in enumerate(itertools.pairwise(labels)) if t != 1)
+    joint = replace(ssh_map, links=tuple(sorted({*links})))
+    found = with_building(joint, Trace(tuple(steps)))
+    assert orders(found) == {(0, 1), (2, 3)}, "no travel leads from 1 to 2"
+    assert len(found.pieces) == 2
+    again, both = drive(LINE, [0, 1, 2, 1, 2, 3])
+    steps = list(both.steps)
+    steps[3] = replace(steps[3], action=Action("tuesday", "start"))
+    assert orders(with_building(again, Trace(tuple(steps)))) == {(0, 1, 2, 3)}
+
+
 def test_near_places_are_one_junction_only_if_the_robot_drove_between_them() -> None:
     points = [(0.0, 0.0), (5.0, 0.0), (5.6, 0.3), (10.0, 0.0), (15.0, 0.0)]
     joined = with_building(*drive(points, [0, 1, 2, 3, 4]))

@@ -21,6 +21,7 @@ import numpy as np
 
 from perception.places.passages import STEP, WIDE, directions
 from ssh_abduction.building.travels import Array, grouped, laid_course
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.roads import place_of_steps
@@ -159,7 +160,9 @@ class FloorPlan:
 
     def _leave_out_lanes(self) -> None:
         """Leave out each edge beside which others lead to the same place, with no wall between."""
-        walls = np.concatenate([np.zeros((0, 2)), *map(walls_beside, self.edges)])
+        frame = {p: spot.frame for p, spot in self.spots.items()}
+        beside = gathered((frame[edge.ends[0]], walls_beside(edge)) for edge in self.edges)
+        walls = {of: np.concatenate(parts) for of, parts in beside.items()}
         for edge in sorted(self.edges, key=lambda e: -e.length):
             graph = nx.MultiGraph()
             graph.add_edges_from(
@@ -174,7 +177,7 @@ class FloorPlan:
                 if sum(e.length for e in chain) > LANE * edge.length + SPARE:
                     continue
                 line = _line(chain, edge.ends[0])
-                if not parted(walls, edge.course, line):
+                if not parted(walls[frame[edge.ends[0]]], edge.course, line):
                     keep = [other for other in self.edges if other is not edge]
                     self.edges = [
                         replace(e, travels=tuple(sorted({*e.travels, *edge.travels})))
