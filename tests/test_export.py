@@ -258,7 +258,7 @@ def test_export_of_dstates_has_one_edge_a_link(square: SSHMap) -> None:
 
 
 @pytest.mark.parametrize("level", ["places", "dstates"])
-@pytest.mark.parametrize("to", formats.FORMATS)
+@pytest.mark.parametrize("to", [to for to in formats.FORMATS if to != "osm"])
 def test_export_lays_out_maps_without_poses(to: str, level: str) -> None:
     ssh_map = solve(rectangle(8)).maps[0]
     if (to, level) == ("dot", "places"):
@@ -343,7 +343,7 @@ def test_export_refuses_wrong_arguments_and_maps_without_roads(square: SSHMap) -
 def test_export_command_writes_the_output_of_python(
     square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert verb.FORMATS == formats.FORMATS
+    assert tuple(verb.FORMATS) == formats.FORMATS
     file = f"{tmp_path}/map.json"
     square.save(file)
     assert main(["export", file, "--to", "nav2", "-o", f"{tmp_path}/graph.geojson"]) == 0

@@ -33,7 +33,9 @@ Step = TypeVar("Step")  # a step by its number or its name
 READ = ("trace", "traces", "log", "logs", "maps", "other", "world", "graph")
 WRITTEN = ("output", "joint_trace")
 # Endings that say what is in a file.
-ENDINGS = re.compile(r"\.(bag|mcap|log|clf|html?|png|pdf|svg|jsonl|ya?ml|geojson|graphml|dot|gv)")
+ENDINGS = re.compile(
+    r"\.(bag|mcap|log|clf|html?|png|pdf|svg|jsonl|ya?ml|geojson|osm|graphml|dot|gv)"
+)
 
 MAPS_SAID = (
     "file of maps that solve -o wrote, a file of a single map, or a folder that the command "

@@ -351,6 +351,7 @@ def _with_regions(ssh_map: SSHMap) -> str:
 FORMATS = {
     "nav2": (".geojson",),
     "tmap2": (".yaml", ".yml"),
+    "osm": (".osm",),
     "graphml": (".graphml",),
     "dot": (".dot", ".gv"),
     "svg": (".svg",),
@@ -362,12 +363,13 @@ FORMATS = {
     {
         "maps": shared.MAPS_SAID,
         f"--to {{{','.join(FORMATS)}}}!": (
-            "the format to write: nav2 and tmap2 are for programs that drive a robot, svg is a "
-            "picture, and the others are graphs"
+            "the format to write: nav2 and tmap2 are for programs that drive a robot, osm has the "
+            "rooms and doors of a robot's log, svg is a picture, and the others are graphs"
         ),
         **shared.ONE_MAP,
         "--trace TRACE": (
-            "the trace that was mapped; its turns give a better layout of a map without poses"
+            "the trace that was mapped; its turns give a better layout of a map without poses, and "
+            "osm needs it for maps without rooms"
         ),
         "-o --output FILE": ("file to write (default: standard output)", {"default": "-"}),
         "--set level {places,dstates}": (
@@ -383,11 +385,11 @@ FORMATS = {
     }
 )
 def run_export(options: argparse.Namespace) -> int:
-    """Write a map for Nav2, tmap2, GraphML, DOT or networkx.
+    """Write a map for Nav2, tmap2, OpenStreetMap, GraphML, DOT or networkx.
 
     Write a map in the format of another program: a route graph for Nav2 (GeoJSON), a topological
-    map for LCAS's topological_navigation (tmap2, YAML), GraphML, Graphviz DOT, SVG, or JSON for
-    networkx.
+    map for LCAS's topological_navigation (tmap2, YAML), an area graph of rooms and doors (osm,
+    OpenStreetMap XML), GraphML, Graphviz DOT, SVG, or JSON for networkx.
 
     Positions are in metres from the first dstate if the map has poses. Otherwise they come from a
     layout, and a warning says so. docs/reference/formats.md describes each format.
@@ -397,6 +399,8 @@ def run_export(options: argparse.Namespace) -> int:
     shared.check_ending(options.output, *FORMATS[options.to])
     listing = Listing.load(options.maps)
     chosen = listing.maps[listing.number(options.map)]
+    if options.to == "osm":
+        chosen = _built(options, listing, chosen)
     how: dict[str, Any] = {"level": options.level, "hide_undecided": options.hide_undecided}
     how["turns"] = None if options.trace is None else Trace.load(options.trace)
     with said_of(listing.source, MapError):

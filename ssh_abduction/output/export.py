@@ -37,9 +37,10 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.drawing import to_svg
 from ssh_abduction.output.graphs import in_text, to_dot, to_graphml, to_networkx
 from ssh_abduction.output.layout import Turns, degrees_of
+from ssh_abduction.output.osm_areas import osm_areas
 from ssh_abduction.output.roads import DIGITS, NO_PLACES, Road, Roads, Stop, undecided_places
 
-FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
+FORMATS = ("nav2", "tmap2", "osm", "graphml", "dot", "svg", "networkx-json")
 FOR_NAVIGATION = ("nav2", "tmap2")  # these need positions
 LEVELS = ("places", "dstates")
 ACTION = "NavigateToPose"
@@ -68,10 +69,12 @@ def export_map(
     Args:
         ssh_map: The map.
         to: The format: "nav2", a route graph of Nav2 (GeoJSON); "tmap2", a topological map of
-            LCAS's topological_navigation (YAML); "graphml"; "dot", for Graphviz; "svg", a picture;
-            or "networkx-json", which networkx.node_link_graph reads.
+            LCAS's topological_navigation (YAML); "osm", rooms and doors as an area graph (osmAG,
+            OpenStreetMap XML); "graphml"; "dot", for Graphviz; "svg", a picture; or
+            "networkx-json", which networkx.node_link_graph reads.
         level: What a node is: "places" or "dstates". None takes places for nav2 and tmap2 if the
-            map has any, and dstates otherwise. Must be None for "svg", and not "places" for "dot".
+            map has any, and dstates otherwise. Must be None for "svg" and "osm", and not "places"
+            for "dot".
         name: The name of the map in nav2 and tmap2 files. In tmap2 it also names the pointset.
         frame: The name of the coordinate frame of the positions, in nav2 and tmap2 files.
         turns: How actions turn, for the layout of a map without poses: the trace that was mapped,
@@ -92,10 +95,13 @@ def export_map(
             f"hide_undecided: expected nav2 or tmap2 with places, got {to} with {nodes}; "
             "export places for navigation, or show all"
         )
-    if to == "svg" and level is not None:
-        raise MapError("level: expected none for svg, which shows places and dstates; leave it out")
+    if to in ("svg", "osm") and level is not None:
+        shows = "places and dstates" if to == "svg" else "rooms"
+        raise MapError(f"level: expected none for {to}, which shows {shows}; leave it out")
     if to == "svg":
         return to_svg(ssh_map, turns)
+    if to == "osm":
+        return osm_areas(ssh_map)
     level = one_of("level", nodes, LEVELS, MapError, mend="say what nodes are")
     for field, text in (("name", name), ("frame", frame)):
         if not isinstance(text, str) or not text or not is_writable(text):
