@@ -26,7 +26,7 @@ from functools import partial
 from typing import Any, Literal, TypeAlias
 
 from ssh_abduction.data.building import SIDES, read_building
-from ssh_abduction.data.checks import View, a_path
+from ssh_abduction.data.checks import View, a_path, a_whole_number
 from ssh_abduction.data.errors import MapError, is_writable
 from ssh_abduction.data.files import BadJson, opened_file, parse_json, save_file, source_of
 from ssh_abduction.data.schema import FieldReader, Shape, SparseData
@@ -120,11 +120,11 @@ class MapPath(SparseData):
 
     def left_of(self, place: int) -> bool:
         """Whether a place is known to lie left of the path in direction +1."""
-        return place in self.left
+        return a_whole_number("place", place, MapError) in self.left
 
     def right_of(self, place: int) -> bool:
         """Whether a place is known to lie right of the path in direction +1."""
-        return place in self.right
+        return a_whole_number("place", place, MapError) in self.right
 
 
 @dataclass(frozen=True, slots=True)
