@@ -8,6 +8,10 @@ doors the robot drove through. Usage:
 LOG.log is a log that `simulate --format carmen` wrote, with its truth beside it. MAPS is the folder
 that `map` wrote. A corridor of the plan counts if the robot visited three of its places or more. It
 is whole if one corridor of the map, and no other, has at least two of them, and all but one.
+
+The order of the places of a corridor of the map is judged by Kendall's tau: it is compared with
+their true positions along the line that fits them best. A place is truly left of the corridor if it
+is left of this line.
 """
 
 from __future__ import annotations
@@ -19,6 +23,8 @@ from collections import Counter, defaultdict
 from itertools import combinations
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.building.derive import with_building
@@ -49,6 +55,7 @@ def judged(ssh_map: SSHMap, trace: Trace, told: dict[str, Any], labels: list[str
             found = any(d["side"] == "through" for d in trace[t].extra.get("doors", ()))
             more = {"doors found": found, "doors true": passed, "doors": found and passed}
             counts += Counter(more)
+    counts += ordered(ssh_map, trace)
     corridors = [{*c.order} for c in ssh_map.corridors]
 
     def label(name: str) -> str:
@@ -68,6 +75,30 @@ def judged(ssh_map: SSHMap, trace: Trace, told: dict[str, Any], labels: list[str
     return counts
 
 
+def ordered(ssh_map: SSHMap, trace: Trace) -> Counter[str]:
+    """Count pairs of places of corridors in order and not, and places on the right side."""
+    seen: dict[int, list[Any]] = defaultdict(list)
+    for step, place in zip(trace.steps, place_of_steps(ssh_map), strict=True):
+        if place is not None:
+            seen[place].append(step.truth["pose"][:2])
+    where = {place: np.mean(poses, axis=0) for place, poses in seen.items()}
+    counts = Counter[str]()
+    for c in ssh_map.corridors:
+        at = np.array([where[p] for p in c.order])
+        axis = np.linalg.svd(at - at.mean(axis=0))[2][0]
+        axis = axis * np.sign((at[-1] - at[0]) @ axis)
+        across = np.array([-axis[1], axis[0]])
+        along = [float(x) for x in at @ axis]
+        for x, y in combinations(along, 2):
+            counts["in order" if x < y else "out of order"] += 1
+        left = {p: float(across @ (where[p] - at.mean(axis=0))) > 0 for p in where}
+        told = {**dict.fromkeys(c.left, True), **dict.fromkeys(c.right, False)}
+        counts["beside"] += len(set(where) - set(c.order))
+        counts["sides"] += len(told)
+        counts["sides right"] += sum(left[p] == side for p, side in told.items())
+    return counts
+
+
 def main(arguments: list[str]) -> None:
     """Print a line for each map, and one for all."""
     total, maps = Counter[str](), 0
@@ -80,7 +111,9 @@ def main(arguments: list[str]) -> None:
         counts = judged(ssh_map, trace, told, labels)
         total, maps = total + counts, maps + 1
         print(folder, dict(counts))
-    print(maps, "maps", dict(total))
+    pairs = total["in order"] + total["out of order"]
+    tau = (total["in order"] - total["out of order"]) / pairs if pairs else None
+    print(maps, "maps", dict(total), "tau", tau)
 
 
 if __name__ == "__main__":
