@@ -189,8 +189,11 @@ def test_broad_beam_and_small_misfit_raise_confidence() -> None:
     assert not weighed.proven
     assert weighed.broken == pytest.approx(0.0, abs=0.01)
     assert weighed.confidence > 0.95
-    least = math.floor(100 * weighed.bound / weighed.nats)
-    assert f"(not proven: no map costs less than {least} % of this one)" in weighed.sentence
+    assert weighed.verdict.endswith(", none doubtful. Not proven best.")
+    nearer = replace(weighed, bound=0.885 * weighed.nats)
+    assert nearer.verdict.endswith(" Not proven best: no map costs less than 88 % of it.")
+    assert replace(nearer, searched=False).verdict.count("which are doubtful is unknown") == 1
+    assert replace(nearer, bound=weighed.nats).verdict.endswith(" Proven best.")
 
 
 def test_cheaper_map_that_breaks_axioms_lowers_confidence() -> None:

@@ -48,7 +48,9 @@ def test_solve_prints_the_maps_and_their_differences(
 ) -> None:
     assert main(["solve", ACES]) == 0
     out = capsys.readouterr().out
-    assert out.startswith("optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps;")
+    verdict, headline = out.splitlines()[:2]
+    assert verdict == "10 places, 3 joins by minimality alone. Proven minimal, one of 4 such maps."
+    assert headline.startswith("optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps;")
     assert "what tells the maps apart\n" in out
     assert "path 0: places" in out
 
@@ -143,7 +145,9 @@ def test_solve_without_time_prints_a_sketch_or_unknown(
     assert main(["solve", path, "--time-limit", "1e-9"]) == 0
     capsys.readouterr()
     assert main(["solve", path, "--time-limit", "1e-9", "--strict"]) == 10
-    assert capsys.readouterr().out.startswith("feasible (time limit): ")
+    verdict, headline = capsys.readouterr().out.splitlines()[:2]
+    assert verdict.endswith(" Not proven minimal.")
+    assert headline.startswith("feasible (time limit): ")
     no_time = ["solve", path, "--time-limit", "1e-9", "--set", "without_speedups=greedy"]
     assert main(no_time) == 30
     assert capsys.readouterr().out.startswith("unknown (time limit): no map of all 22 steps yet")
@@ -262,6 +266,7 @@ def test_count_of_one_has_a_singular_noun(
     path = saved(Trace.from_steps("a", []), tmp_path)
     assert main(["solve", path, "--theory", "topological"]) == 0
     assert capsys.readouterr().out.startswith(
+        "1 place. Proven minimal, the only such map.\n"
         "optimal: 1 dstate, 1 place, 0 paths; 1 minimal map; "
     )
     assert main(["solve", path, "--json"]) == 0
@@ -402,7 +407,7 @@ def test_setting_level_causal_gives_the_causal_preset(
 ) -> None:
     assert main(["solve", room, "--set", "level=causal"]) == 0
     alone = capsys.readouterr().out
-    assert re.match(r"optimal: \d+ dstates?; 1 minimal map;", alone)  # no places and paths
+    assert re.search(r"\noptimal: \d+ dstates?; 1 minimal map;", alone)  # no places and paths
     assert main(["solve", room, "--theory", "causal"]) == 0
     assert re.sub(r"\d\.\d\d s", "", alone) == re.sub(r"\d\.\d\d s", "", capsys.readouterr().out)
 
@@ -475,7 +480,7 @@ def test_verbs_read_standard_input_and_survive_a_closed_pipe(room: str) -> None:
     trace = Path(room).read_bytes()
     command = [sys.executable, "-m", "ssh_abduction", "solve", "-"]
     done = subprocess.run(command, input=trace, capture_output=True, check=True)
-    assert done.stdout.startswith(b"optimal: 8 dstates")
+    assert b"\noptimal: 8 dstates" in done.stdout
     assert done.stderr == b""  # no progress where there is no terminal
     shown = printed_in("utf-8", "show", "-", given=aces.answer().encode())
     assert shown.count(b"path 0: places") == 4
@@ -593,7 +598,7 @@ def test_closed_standard_error_does_not_stop_the_answer(
         assert main(words) == code
         sys.stderr.close()
     out = capsys.readouterr().out
-    assert out.startswith("optimal: 8 dstates")
+    assert "\noptimal: 8 dstates" in out
     assert "nosuch" not in out
 
 

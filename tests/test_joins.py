@@ -152,7 +152,9 @@ def test_commands_print_joins_that_rest_on_minimality(
 ) -> None:
     trace, maps = str(EXAMPLES / "notched-rectangle.jsonl"), str(tmp_path / "maps.json")
     assert main(["solve", trace]) == 0
-    assert capsys.readouterr().out.splitlines()[1] == TOLD
+    verdict, _, told = capsys.readouterr().out.splitlines()[:3]
+    assert verdict == "4 places, 1 join by minimality alone. Proven minimal, the only such map."
+    assert told == TOLD
     assert main(["solve", trace, "--json"]) == 0
     out = capsys.readouterr().out
     Path(maps).write_text(out)
@@ -196,6 +198,7 @@ def test_page_lists_doubtful_joins() -> None:
     content = content_of(solution)
     assert content["sureness"] == TOLD
     assert content["joins"] == [(0, 8, None)]
+    assert content["verdict"] == solution.verdict
     costs = [0.0, 1.0, 9.0]
     rivals = [(0, 1, 0, 1, 0), (0, 1, 0, 1, 2), (0, 1, 2, 3, 4)]
     weighed = Weighed(0.0, 5.0, tuple(Rival(*rival) for rival in zip(costs, rivals, strict=True)))
@@ -207,9 +210,8 @@ def test_page_lists_doubtful_joins() -> None:
 
 def test_maps_of_logs_name_doubtful_joins() -> None:
     solution = solve(Trace.load(EXAMPLES / "notched-rectangle.jsonl"))
-    told = f"minimal map; {TOLD.removeprefix('minimal; ')}"
     run = {"log": {"scans": 9, "metres": 5.0}, "visits": 3, "steps": 401}
-    assert told in log_report._summary(solution, run)
+    assert TOLD in log_report._summary(solution, run)
     imported = SimpleNamespace(visits=(), track=SimpleNamespace(way=[5.0]))
     log = MagicMock(warnings=(), __len__=lambda _: 9)
     files = {"run.json": b'{"log": {}}'}
@@ -224,7 +226,8 @@ def test_maps_of_logs_name_doubtful_joins() -> None:
     )
     question = MapQuestion(None, {}, {}, 0.5, None, 0)
     line = question._answer(0, ["a.log"], done, None, time.monotonic() - 60).line
-    assert told in line
+    assert line.startswith(f"a.log: {solution.verdict}\n  optimal: ")
+    assert TOLD in line
     assert line.endswith("; 60.0 s")
     # Neither the second part of x nor the log that is named like one confuses their sources.
     drives = [{"name": name} for name in ("x", "x part 3", "x part 2")]

@@ -22,11 +22,10 @@ from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.output.roads import place_of_steps, undecided_places
 from ssh_abduction.output.scene import ALARM
-from ssh_abduction.robot_logs import log_picture
 from ssh_abduction.robot_logs.log_maps import LogMap, map_log
 from ssh_abduction.robot_logs.log_picture import BESIDE, EDGE, drawn_once, figure
 from ssh_abduction.robot_logs.log_report import report
-from ssh_abduction.solver import Status
+from ssh_abduction.solver import Status, Weighed
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +176,9 @@ def test_picture_shows_probabilities_of_doubtful_joins(
     house: LogMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert ALARM not in figure(house.log, house.imported, house.solution)
-    monkeypatch.setattr(log_picture, "SURE", 2.0)  # all joins are doubtful
+    monkeypatch.setattr(
+        Weighed, "doubtful", property(lambda found: found.joins)
+    )  # all joins are doubtful
     places = place_of_steps(house.solution.maps[0])
     joined = {places[second] for _, second, _ in house.solution.weighed.joins}
     picture = figure(house.log, house.imported, house.solution)

@@ -173,7 +173,7 @@ def test_counts_of_one_are_singular() -> None:
         (Progress(1, 1, one.cost, one.bound, 1, 0.0).sentence, "1 of 1 step; best 1 dstate, 1 pl"),
         (headline(one, None), "1 of 1 step given to clingo"),
         (log_report._summary(one, run), "1 scan along 1 m; 1 visit to distinctive places, 1 step."),
-        (log_report._summary(one, run), " 1 place, 1 distinctive state: "),
+        (log_report._summary(one, run), " 1 place, 1 distinctive state."),
         (repr(OnlineMapper("a")), "<OnlineMapper: 1 step, optimal, 1 dstate>"),
     ):
         assert said in text

@@ -35,7 +35,6 @@ from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.runtime import workers
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, check_limit
-from ssh_abduction.theory.joins import joins_in_words
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
@@ -223,21 +222,13 @@ class MapQuestion(jobs.FileQuestion):
             drive["source"] = path = sources.get(drive["name"], path)
         files["run.json"] = (json.dumps(run, indent=2, ensure_ascii=False) + "\n").encode()
 
-        cost, solution = done.solution.cost, done.solution
-        found = "no map"
-        if cost is not None:
-            names = ["places", *(["paths"] if solution.theory.has_paths else []), "dstates"]
-            found = ", ".join(counted(getattr(cost, name), name) for name in names)
-        how = f"{solution.status.value}, {counted(solution.count, 'minimal maps')}"
-        how += "" if solution.complete else " or more"
-        if solution.weighed:
-            how = f"{solution.status.value}, {solution.weighed.sentence}"
-        joins = joins_in_words(solution.by_minimality, solution.count)
+        solution = done.solution
         visits = counted(len(done.imported.visits), "visits")
         way = f"{counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m"
         seconds = f"{time.monotonic() - started:.1f} s"
-        parts = [found, how, joins, solution.joined, f"{visits} in {way}", seconds]
-        line = f"{' + '.join(map(named, paths))}: {'; '.join(filter(None, parts))}"
+        parts = [solution.headline, solution.sureness, solution.joined]
+        detail = "; ".join(filter(None, [*parts, f"{visits} in {way}", seconds]))
+        line = f"{' + '.join(map(named, paths))}: {solution.verdict}\n  {detail}"
         is_ended = done.interrupted and self.known is None  # by a person
         code = interrupted_code() if is_ended else exit_code(solution)
         notes = (*log.warnings, *done.notes, *solution.warnings)
@@ -286,7 +277,8 @@ def run_map(options: argparse.Namespace) -> int:
     """Map a building from a robot's log.
 
     Find the minimal maps of a building. Writes trace.jsonl, maps.json, page.html, report.html and
-    run.json into a folder. With several logs, each gets its own folder, and its result is one line.
+    run.json into a folder. With several logs, each gets its own folder, and its result is
+    a verdict with a line of details.
     Logs that are already mapped with the same settings are skipped. With --together, the logs are
     drives through one building, and get one map.
     """

@@ -46,6 +46,8 @@ def answer_lines(
 
     `existing` is the map to which drives were added, if there was one.
     """
+    if solution.cost is not None:
+        yield solution.verdict
     yield headline(solution, explanation)
     yield from by_displacements(solution)
     if solution.joined:

@@ -42,12 +42,11 @@ from ssh_abduction.data.words import counted
 from ssh_abduction.output.layout import Layout, layout
 from ssh_abduction.output.scene import axes
 from ssh_abduction.rivals.comparison import Choice, compare
-from ssh_abduction.rivals.listing import DrivePair, Listing, Maps, joins_of_drives, trusted
+from ssh_abduction.rivals.listing import DrivePair, Listing, Maps, joins_of_drives
 from ssh_abduction.solver import probability_in_words
 
 DRAWING = 3.0  # processor seconds for the drawings of all maps except the first
 DRAWN = 10_000  # dstates of all drawings together; more would make the page too large
-DOUBTED = 0.95  # joins of a smaller probability are listed
 JOINS = 20  # at most this many joins are listed
 CUT = 0.5  # the largest standard deviation of an ellipse, as a share of the extent of the map
 Steps: TypeAlias = tuple[int, ...]
@@ -102,7 +101,7 @@ def content_of(
     spots = _spots(maps[0], layouts[0][1])
     return {
         **attributes_of(found, "sentence", "minimal", "complete"),
-        **attributes_of(listing, "sureness", "warnings"),
+        **attributes_of(listing, "verdict", "sureness", "warnings"),
         "joins": _joins(listing),
         **_drives(listing),
         "file": called.maps,
@@ -182,11 +181,10 @@ def _joins(listing: Listing) -> list[tuple[int, int, str | None]]:
     Each has two steps and the probability of their join. If probabilities are unknown, the joins
     are those that no axiom and no observation forces, each with None.
     """
-    weighed = trusted(listing.weighed)
-    if weighed is None:
+    doubtful = listing.weighed.doubtful if listing.weighed else None
+    if doubtful is None:
         return [(join.first, join.second, None) for join in listing.by_minimality[:JOINS]]
-    doubted = [join for join in weighed.joins if join[2] < DOUBTED]
-    return [(i, j, probability_in_words(share)) for i, j, share in doubted[:JOINS]]
+    return [(i, j, probability_in_words(share)) for i, j, share in doubtful[:JOINS]]
 
 
 def _drives(listing: Listing) -> dict[str, Any]:

@@ -44,6 +44,7 @@ from ssh_abduction.solver import (
     Status,
     Weighed,
     probability_in_words,
+    verdict_of,
 )
 from ssh_abduction.theory.joins import Join, joins_in_words
 from ssh_abduction.theory.theory import Theory
@@ -105,6 +106,20 @@ class Listing:
     def joined(self) -> str:
         """Which drives the first map joins, in words; empty for a single drive."""
         return pieces_in_words(self.drives, self.maps[0])
+
+    @property
+    def verdict(self) -> str:
+        """What was found and how sure it is, in a few words."""
+        best = self.maps[0]
+        unproven = 0 if self.complete is False else None
+        return verdict_of(
+            len(best.places or best.dstates),
+            bool(best.places),
+            self.weighed,
+            unproven if self.minimal is None else self.minimal,
+            listed=self.complete,
+            unforced=len(self.by_minimality),
+        )
 
     @property
     def sureness(self) -> str:

@@ -116,7 +116,7 @@ class FoundMap:
         middles: (n, 2) the middle of each visit by the track, in metres.
         located: Whether the map says where the robot is. If it was lifted, closures have to connect
             the new trajectory with the old map first.
-        said: How good the map is: its status and its probability.
+        said: How good the map is: the verdict of its solution.
         files: The files of the map, by name.
     """
 
@@ -147,7 +147,6 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
     ssh_map = solution.maps[0]
     first = {int(step.extra["visit"]): t for t, step in reversed([*enumerate(done.trace.steps)])}
     places = (ssh_map.dstates[ssh_map.dstate_at[first[k]]].place for k in range(len(done.visits)))
-    parts = [solution.status.value, solution.weighed and solution.weighed.sentence]
     files = {
         "trace.jsonl": "".join(f"{line}\n" for line in done.trace.to_lines()).encode(),
         "maps.json": f"{json_line(solution.to_dict())}\n".encode(),
@@ -158,7 +157,7 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
         tuple(-1 if place is None else place for place in places),
         done.poses,
         np.array([visit.middle for visit in done.visits]).reshape(-1, 2),
-        ", ".join(part for part in parts if part),
+        solution.verdict,
         files,
         _is_located(done),
     )

@@ -71,8 +71,6 @@ MIDDLE = 1.0
 BESIDE = 0.75
 # The innermost bands of regions are this many metres wide.
 BROAD = 2.0
-# A join with a smaller probability is doubtful.
-SURE = 0.95
 # The colour of edges that belong to no meaningful path, of walls, of the robot's way, and of doors.
 EDGE, WALL, WAY, DOOR = "#0072b2", "#8a8a8a", "#c9d4df", "#8b4513"
 INDOORS = "Broad pale lines are corridors, C0, C1 and so on, and brown dots are doors. "
@@ -125,16 +123,6 @@ def legend(drives: Sequence[Drive]) -> str:
         f'<span style="color:{colour_of(k)}">●</span> {escaped(drive.name)}'
         for k, drive in enumerate(drives)
     )
-
-
-def doubtful_joins(solution: Solution) -> list[tuple[int, int, float]]:
-    """List the joins of the first map with a probability below SURE, least first.
-
-    Each has two steps and its probability. There are none if probabilities are unknown.
-    """
-    weighed = trusted(solution.weighed)
-    joins = weighed.joins if weighed else ()
-    return sorted((join for join in joins if join[2] < SURE), key=lambda join: join[2])
 
 
 @dataclass(frozen=True)
@@ -190,9 +178,8 @@ def _map_marks(sheet: _Sheet, imported: Imported, solution: Solution) -> Iterato
             visits[place].append(visit)
     # A place is drawn at the mean of its visits.
     middles = {p: np.mean([sheet.spots[v] for v in seen], axis=0) for p, seen in visits.items()}
-    doubts = firsts(
-        (places[second], probability) for _, second, probability in doubtful_joins(solution)
-    )
+    doubtful = solution.weighed.doubtful if solution.weighed else None
+    doubts = firsts((places[second], share) for _, second, share in doubtful or ())
     hidden = undecided_places(ssh_map) - doubts.keys()
     shown = {place: middle for place, middle in middles.items() if place not in hidden}
     edges = list(_edges(sheet, imported, ssh_map, visit_of, middles))

@@ -22,10 +22,9 @@ from ssh_abduction.data.files import filled
 from ssh_abduction.data.words import counted
 from ssh_abduction.output.cards import html_table, html_text, paragraph
 from ssh_abduction.output.roads import place_of_steps
-from ssh_abduction.rivals.listing import Listing, joins_of_drives, trusted
-from ssh_abduction.robot_logs.log_picture import SURE, doubtful_joins, figure
+from ssh_abduction.rivals.listing import Listing, joins_of_drives
+from ssh_abduction.robot_logs.log_picture import figure
 from ssh_abduction.solver import Solution, Status
-from ssh_abduction.theory.joins import joins_in_words
 
 _table = partial(html_table, is_whole=True)
 TEMPLATE = Path(__file__).parent / "report.html"
@@ -41,7 +40,10 @@ def report(
     name = imported.trace.name or "log"
     parts = [
         f"<h1>{html_text(name)}</h1>",
-        *map(paragraph, [_summary(solution, run), *run["notes"], *solution.warnings]),
+        *map(
+            paragraph,
+            [solution.verdict, _summary(solution, run), *run["notes"], *solution.warnings],
+        ),
         figure(log, imported, solution),
         *_drives(imported, solution, run),
         *_building(solution),
@@ -77,22 +79,12 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
         f"{counted(run['steps'], 'steps')}."
     )
     if cost is None:
-        return f"{seen} There is no map of them: {solution.status.value}."
-    if solution.status is not Status.OPTIMAL:
-        proven = "a map without a proof that it is the best"
-    elif solution.complete and solution.count == 1:
-        proven = "one minimal map" if solution.weighed is None else "one map of least cost"
-    else:
-        least = "" if solution.complete else "at least "
-        proven = f"{least}{counted(solution.count, 'minimal maps')}"
-    if solution.weighed is not None:
-        proven += f"; {solution.weighed.sentence}"
-    elif joins := joins_in_words(solution.by_minimality, solution.count):
-        proven += f"; {joins}"
+        return seen
     paths = f", {counted(cost.paths, 'paths')}" if cost.paths else ""
     dstates = counted(cost.dstates, "distinctive states")
     size = f"{counted(cost.places, 'places')}{paths}, {dstates}"
-    return f"{seen} {size}: {proven}."
+    sure = f"; {solution.sureness}" if solution.sureness else ""
+    return f"{seen} {size}{sure}."
 
 
 def _drives(imported: Imported, solution: Solution, run: Mapping[str, Any]) -> Iterator[str]:
@@ -135,8 +127,8 @@ def _joins_of_drives(solution: Solution) -> str:
 
 def _doubts(solution: Solution) -> str:
     """Make the table of the joins of the first map that are not sure."""
-    doubts = doubtful_joins(solution)
-    if not trusted(solution.weighed):
+    doubts = solution.weighed.doubtful if solution.weighed else None
+    if doubts is None:
         return paragraph(
             "Unknown: a map that costs less may exist, with other joins. To search longer, use "
             "--time-limit."
@@ -144,7 +136,7 @@ def _doubts(solution: Solution) -> str:
     if not doubts:
         return paragraph(
             "None: each two visits that the first map puts at one place are there with a "
-            f"probability of at least {SURE:g}. Which way they faced may be less sure."
+            "probability of at least 0.95. Which way they faced may be less sure."
         )
     places = place_of_steps(solution.maps[0])
     rows = [(first, second, places[second], f"{share:.2f}") for first, second, share in doubts]

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.solution.result import ending as ending
     from ssh_abduction.solver.solution.result import opening as opening
     from ssh_abduction.solver.solution.result import summary_of as summary_of
+    from ssh_abduction.solver.solution.result import verdict_of as verdict_of
     from ssh_abduction.solver.solution.result import written_map as written_map
     from ssh_abduction.solver.solution.sharing import SORTS as SORTS
     from ssh_abduction.solver.solution.sharing import Backbone as Backbone

@@ -2,8 +2,9 @@
 
 function load(judging = true) {
   state.region = null;
+  $("verdict").textContent = data.verdict;
   $("sentence").textContent = data.sentence + (theory() ? ` — assumed:${theory()}` : "");
-  document.title = data.sentence;
+  document.title = data.verdict;
   $("first").max = $("later").max = labelsOf(0).length - 1;
   $("which").replaceChildren();
   data.replays.forEach(({ name }, k) => element("option", { value: k }, name, $("which")));

@@ -196,6 +196,22 @@ class Solution(MapSequence):
         return joins_by_minimality(self.trace, self.maps[0], self.theory)
 
     @property
+    def verdict(self) -> str:
+        """What was found and how sure it is, in a few words: the first line of each answer."""
+        if self.cost is None:
+            is_none = self.status is Status.UNSATISFIABLE
+            return "No map satisfies the axioms." if is_none else "No map was found."
+        minimal = self.levels[0].count if self.levels else self.count
+        return verdict_of(
+            self.cost.places or self.cost.dstates,
+            self.cost.places > 0,
+            self.weighed,
+            minimal if self.status is Status.OPTIMAL else 0,
+            listed=self.minimal_listed,
+            unforced=len(self.by_minimality),
+        )
+
+    @property
     def sureness(self) -> str:
         """How sure the first map is, in words; an empty text if there is nothing to say.
 
@@ -469,6 +485,36 @@ def _check_steps(
                 f"{where}: steps: expected maps of a trace of {len(trace)} steps, got {steps}; "
                 "give the trace from which these maps were made"
             )
+
+
+def verdict_of(
+    size: int,
+    has_places: bool,
+    weighed: Weighed | None,
+    minimal: int | None,
+    *,
+    listed: bool | None,
+    unforced: int,
+) -> str:
+    """Say in a few words what was found, and how sure it is.
+
+    Args:
+        size: The number of places of the best map, or of its dstates if it has no places.
+        has_places: Whether it has places.
+        weighed: The costs of maps, if they were compared by cost.
+        minimal: The number of minimal maps found; 0 if none is proven minimal; None if unknown.
+        listed: Whether these are all minimal maps.
+        unforced: The number of joins that rest on minimality alone.
+    """
+    found = counted(size, "places" if has_places else "dstates")
+    if weighed is not None:
+        return f"{found}. {weighed.verdict}"
+    found += f", {counted(unforced, 'joins')} by minimality alone" * (unforced > 0)
+    if not minimal:
+        return f"{found}." if minimal is None else f"{found}. Not proven minimal."
+    which = f"one of {minimal}{'' if listed else ' or more'} such maps"
+    which = "the only such map" if listed and minimal == 1 else which
+    return f"{found}. Proven minimal, {which}."
 
 
 def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str:

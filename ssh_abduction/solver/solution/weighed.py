@@ -17,6 +17,7 @@ from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.groups import indices_of
 from ssh_abduction.data.map_parts import FAULTS
 from ssh_abduction.data.schema import FieldReader
+from ssh_abduction.data.words import counted
 
 EQUAL = 1e-6  # costs in nats that differ by less count as equal
 # Probabilities with the same digits are equally doubtful. A file has costs with fewer digits, and
@@ -25,7 +26,8 @@ TOLD = 4
 # The price of breaking axioms, in nats. Mention a map that breaks axioms only if it costs SAID nats
 # less than the best map.
 BROKEN, SAID = 12.0, 1.0
-# Mention that two steps may be at one place, too, if that is more probable than this.
+# A join is doubtful if it is false with more than this probability. Mention that two steps may be
+# at one place, too, if that is more probable than this.
 DOUBTED = 0.05
 # A misfit is improbable if the true map has a larger one with less than this probability.
 IMPROBABLE = 0.01
@@ -202,6 +204,34 @@ class Weighed:
         return [(steps[i], steps[j], self.probability(i, j, of)) for i, j in sorted(found)]
 
     @property
+    def doubtful(self) -> tuple[tuple[int, int, float], ...] | None:
+        """The joins with a probability below 0.95, least first; None if that is unknown.
+
+        It is unknown if the search did not finish, or if there is a `doubt`.
+        """
+        if self.confidence is None:
+            return None
+        return tuple(join for join in self.joins if join[2] < 1 - DOUBTED)
+
+    @property
+    def verdict(self) -> str:
+        """How many joins the best map has and how many are doubtful, and whether it is proven."""
+        joins = f"{counted(len(self.joins), 'pairs')} of visits joined"
+        if self.doubt is not None:
+            text = f"Which joins are doubtful is unknown, as {self.doubt}."
+        elif not self.joins:
+            text = "No two visits joined."
+        elif self.doubtful is None:
+            text = f"{joins}; which are doubtful is unknown."
+        else:
+            text = f"{joins}, {len(self.doubtful) or 'none'} doubtful."
+        if self.proven:
+            return f"{text} Proven best{' if the axioms hold' if self.broken > SAID else ''}."
+        least = math.floor(100 * self.bound / self.nats) if self.bound > 0 else 0
+        known = f": no map costs less than {least} % of it" if least else ""
+        return f"{text} Not proven best{known}."
+
+    @property
     def sentence(self) -> str:
         """How probable the best map is, and which of its joins is least sure, in words."""
         if self.doubt is not None:
@@ -220,9 +250,6 @@ class Weighed:
         if self.broken > SAID:
             text += f"; a map that breaks axioms costs {self.broken:.1f} nats less"
             given = " if the axioms hold"
-        elif self.searched and not self.proven:
-            least = math.floor(100 * self.bound / self.nats)
-            text += f" (not proven: no map costs less than {least} % of this one)"
         text += self._misread
         if aliases := self.rivals[0].aliases:
             false = sum(map(bool, aliases))
