@@ -199,6 +199,17 @@ def test_files_keep_paths_and_buildings() -> None:
     assert [len(c.order) for c in new.corridors] == [len(c.order) for c in found.corridors]
 
 
+def test_files_keep_paths_and_rooms_without_places() -> None:
+    found = with_building(*drive(CROSS, TOUR, doors=[(1, 4)]))
+    assert found.building is not None
+    path, room = replace(found.paths[0], order=()), replace(found.rooms[0], places=())
+    building = replace(found.building, corridors=(), rooms=(room, *found.rooms[1:]))
+    bare = replace(found, paths=(path, *found.paths[1:]), building=building)
+    again = SSHMap.from_dict(bare.to_dict())
+    assert again.paths == bare.paths
+    assert again.building == bare.building
+
+
 def in_frames(parts: Sequence[tuple[SSHMap, Trace]], floors: bool) -> tuple[SSHMap, Trace]:
     """One map of some drives that share no place: on floors joined by lifts, or in pieces."""
     steps: list[Step] = []

@@ -47,14 +47,26 @@ class PlainData:
 
 
 class SparseData(PlainData):
-    """The base class of dataclasses whose plain data leaves out fields that are None or empty."""
+    """The base class of dataclasses whose plain data leaves out fields that are None or empty.
+
+    A list that has no default is written even if it is empty.
+    """
 
     __slots__ = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, without those that are None or empty."""
-        data = PlainData.to_dict(self)
-        return {name: value for name, value in data.items() if value is not None and value != []}
+        data, needed = PlainData.to_dict(self), _without_default(type(self))
+        return {
+            name: value
+            for name, value in data.items()
+            if value is not None and (value != [] or name in needed)
+        }
+
+
+def _without_default(kind: Any) -> set[str]:
+    """The names of the fields of a dataclass that have no default."""
+    return {f.name for f in fields(kind) if f.default is f.default_factory is MISSING}
 
 
 def attributes_of(value: Any, *names: str) -> dict[str, Any]:
@@ -109,9 +121,7 @@ class FieldReader:
         A field that is missing keeps its default. If it has none, its shape reads None.
         """
         given, path = self.mapping(value, name), f"{name}." if name else ""
-        known: Any = kind
-        no_default = (MISSING, MISSING)
-        needed = {f.name for f in fields(known) if (f.default, f.default_factory) == no_default}
+        needed = _without_default(kind)
         return kind(
             **{
                 key: read(given.get(key), path + key)
