@@ -48,6 +48,10 @@ SAID_BY = {
     "ssh_abduction/page/server.py": ("view",),
     "ssh_abduction/online/routes.py": ("route",),
     "ssh_abduction/solver/search.py": ("solve",),
+    "ssh_abduction/building/directions.py": ("route",),
+    "ssh_abduction/cli/live_map.py": ("live",),
+    "ssh_abduction/robot_logs/live_page.py": ("live",),
+    "ssh_abduction/robot_logs/ros_node.py": ("live",),
     "ssh_abduction/solver/parts.py": ("solve",),
     "ssh_abduction/theory": WITH_THEORY,
 }
@@ -55,6 +59,7 @@ SAID_BY = {
 # module names without a verb.
 SEVERAL = {
     "ssh_abduction/explain/no_map.py": WITH_THEORY,
+    "ssh_abduction/cli/__init__.py": ("solve", "map", "next"),
     "ssh_abduction/cli/shared.py": SAID_BY["ssh_abduction/cli/shared.py"],
     "ssh_abduction/cli/about.py": ("theory", "facts", "completion"),
     "ssh_abduction/cli/compare.py": ("compare", "next", "evaluate", "ladder"),

@@ -93,6 +93,7 @@ ANYTHING = {"truth", "y"}
 
 # Which of these are right, by the kind of parameter. A parameter with default None also takes None.
 RIGHT_BY_NAME: dict[str, set[str]] = {
+    "place": {"huge"},
     "time_limit": {"None", "3.5", "inf", "huge"},
     "work_limit": {"None", "3.5", "inf", "huge"},
     "memory_limit": {"None", "3.5", "inf", "huge"},
@@ -338,6 +339,7 @@ def receiver(name: str) -> Any:
         "Exploration": lambda: Explorer(Ring(), Theory.causal()).result,
         "Explorer": lambda: Explorer(Ring(), Theory.causal()),
         "Fit": lambda: ssh_map.fit,
+        "MapPath": lambda: ssh_map.paths[0],
         "Level": lambda: Level(solution.cost, 1),
         "Listing": lambda: made["listing"],
         "Localiser": lambda: made["localiser"],
@@ -504,6 +506,10 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
     return by_name[parameter.name]
 
 
+# They need a log or its scans: tests/test_log_maps.py and tests/test_log_mapper.py.
+NEED_LOGS = {"map_log", "read_log", "OnlineLogMapper", "solved"}
+
+
 def calls() -> Iterator[tuple[str, Any]]:
     """The public functions, constructors and methods, by name.
 
@@ -512,8 +518,10 @@ def calls() -> Iterator[tuple[str, Any]]:
     for path in itertools.chain.from_iterable(hooks.themes().values()):
         found = hooks.named(path)
         if not inspect.isclass(found):
-            if found.__name__ != "map_log":  # needs a whole log: tests/test_log_maps.py
+            if found.__name__ not in NEED_LOGS:
                 yield found.__name__, found
+            continue
+        if found.__name__ in NEED_LOGS:
             continue
         if issubclass(found, BaseException):
             continue

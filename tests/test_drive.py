@@ -531,10 +531,6 @@ def test_a_bag_has_the_covariance_of_its_odometry(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (
-            ["school.xml"],
-            "school.xml: expected --format carmen or --format bag with a floor plan",
-        ),
-        (
             ["school.xml", "--format", "carmen", "--set", "reach=1"],
             "--reach: expected no such option with a floor plan",
         ),
@@ -565,3 +561,8 @@ def test_simulate_refuses_wrong_options_for_logs(
 ) -> None:
     assert main(["simulate", *arguments, "-o", "run.log"]) == 1
     assert message in capsys.readouterr().err
+
+
+def test_simulate_refuses_a_plan_without_a_log(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "school.xml", "-o", "run.jsonl"]) == 1
+    assert "expected --format carmen or --format bag with a floor plan" in capsys.readouterr().err

@@ -25,7 +25,7 @@ from ssh_abduction.cli.jobs import FileAnswer
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.parsing import RUN
 
-QUESTION = MapQuestion(None, {}, (None, None, None), 0.5, None, 300, False)
+QUESTION = MapQuestion(None, {}, (None, None, None), 0.5, None, 300)
 LONG = "n" * 251
 
 

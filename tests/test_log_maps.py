@@ -465,7 +465,7 @@ def test_compare_reads_two_runs(
 
 @pytest.mark.slow
 def test_log_is_mapped_in_its_own_process(hall: Path, tmp_path: Path) -> None:
-    question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1, False)
+    question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1)
     small = tmp_path / "small.log"
     small.write_text("\n".join(hall.read_text().splitlines()[:80]) + "\n")
     (answer,) = answers_here(question, [str(small)], 2, StopFlag())
@@ -474,12 +474,12 @@ def test_log_is_mapped_in_its_own_process(hall: Path, tmp_path: Path) -> None:
 
 
 def test_error_of_a_log_names_it_once(tmp_path: Path) -> None:
-    answer = MapQuestion(None, {}, {}, 0.5, 1.0, 1, False).answer(0, f"{tmp_path}/")
+    answer = MapQuestion(None, {}, {}, 0.5, 1.0, 1).answer(0, f"{tmp_path}/")
     assert answer.line.startswith(f"{tmp_path}: expected a folder of ROS 2")
 
 
 def test_killed_process_loses_only_its_log(hall: Path) -> None:
-    question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1, False)
+    question = MapQuestion(None, {}, {}, 0.5, 1000.0, 1)
     lost = question.lost(workers.Lost(0, late=False), str(hall))
     assert (lost.code, "got a killed process" in lost.line) == (1, True)
 

@@ -81,7 +81,7 @@ def test_node_maps_a_drive_over_dds(tmp_path: Path) -> None:
     write_carmen(tmp_path / "a.log", scans)
     given = {**os.environ, "ROS_DOMAIN_ID": str(os.getpid() % 100)}
     house = tmp_path / "house"
-    call = [sys.executable, "-m", "ssh_abduction", "live", "--save", str(house), "--idle", "20"]
+    call = [sys.executable, "-m", "ssh_abduction", "live", "--save", str(house), "--set", "idle=20"]
     with subprocess.Popen(call, env=given, stdout=subprocess.PIPE, text=True) as node:
         play = [sys.executable, str(TESTS / "ros_player.py"), str(tmp_path / "a.log"), "20"]
         subprocess.run(play, env=given, check=True, timeout=120)

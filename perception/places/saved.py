@@ -91,7 +91,9 @@ def to_bytes(value: Any, scans: Mapping[int, int]) -> bytes:
             return ["known", known[id(one)]]
         kind = type(one).__name__
         if CLASSES.get(kind) is not type(one):
-            raise TypeError(f"expected an object of {', '.join(CLASSES)}, got a {kind}")
+            raise TypeError(
+                f"expected an object of {', '.join(CLASSES)}, got a {kind}; add it there"
+            )
         known[id(one)] = len(known)
         alive.append(one)
         return [

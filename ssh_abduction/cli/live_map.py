@@ -41,7 +41,7 @@ def positive(text: str) -> float:
         ),
         "--scan TOPIC=/scan": "topic of the LaserScan",
         "--odom TOPIC=/odom": "topic of the Odometry",
-        "--idle S": (
+        "--set idle S": (
             "end when no message came for S seconds (default: never)",
             {"type": positive},
         ),
@@ -57,7 +57,7 @@ def positive(text: str) -> float:
             "serve a page on this computer that follows the robot; 0 takes any free port",
             {"type": int},
         ),
-        "--work W": (
+        "--work-limit W": (
             "units of work for each search, each about a second of a quiet core (default: 5)",
             {"type": positive, "default": 5.0},
         ),
@@ -85,7 +85,7 @@ def run_live(options: argparse.Namespace) -> int:
         print(f"{named(folder)}: the drive goes on after {counted(len(mapper), 'scans')}")
     else:
         mapper = OnlineLogMapper(options.width or import_log.WIDTH, tell)
-    session = LiveSession(mapper, folder, lambda line: print(line, flush=True), options.work)
+    session = LiveSession(mapper, folder, lambda line: print(line, flush=True), options.work_limit)
     if options.page is not None:
         from ssh_abduction.robot_logs.live_page import LivePage
 

@@ -25,7 +25,6 @@ from ssh_abduction.data.errors import MapError, brief, named
 from ssh_abduction.data.groups import minimal_part
 from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.words import meant
-from ssh_abduction.runtime.clock import POLL
 from ssh_abduction.solver import Control
 from ssh_abduction.theory import encodings
 
@@ -152,7 +151,7 @@ class _GraphAxioms:
         config.opt_mode, config.models = "optN", most + 1
         found: set[tuple[int, ...]] = set()
         fewest = 0
-        for model in self._models():
+        for model in self._control.models():
             if model.optimality_proven:
                 found.add(_wrong_in(model))
                 fewest = model.cost[0]
@@ -161,7 +160,7 @@ class _GraphAxioms:
         if len(found) > most:
             config.opt_mode, config.models = f"enum,{fewest}", 0
             config.enum_mode, config.project = "cautious", "auto"
-            *_, blamed = [set(_wrong_in(model)) for model in self._models()]
+            *_, blamed = [set(_wrong_in(model)) for model in self._control.models()]
             config.enum_mode = "auto"
         config.opt_mode, config.models = "ignore", 1
         return fewest, repairs, len(found) <= most, tuple(sorted(blamed))
@@ -195,17 +194,7 @@ class _GraphAxioms:
         return tuple(name for name, one in found if one._clash(range(len(some))))
 
     def _holds(self, assumptions: list[tuple[clingo.Symbol, bool]]) -> bool:
-        return bool(self._control.solve(assumptions=assumptions).satisfiable)
-
-    def _models(self) -> Iterable[clingo.Model]:
-        with self._control.solve(yield_=True, async_=True) as handle:
-            while True:
-                handle.resume()
-                while not handle.wait(POLL):
-                    pass
-                if (model := handle.model()) is None:
-                    return
-                yield model
+        return any(True for _ in self._control.models(assumptions))
 
 
 def _wrong(edge: int) -> clingo.Symbol:

@@ -116,11 +116,10 @@ def _least(control: Control, most: int) -> list[Pairing]:
     configuration: Any = control.configuration.solve
     configuration.opt_mode, configuration.models = ("opt", 0) if most == 1 else ("optN", most)
     found: list[Pairing] = []
-    with control.solve(yield_=True) as handle:
-        for model in handle:
-            if most == 1 or model.optimality_proven:
-                pairs = (s.arguments for s in model.symbols(shown=True))
-                found.append(tuple(sorted((e.number, f.number) for e, f in pairs)))
+    for model in control.models():
+        if most == 1 or model.optimality_proven:
+            pairs = (s.arguments for s in model.symbols(shown=True))
+            found.append(tuple(sorted((e.number, f.number) for e, f in pairs)))
     return found[-1:] if most == 1 else found
 
 

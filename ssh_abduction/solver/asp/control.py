@@ -122,6 +122,19 @@ class Control(clingo.Control):
                 _under_way.discard(handle)
                 handle.cancel()
 
+    def models(
+        self, assumptions: Sequence[tuple[clingo.Symbol, bool]] = ()
+    ) -> Iterator[clingo.Model]:
+        """Yield each model when it is found. Ctrl-C ends the search."""
+        with self.searching(assumptions=assumptions, yield_=True) as handle:
+            while True:
+                handle.resume()
+                while not handle.wait(POLL):
+                    pass
+                if (model := handle.model()) is None:
+                    return
+                yield model
+
     @contextmanager
     def _alone(self) -> Iterator[None]:
         """Let only this control read or ground in this context. First wait for other controls."""

@@ -102,7 +102,7 @@ class Beams:
         return [
             Source(turn("smoothing"), lambda: True, self._smooth),
             Source(turn("joint drives"), lambda: several, self._join),
-            beam(widths[0]),
+            *map(beam, widths[:1]),
             Source(
                 turn("false closures"),
                 lambda: bool(self._parts.task.trace.closures),
