@@ -344,7 +344,6 @@ def receiver(name: str) -> Any:
         "Listing": lambda: made["listing"],
         "Localiser": lambda: made["localiser"],
         "MapEvaluation": lambda: evaluate(solution.maps, trace).maps[0],
-        "MapPath": lambda: ssh_map.paths[0],
         "Move": lambda: route(solution, 0, 1).moves[0],
         "Odometry": Odometry,
         "OnlineMapper": lambda: made["mapper"],
