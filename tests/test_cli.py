@@ -672,10 +672,10 @@ def test_a_theory_is_read_from_a_file(
     toml.write_text('preset = "topological"\nboundary = "none"\nprefer = ["dstates", "paths"]\n')
     assert Theory.from_toml(toml) == Theory(boundary="none", prefer=("dstates", "paths"))
     assert main(["solve", room, "--theory", str(toml)]) == 0
-    by_file = capsys.readouterr().out.splitlines()[1:]
+    by_file = capsys.readouterr().out.splitlines()[2:]
     flags = ["--set", "boundary=none", "--set", "prefer=dstates,paths"]
     assert main(["solve", room, *flags]) == 0
-    assert capsys.readouterr().out.splitlines()[1:] == by_file
+    assert capsys.readouterr().out.splitlines()[2:] == by_file
     toml.write_text("boundary = 3\n")
     assert main(["solve", room, "--theory", str(toml)]) == 1
     assert "mine.toml: boundary: expected none, strict or defeasible" in capsys.readouterr().err

@@ -77,7 +77,7 @@ def test_drive_joins_the_pieces_of_the_existing_map(places: int) -> None:
         warnings.simplefilter("ignore")  # no common view
         pieces = solve(end, onto=solve(begin))
     assert len(pieces[0].pieces) == 2
-    solution = solve(along(0, places, "all"), onto=pieces)
+    solution = solve(along(0, places, "all"), onto=pieces, work_limit=60)
     assert len(solution[0].dstates) == len(solution[0].places) == places
     assert len(solution[0].pieces) == 1
     assert solution.trace is not None

@@ -117,7 +117,9 @@ class Misfit:
         """Return the misfit, the nats, and the aliases of the best explanation of the closures."""
         groups = _groups_of(dstates, places, wrong)
         if groups not in self._likelihood:
-            self._likelihood[groups] = self._explaining(groups).best()
+            self._likelihood[groups] = found = self._explaining(groups).best()
+            if not self.trace.closures:
+                self._known[groups] = found[0]
         return self._likelihood[groups]
 
     def returns_of(self, ssh_map: SSHMap) -> list[Equality]:
