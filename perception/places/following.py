@@ -1,10 +1,12 @@
-"""Follows the robot from scan to scan: odometry, corrected by matching each scan with recent ones.
+"""Follows the robot: odometry, corrected by matching keyframes with the walls seen before.
 
 Points are matched with lines (Chen & Medioni 1992; Censi 2008): the pose moves until the points of
-the scan lie on the walls that the last scans saw. Odometry is a prior. In a bare corridor, walls do
-not show how far the robot went, so the odometer decides. An increment is the motion from one scan
-to the next. There is no global map, so errors of increments accumulate along the trajectory. Each
-increment has a covariance.
+the scan lie on the walls that the last keyframes saw. A scan that shows hardly anything new is no
+keyframe, and the odometry alone places it between two of them. If scans are far apart, each is a
+keyframe. So the time depends on the way, not on the number of scans. Odometry is a prior. In a
+bare corridor, walls do not show how far the robot went, so the odometer decides. An increment is
+the motion from one scan to the next. There is no global map, so errors of increments accumulate
+along the trajectory. Each increment has a covariance.
 
 If the odometer jumps, the scan is matched near the previous pose without odometry. If it
 matches, the track goes on, and only the increment is unknown: this is a cut. If nothing in the scan
@@ -27,12 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from perception.places.odometers import Doubt, doubts_of, is_missing
+from perception.places.odometers import Doubt, doubts_of, is_missing, seconds_between, shows_motion
 from perception.places.track import (
     Array,
     Track,
     covariance_turned,
     errors_of,
+    is_near,
     odometer_covariance,
     points_moved,
     points_turned,
@@ -62,14 +65,18 @@ BEGIN, END, SHRINK, ROUNDS = 1.0, 0.25, 0.75, 12
 # the RARELY-th percentile of the log.
 INTRUDING, MARGIN, POORLY, BESIDE = 0.3, 0.4, 0.6, 3
 INTRUDING_RARELY, WORSE, RARELY = 0.15, 0.25, 1.0
-# Number of previous scans to match a scan with.
+# Nobody carries a robot in less than CARRYING seconds.
+CARRYING = 1.0
+# Number of previous keyframes to match a scan with.
 RECENT = 40
+# The keyframes, counted back, that show what moved since, if they are at most NEARBY metres away.
+EARLIER, NEARBY = (10, 7, 4, 1), 1.0
 # Largest number of points of a scan to match, evenly spread. It bounds the time for a scan.
 POINTS = 150
 # A match is poor if less than the share POOR of the points lies on walls. Then HEADINGS headings
 # are tried, because odometers miss turns, and logs miss lines. An independent point on a wall is
-# worth a nat. The points must gain more than what the odometry loses, or MISSED nats, as it misses
-# a turn once in thousands of steps.
+# worth a nat. A pose loses what the odometry says against it, but at most MISSED nats, as odometers
+# miss a turn once in thousands of steps.
 POOR, HEADINGS, MISSED = 0.5, 24, 8.0
 # Matching fails in at most 1.5 % of the scans of good logs.
 FAILING = 0.05
@@ -182,6 +189,14 @@ class Followed:
     cut: bool = False  # whether the motion from the previous scan is unknown
     broken: bool = False  # whether the robot may be anywhere, so that a new trajectory begins
 
+    def shows_the_same(self, scan: Scan, onward: Pose) -> bool:
+        """Whether a scan shows hardly more than this one, after a motion by the odometry.
+
+        If many beams change, the odometer misses a motion.
+        """
+        same = is_near(onward) and scan.laser == self.scan.laser
+        return same and not shows_motion(self.scan, scan)
+
 
 class GrowingTrack:
     """A track to which scans are added. Each needs about 100 bytes."""
@@ -210,7 +225,11 @@ class GrowingTrack:
 
 
 class Follower:
-    """Computes the pose of each scan from the scans before it, while they come."""
+    """Computes the pose of each scan from the scans before it, while they come.
+
+    A keyframe is a scan that may show something new. Only keyframes are matched. The odometry leads
+    on from the last one.
+    """
 
     def __init__(self, doubt_of: Callable[[int, Pose], Doubt]) -> None:
         """Begin a track.
@@ -221,37 +240,66 @@ class Follower:
         self.doubts: dict[int, Doubt] = {}  # of the scans whose odometry was doubted
         self.lifted = False  # whether the robot may be anywhere at the next scan
         self._doubt_of, self._count = doubt_of, 0
-        self._recent: deque[Surfaces] = deque(maxlen=RECENT)
+        self._walls = LocalWalls()
         self._last: Followed | None = None
         self._before: Pose = (0.0, 0.0, 0.0)
         self._mounts: set[Pose] = set()  # of the lasers whose scans came since the last break
 
     def add(self, scan: Scan) -> Followed:
         """Add the next scan, and return it with its pose."""
-        seen, last, recent = surfaces_in(scan), self._last, self._recent
-        if last is None:
-            one = Followed(scan, (0.0, 0.0, 0.0))
-        else:
-            onward = displacement_between(last.scan.odometry, scan.odometry)
-            step = ScanMotion(scan, seen, recent, last.pose, onward, self._before)
-            doubt = Doubt.CARRIED if self.lifted else self._doubt_of(self._count, onward)
-            if doubt is Doubt.NONE and scan.laser.mount not in self._mounts:
-                # The first scan of another laser may show none of the known walls.
-                one = Followed(scan, moved(last.pose, onward), odometer_covariance(onward))
-            else:
-                one = step.judged(doubt)
-            self.doubts |= {} if doubt is Doubt.NONE else {self._count: doubt}
-            one = one if in_sight(scan).any() else replace(one, share=math.nan)
-            self._before = displacement_between(last.pose, one.pose)
+        one, is_key = self._posed(scan)
+        one = one if in_sight(scan).any() or not self._last else replace(one, share=math.nan)
+        if self._last:
+            self._before = displacement_between(self._last.pose, one.pose)
         if one.broken:
-            recent.clear()
+            self._walls = LocalWalls()
             self._mounts.clear()
         self._mounts.add(scan.laser.mount)
-        # Walls are remembered while the laser sees none.
-        if len(seen) or not recent:
-            recent.append(seen.moved(one.pose))
+        if is_key:
+            self._walls.add(one)
         self._last, self._count, self.lifted = one, self._count + 1, False
         return one
+
+    def _posed(self, scan: Scan) -> tuple[Followed, bool]:
+        """Compute the pose of the next scan. Also return whether it is a keyframe."""
+        if not (last := self._last):
+            return Followed(scan, (0.0, 0.0, 0.0)), True
+        onward = displacement_between(last.scan.odometry, scan.odometry)
+        doubt = Doubt.CARRIED if self.lifted else self._doubt_of(self._count, onward)
+        self.doubts |= {} if doubt is Doubt.NONE else {self._count: doubt}
+        start = self._walls.keys[-1] if doubt is Doubt.NONE else last
+        onward = displacement_between(start.scan.odometry, scan.odometry)
+        guess = moved(start.pose, onward)
+        if doubt is Doubt.NONE and start.shows_the_same(scan, onward):
+            return Followed(scan, guess, share=start.share), False
+        if doubt is Doubt.NONE and scan.laser.mount not in self._mounts:
+            # The first scan of another laser may show none of the known walls.
+            return Followed(scan, guess, odometer_covariance(onward)), True
+        seen, recent = surfaces_in(scan), self._walls.recent
+        step = ScanMotion(scan, seen, recent, start.pose, onward, self._before)
+        return step.judged(doubt), True
+
+
+class LocalWalls:
+    """The walls that the last keyframes saw, in the frame of the track."""
+
+    def __init__(self) -> None:
+        self.keys: deque[Followed] = deque(maxlen=EARLIER[0])
+        self.recent: deque[Surfaces] = deque(maxlen=RECENT)
+
+    def add(self, key: Followed) -> None:
+        """Add a keyframe, and the surfaces in it.
+
+        What stands in space that earlier keyframes saw to be free has moved. It is no wall.
+        """
+        known = [self.keys[-n] for n in EARLIER if n <= len(self.keys)]
+        near = [old for old in known if math.dist(old.pose[:2], key.pose[:2]) < NEARBY]
+        gone = [_in_free_space(key.scan, key.pose, old.scan, old.pose)[0] for old in near]
+        seen = surfaces_in(key.scan, np.any(gone, axis=0) if gone else None)
+        # Walls are remembered while the laser sees none.
+        if len(seen) or not self.recent:
+            self.recent.append(seen.moved(key.pose))
+        self.keys.append(key)
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,17 +351,16 @@ class ScanMotion:
         if len(walls) and len(self.seen):
             fit = ScanFit(self.seen.some(POINTS), walls)
             share, pose, information = fit.improved(guess, weight)
-            # A poor match may have a wrong heading: try others.
-            if share < POOR and len(self.seen) >= FEW_POINTS:
+            # If the match is poor, the odometer may be right, or the heading wrong.
+            if share < POOR:
+                found = [(share, pose, information), (fit.share(guess), guess, weight)]
                 turns = (wrapped(2 * math.pi * k / HEADINGS) for k in range(HEADINGS))
-                turned = [guess + np.array([0, 0, turn]) for turn in turns if abs(turn) <= most]
-                best = max(
-                    (fit.improved(other, weight) for other in turned), key=lambda found: found[0]
-                )
-                gain = (best[0] - share) * len(self.seen) / TOGETHER
-                before, after = (_square(at, guess, weight) for at in (pose, best[1]))
-                if gain > min((after - before) / 2, MISSED):
-                    share, pose, information = best
+                if len(self.seen) >= FEW_POINTS:
+                    tried = (guess + np.array([0, 0, turn]) for turn in turns if abs(turn) <= most)
+                    found += [fit.improved(start, weight) for start in tried]
+                losses = [min(_square(at, guess, weight) / 2, MISSED) for _, at, _ in found]
+                gains = [share * len(self.seen) / TOGETHER for share, *_ in found]
+                share, pose, information = found[int(np.argmax(np.subtract(gains, losses)))]
         covariance = covariance_turned(-self.last[2], _accumulating(information, weight))
         if share < CLEAR and _square(pose, guess, weight) > CONTRARY:
             off = errors_of(pose, guess)
@@ -401,8 +448,11 @@ class Surfaces:
         return Surfaces(points, normals)
 
 
-def surfaces_in(scan: Scan) -> Surfaces:
-    """Find the smooth surfaces that a scan shows, in the frame of the robot."""
+def surfaces_in(scan: Scan, without: NDArray[np.bool_] | None = None) -> Surfaces:
+    """Find the smooth surfaces that a scan shows, in the frame of the robot.
+
+    The beams of the mask `without`, (beams,), are left out.
+    """
     laser, ranges, good = scan.laser, scan.ranges, in_sight(scan)
     r = np.where(good, ranges, 0.0)
     points = np.stack([r * np.cos(laser.bearings), r * np.sin(laser.bearings)], axis=1)
@@ -426,6 +476,8 @@ def surfaces_in(scan: Scan) -> Surfaces:
         )
         normals[middle][smooth] = normal[smooth]
     on_surface = good & np.isfinite(normals[:, 0])
+    if without is not None:
+        on_surface &= ~without
     return Surfaces(points[on_surface], normals[on_surface]).moved(laser.mount)
 
 
@@ -462,14 +514,7 @@ class ScanFit:
         """
         information, pose, share = weight, guess, 0.0
         for count in range(ROUNDS):
-            placed = points_moved(pose, self.scan.points)
-            distance, nearest = self.tree.query(
-                placed, distance_upper_bound=max(END, BEGIN * SHRINK**count)
-            )
-            met = np.flatnonzero(np.isfinite(distance))
-            facing = points_turned(pose[2], self.scan.normals[met])
-            alike = products(facing, self.walls.normals[nearest[met]])
-            met = met[np.abs(alike) > 0.8]
+            placed, met, distance, nearest = self._met(pose, max(END, BEGIN * SHRINK**count))
             share = float((distance[met] < END).sum() / len(placed))
             if len(met) < 5:
                 break
@@ -489,6 +534,26 @@ class ScanFit:
             if np.abs(step).max() < 1e-4:
                 break
         return share, pose, information
+
+    def share(self, pose: Array) -> float:
+        """Compute the share of the points that lie on walls, with the scan at a pose."""
+        placed, met, *_ = self._met(pose, END)
+        return len(met) / len(placed)
+
+    def _met(
+        self, pose: Array, far: float
+    ) -> tuple[Array, NDArray[np.intp], Array, NDArray[np.intp]]:
+        """Find the walls that the points of the scan at a pose meet within `far` metres.
+
+        Returns the points in the frame of the track; the indices of those that meet walls that face
+        as they do; and for each point, the distance and the index of its nearest wall.
+        """
+        placed = points_moved(pose, self.scan.points)
+        distance, nearest = self.tree.query(placed, distance_upper_bound=far)
+        met = np.flatnonzero(np.isfinite(distance))
+        facing = points_turned(pose[2], self.scan.normals[met])
+        alike = products(facing, self.walls.normals[nearest[met]])
+        return placed, met[np.abs(alike) > 0.8], distance, nearest
 
 
 def contradicting_scans(log: RobotLog, track: Track) -> list[int]:
@@ -519,11 +584,13 @@ def _intruding_shares(log: RobotLog, track: Track) -> dict[int, float]:
     """For each scan that matches badly, the share of points that intrude on either side."""
     found: dict[int, float] = {}
     # A scan without a share meets no wall, or the laser is covered.
-    seeing = ~np.isnan(track.shares)
+    seeing, seconds = ~np.isnan(track.shares), seconds_between(log)
     for i in np.flatnonzero(track.shares < POORLY).tolist():
         before = [k for k in range(max(0, i - BESIDE), i) if seeing[k]]
         after = [k for k in range(i, min(len(log), i + BESIDE)) if seeing[k]]
-        if before and not track.cuts_between(i - BESIDE, i + BESIDE - 1):
+        near = slice(max(0, i - BESIDE), i + BESIDE - 1)
+        is_slow = seconds is None or seconds[near].max() >= CARRYING
+        if before and is_slow and not track.cuts_between(i - BESIDE, i + BESIDE - 1):
             # If the next scans do not contradict, this scan alone was matched wrongly.
             found[i] = min(
                 _intruding_share(log, track, before, some) for some in (after, after[1:]) if some
@@ -542,20 +609,35 @@ def _intruding_share(
 
 def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, int]:
     """Count the points of scan `one` in the free space of `other`, and those in its view."""
-    pose = moved(track.pose(one), log.scans[one].laser.mount)
-    scan, laser = log.scans[other], log.scans[other].laser
-    x, y, heading = displacement_between(moved(track.pose(other), laser.mount), pose)
-    met = np.isfinite(log.scans[one].ranges) & (log.scans[one].ranges > 0)
-    angles = log.scans[one].laser.bearings[met] + heading
-    points = log.scans[one].ranges[met] * np.exp(1j * angles) + complex(x, y)
+    inside, in_view = _in_free_space(
+        log.scans[one], track.pose(one), log.scans[other], track.pose(other)
+    )
+    return int(inside.sum()), int(in_view.sum())
+
+
+def _in_free_space(
+    scan: Scan, pose: Pose, other: Scan, its: Pose
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Masks of the beams of a scan that end in the free space of another scan, and in its view.
+
+    The poses are those of the robot at the two scans. The masks are (beams,).
+    """
+    laser = other.laser
+    x, y, heading = displacement_between(moved(its, laser.mount), moved(pose, scan.laser.mount))
+    met = np.isfinite(scan.ranges) & (scan.ranges > 0)
+    angles = scan.laser.bearings[met] + heading
+    points = scan.ranges[met] * np.exp(1j * angles) + complex(x, y)
     onward = math.copysign(1.0, laser.step)
     beam = np.rint(onward * (np.angle(points) - laser.first) % math.tau / abs(laser.step))
     beam = beam.astype(int)
-    in_view = (beam >= 1) & (beam < len(scan.ranges) - 1)
-    beam, far = beam[in_view], np.abs(points[in_view])
-    ranges = np.nan_to_num(scan.ranges, nan=0.0, posinf=laser.reach)
+    seen = (beam >= 1) & (beam < len(other.ranges) - 1)
+    beam, far = beam[seen], np.abs(points[seen])
+    ranges = np.nan_to_num(other.ranges, nan=0.0, posinf=laser.reach)
     # The nearest and the farthest range of each beam and its two neighbours.
     around = ranges[[beam - 1, beam, beam + 1]]
     free, wall = around.min(axis=0), around.max(axis=0)
     margin = MARGIN + MARGIN / 8 * far
-    return int((far < free - margin).sum()), int((far < wall + MARGIN).sum())
+    inside, in_view = np.zeros((2, len(met)), bool)
+    inside[np.flatnonzero(met)[seen]] = far < free - margin
+    in_view[np.flatnonzero(met)[seen]] = far < wall + MARGIN
+    return inside, in_view

@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from perception.places.track import Array, points_turned
+from perception.places.track import Array, is_near, points_turned
 from perception.readers.scans import Scan
-from ssh_abduction.data.odometry import Pose
+from ssh_abduction.data.odometry import Pose, displacement_between
 
 Bools = NDArray[np.bool_]
 Cells = NDArray[np.int32]
@@ -135,7 +135,7 @@ class LocalMaps:
         rows, columns = (np.arange(n, n + 2 * round(half / CELL) + 1) % self._side for n in first)
         cells = rows[:, None] * self._side + columns
         counts = np.zeros((2, self._side**2), np.int32)
-        for i in range(begin, end):
+        for i in self._recent.keyframes(begin, end):
             for count, seen in zip(counts, self._cells_of(i), strict=True):
                 count[seen] += 1
         passed, met = counts[:, cells]
@@ -216,6 +216,7 @@ class Recent:
         self._scans: list[Scan] = []
         self._poses: list[Pose] = []
         self._ways: list[float] = []
+        self._keys: list[int] = []
 
     @property
     def end(self) -> int:
@@ -226,6 +227,10 @@ class Recent:
         """Add the next scan and its pose: x, y in metres and heading in radians."""
         last, way = (self._poses[-1], self._ways[-1]) if self._poses else (pose, 0.0)
         self._ways.append(way + float(np.hypot(last[0] - pose[0], last[1] - pose[1])))
+        if not self._keys or not is_near(
+            displacement_between(self._poses[self._keys[-1] - self.begin], pose)
+        ):
+            self._keys.append(self.end)
         self._scans.append(scan)
         self._poses.append(pose)
 
@@ -235,10 +240,15 @@ class Recent:
         for kept in (self._scans, self._poses, self._ways):
             del kept[:dropped]
         self.begin += dropped
+        del self._keys[: bisect_left(self._keys, self.begin)]
 
     def scan(self, index: int) -> Scan:
         """Return a scan."""
         return self._scans[index - self.begin]
+
+    def keyframes(self, begin: int, end: int) -> list[int]:
+        """Return those of scans begin … end - 1 that show something new."""
+        return self._keys[bisect_left(self._keys, begin) : bisect_left(self._keys, end)]
 
     def poses(self, begin: int, end: int) -> Array:
         """Return the poses of scans begin … end - 1: (n, 3) metres and radians."""

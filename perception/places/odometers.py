@@ -112,7 +112,9 @@ def lag_of(log: RobotLog, track: Track) -> float:
         return 0.0
     at, headings = log.odometer[0], log.odometer[1][:, 2]
     times = np.array([scan.time for scan in log.scans], dtype=float)
-    turns = np.diff(track.poses[:, 2])
+    # Only keyframes are matched. In between, the track follows the odometry.
+    keys = np.flatnonzero(track.covariances.any(axis=(1, 2)))
+    times, turns = times[keys], np.diff(track.poses[keys, 2])
 
     def off(lag: float) -> float:
         measured = np.diff(np.interp(times - lag, at, headings))
@@ -319,7 +321,7 @@ def doubts_of(log: RobotLog) -> tuple[dict[int, Doubt], list[tuple[int, int]]]:
     """
     if len(log) < 3:
         return {}, []
-    seconds = _seconds(log)
+    seconds = seconds_between(log)
     paused = (
         np.zeros(len(log) - 1, bool) if seconds is None else seconds > PAUSE * np.median(seconds)
     )
@@ -441,7 +443,7 @@ def _far(log: RobotLog, steps: int) -> Array:
     return np.asarray(np.hypot(*(positions[steps:] - positions[:-steps]).T))
 
 
-def _seconds(log: RobotLog) -> Array | None:
+def seconds_between(log: RobotLog) -> Array | None:
     """Seconds from each scan to the next, (n - 1,).
 
     None if times are missing, run backwards, or are all equal.

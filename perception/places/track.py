@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 WAY, OFFSET = 0.1, 0.03
 TURNING, DRIFT, ANGLE = 0.1, 0.02, 0.02
 
+# Scans at poses that differ by less than STEP metres and TURN radians show nearly the same.
+STEP, TURN = 0.2, math.radians(10)
+
 
 @dataclass(frozen=True, eq=False)
 class Track:
@@ -75,6 +78,11 @@ class Track:
     def cuts_between(self, first: int, last: int) -> list[int]:
         """List the cuts after scan `first` and up to scan `last`."""
         return [cut for cut in self.cuts if first < cut <= last]
+
+
+def is_near(motion: Pose | Array) -> bool:
+    """Whether scans before and after a motion, in metres and radians, show nearly the same."""
+    return bool(math.hypot(motion[0], motion[1]) < STEP and abs(motion[2]) < TURN)
 
 
 def wrapped(angle: float) -> float:
