@@ -609,6 +609,7 @@ def test_page_names_floors_beside_their_places(browser: Any, tmp_path: Path) -> 
     assert len(browser.find_elements("css selector", "#drawings .trail.lift")) == 1
 
 
+@pytest.mark.filterwarnings("ignore:views")  # the drives have no view in common
 def test_page_draws_a_street_for_each_travel_without_paths(browser: Any, tmp_path: Path) -> None:
     """Maps of logs have places, but no paths. A lift and the start of a drive are no street."""
     monday = Trace.from_steps("abcde", ["travel", "travel", Action("up", "lift"), "travel"])
@@ -669,3 +670,9 @@ def test_page_of_a_joint_map_shows_its_drives(browser: Any, tmp_path: Path) -> N
     told = browser.execute_script("return stretches([1, 2, 3, 4])")
     assert told == "steps monday:1–2, <b>tuesday</b>:0–1"
     assert page.complaints == []
+
+
+def test_no_two_elements_of_the_page_have_one_id() -> None:
+    template = (html.HERE / "page.html").read_text("utf-8")
+    ids = re.findall(r'id="([^"]+)"', template)
+    assert len(ids) == len(set(ids)) > 10

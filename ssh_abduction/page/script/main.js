@@ -2,7 +2,7 @@
 
 function load(judging = true) {
   state.region = null;
-  $("verdict").textContent = data.verdict;
+  $("heading").textContent = data.verdict;
   $("sentence").textContent = data.sentence + (theory() ? ` — assumed:${theory()}` : "");
   document.title = data.verdict;
   $("first").max = $("later").max = labelsOf(0).length - 1;
