@@ -115,6 +115,21 @@ class NodeClasses(Generic[Node]):
         """Whether two nodes are in one class."""
         return self.of(first) == self.of(second)
 
+    def merge_with_links(
+        self, pairs: Iterable[tuple[Node, Node]], links: Collection[tuple[Node, str, Node]]
+    ) -> None:
+        """Merge pairs of nodes, and what links of one name lead to from one class.
+
+        A link is its first node, its name, and its last node.
+        """
+        waiting = [*pairs]
+        while waiting:
+            for first, second in waiting:
+                self.merge(first, second)
+            led: dict[tuple[Node, str], Node] = {}
+            ends = [(led.setdefault((self.of(s), name), x), x) for s, name, x in links]
+            waiting = [pair for pair in ends if not self.are_one(*pair)]
+
 
 def minimal_part(suffices: Callable[[list[Member]], bool], members: list[Member]) -> list[Member]:
     """Find a minimal subset of the members for which `suffices` is true.

@@ -12,21 +12,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
-from typing import TypeAlias
 
 import numpy as np
 
 from ssh_abduction.data.groups import NodeClasses, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.solver.costs.estimating import ONE_WAY, Course
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.theory.settle import Problem
-
-# The dstate and the place of each step.
-Course: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
-# Two dstates may face one way if their headings differ by less than this many radians.
-ONE_WAY = 0.4
 
 
 def improved(
@@ -111,25 +106,22 @@ def _joined(
     views: dict[int, object] = {}
     for s, view in zip(dstates, problem.trace.views, strict=True):
         views[s] = view if views.get(s) is None else views[s]
-    merged, at = NodeClasses[int](), NodeClasses[int]()
-    at.merge(*pair)
     here, there = ([s for s, p in enumerate(of_dstate) if p == place] for place in pair)
-    waiting = [
+    alike = [
         (s, x)
         for s in here
         for x in there
         if abs(math.remainder(facing[s] - facing[x], math.tau)) < ONE_WAY
         and (views[s] == views[x] or None in (views[s], views[x]))
     ]
-    while waiting:
-        for s, x in waiting:
-            merged.merge(s, x)
-            at.merge(of_dstate[s], of_dstate[x])
-        led: dict[tuple[int, str], int] = {}
-        ends = [
-            (led.setdefault((merged.of(s), action.name), x), x)
-            for s, action, x in zip(dstates, problem.trace.actions, dstates[1:], strict=False)
-            if not action.starts
-        ]
-        waiting = [ends_ for ends_ in ends if not merged.are_one(*ends_)]
+    links = [
+        (s, action.name, x)
+        for s, action, x in zip(dstates, problem.trace.actions, dstates[1:], strict=False)
+        if not action.starts
+    ]
+    merged, at = NodeClasses[int](), NodeClasses[int]()
+    merged.merge_with_links(alike, links)
+    at.merge(*pair)
+    for s, place in enumerate(of_dstate):
+        at.merge(of_dstate[merged.of(s)], place)
     return tuple(numbered(map(merged.of, dstates))), tuple(numbered(map(at.of, places)))

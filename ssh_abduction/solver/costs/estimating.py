@@ -125,13 +125,8 @@ def rivals_with_misread_views(
 
 def _joined(ssh_map: SSHMap, pairs: Iterable[tuple[int, int]]) -> tuple[int, ...]:
     """Join pairs of dstates, and what one action leads to from both. Return that of each step."""
-    merged, waiting = NodeClasses[int](), [*pairs]
-    while waiting:
-        for s, x in waiting:
-            merged.merge(s, x)
-        led: dict[tuple[int, str], int] = {}
-        ends = [(led.setdefault((merged.of(s), a), x), x) for s, a, x in ssh_map.links]
-        waiting = [pair for pair in ends if not merged.are_one(*pair)]
+    merged = NodeClasses[int]()
+    merged.merge_with_links(pairs, ssh_map.links)
     return tuple(numbered(map(merged.of, ssh_map.dstate_at)))
 
 
