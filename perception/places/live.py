@@ -256,7 +256,7 @@ class LiveLog:
         ]
 
     def finish(self, name: str | None = None) -> Imported:
-        """Import the log so far as `import_log` does, with the same result.
+        """Import the log so far. The result equals that of `import_log`.
 
         The log may go on to grow afterwards. Raises LogError as `import_log`.
         """

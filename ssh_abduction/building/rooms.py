@@ -29,8 +29,8 @@ LONG, SLIM, STRAIGHT = 6.0, 3.0, 0.8
 # A part of a path between two doors is a room if it is shorter than SHORT metres, or than SQUARE
 # widths; at an end of the path, than END widths. Its width is exceeded on WIDEST per cent of it.
 SHORT, SQUARE, END, WIDEST = 2.0, 1.3, 2.0, 30
-# An opening that the robot never drove through is told if it is at least BESIDE metres from those
-# that it did drive through.
+# The robot never drove through some openings. Leave out those of them that are less than BESIDE
+# metres from an opening that it drove through.
 BESIDE = 1.2
 OUTLINE = 8  # A room has an outline if at least this many points of its walls were seen.
 Part = tuple[int, int]  # the first and the last point of a part of a way

@@ -50,8 +50,8 @@ def positive(text: str) -> float:
             "state, the drive goes on from there"
         ),
         "--onto FOLDER": (
-            "go on with the map that was saved in this folder, from anywhere: no position is told "
-            "until the scans show where the robot is; saves to this folder unless --save is given"
+            "continue the map that was saved in this folder; the robot may be anywhere, and has no "
+            "position until the scans show it; saves to this folder unless --save is given"
         ),
         "--page PORT": (
             "serve a page on this computer that follows the robot; 0 takes any free port",
