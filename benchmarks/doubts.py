@@ -3,7 +3,7 @@
     python benchmarks/doubts.py [--seeds 200-204] [--tours 10]
     python benchmarks/doubts.py --tolerances      # spread of poses and k by the tolerance
 
-The script makes the table of docs/measurements/reproduction.md. M and trimmed M measure how well
+The script makes the table of benchmarks/reproduction.md. M and trimmed M measure how well
 views separate images (`perception.quality`). Each row is the notched rectangle with one change: the
 size of the room, the notch, the noise, single scans instead of medians of nine, or images that show
 a person. The map is solved from the views alone, in at most two seconds.

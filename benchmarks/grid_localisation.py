@@ -5,7 +5,7 @@
     python benchmarks/grid_localisation.py --from JSON [--plot PNG]
 
 The script compares memory, time per step, steps until the robot is localised, and accuracy, on the
-same drives. It prints tables for docs/measurements/localisation.md and draws the figure of that
+same drives. It prints tables for benchmarks/localisation.md and draws the figure of that
 page, for which all parts are needed. With --from, it prints and draws stored results. In each
 drive, a simulated robot drives at random for 30 steps. Then it is carried to another dstate (a
 place and a heading), and drives for 30 more.

@@ -3,7 +3,7 @@
     python benchmarks/localisation.py [--part kidnapped|nowhere|images|speed] [--seeds 20]
                                       [--first 200] [--plot PNG]
 
-The script prints tables for docs/measurements/localisation.md. With --plot, it draws a figure of
+The script prints tables for benchmarks/localisation.md. With --plot, it draws a figure of
 that page instead: a robot in a maze of 5 x 5 cells that is put into another maze and back. Maps are
 the true maps of walks, so only localisation is measured. Robots walk at random along the links of
 the map:

@@ -3,7 +3,7 @@
     python benchmarks/panoramas.py [--seeds 300-302]
     python benchmarks/panoramas.py --figure docs/figures/panoramas.png
 
-The script makes the tables and the figure of docs/measurements/panoramas.md. The images of a drive
+The script makes the tables and the figure of benchmarks/panoramas.md. The images of a drive
 are clustered into at most 24 views, whose number is chosen by M (`perception.quality`). The drive
 is mapped from the views alone, in at most two seconds. Its recogniser is tested on a second drive
 at other hours. Each seed has its own drive, noise and textures.

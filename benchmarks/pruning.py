@@ -9,7 +9,7 @@ ratio over the seeds is at least GAIN on two families. Seconds are CPU seconds u
 otherwise, so other work on the machine hardly matters. A search that hits its limit counts as if it
 had ended at the limit, so the true ratio is at least as far from 1. Each run has its own process,
 and only one runs at a time. Results are stored as JSON after each run; --resume continues a stored
-run. readme.py writes the table into docs/measurements/performance.md.
+run. readme.py writes the table into benchmarks/performance.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Write the tables of a stored run into docs/measurements/performance.md.
+"""Write the tables of a stored run into benchmarks/performance.md.
 
     python benchmarks/readme.py RESULTS.json             # of bench.py
     python benchmarks/readme.py RESULTS.json pruning     # of pruning.py
@@ -20,8 +20,8 @@ from table import times
 
 ROOT = Path(__file__).parent.parent
 PAGES = {
-    "peers": ROOT / "docs" / "measurements" / "performance.md",
-    "pruning": ROOT / "docs" / "measurements" / "performance.md",
+    "peers": ROOT / "benchmarks" / "performance.md",
+    "pruning": ROOT / "benchmarks" / "performance.md",
 }
 
 

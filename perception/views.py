@@ -32,7 +32,7 @@ from ssh_abduction.data.errors import brief
 from ssh_abduction.runtime.threads import one_thread
 
 # There is a runner-up if trimmed M of the chosen k is below this multiple of the largest trimmed M
-# of the others. docs/measurements/reproduction.md has measurements.
+# of the others. benchmarks/reproduction.md has measurements.
 NEAR = 1.5
 # A larger k is also a runner-up if its trimmed M is at least this, because each of a few distant
 # views can hide several well-separated ones.
@@ -51,7 +51,7 @@ ROUNDS = 30
 # More starts of k-means than this are an error, since each takes as long as the first.
 MOST_STARTS = 10_000
 # The value of `isolated` that `BootstrapLearner` uses when the theory allows wrong views.
-# docs/measurements/reproduction.md has measurements.
+# benchmarks/reproduction.md has measurements.
 ISOLATED = 10.0
 
 

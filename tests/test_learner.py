@@ -722,7 +722,7 @@ def test_reproduce_writes_the_page_and_its_data(
         True,
         False,
     ]
-    assert "docs/measurements/reproduction.md" in page
+    assert "benchmarks/reproduction.md" in page
     assert "ours: errors do not add up" in out
     configuration = json.loads((tmp_path / "configuration.json").read_text())
     assert configuration["seeds"] == [500]

@@ -1,4 +1,4 @@
-"""Blocks of the README and of docs/ print what the pages show, and pages name only what exists."""
+"""Blocks of the README, docs/ and benchmarks/ print what the pages show; names in pages exist."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ README = ROOT / "README.md"
 TUTORIALS = sorted(
     {*(ROOT / "docs" / "tutorials").glob("*.md")} - {ROOT / "docs" / "tutorials" / "index.md"}
 )
-PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
+MEASURED = sorted((ROOT / "benchmarks").glob("*.md"))
+PAGES = [README, *sorted((ROOT / "docs").rglob("*.md")), *MEASURED]
 BLOCKS = {page: re.findall(r"```(\w*)\n(.*?)```", page.read_text(), re.DOTALL) for page in PAGES}
 
 FILES = [

@@ -10,10 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 TABLE = re.compile(r"^\| (?!kind of input|-)(.+) \|$", re.MULTILINE)
-ROWS = [
-    row.split(" | ")
-    for row in TABLE.findall((ROOT / "docs/measurements/robustness.md").read_text())
-]
+ROWS = [row.split(" | ") for row in TABLE.findall((ROOT / "benchmarks/robustness.md").read_text())]
 
 
 @cache

@@ -58,7 +58,7 @@ from ssh_abduction.data.odometry import Pose, moved
 
 # A match is reliable with at least this score and share of area that both maps observed.
 SCORE, MUTUAL = 0.75, 0.5
-# Standard deviations of a reliable match, in metres and radians (docs/measurements/logs.md).
+# Standard deviations of a reliable match, in metres and radians (benchmarks/logs.md).
 NOISE = (0.1, 0.1, math.radians(1))
 # The covariance of the track is multiplied by INFLATED. The drifts are multiples of BEND up to
 # BENDS times it, in radians per metre. A match may be off by a chi-square of GATE (3 degrees of
@@ -66,7 +66,7 @@ NOISE = (0.1, 0.1, math.radians(1))
 INFLATED, BEND, BENDS, GATE = 10.0, 2e-4, 10, 20.0
 # The drifts of the heading that are tried, in radians per metre.
 DRIFTS = BEND * np.arange(-BENDS, BENDS + 1)
-# Standard deviations of the error of a closure, in metres and radians (docs/measurements/logs.md).
+# Standard deviations of the error of a closure, in metres and radians (benchmarks/logs.md).
 ERROR = (0.05, 0.05, math.radians(0.5))
 # The factors that are tried, and the standard deviation of the prior of their natural logarithm.
 # Because of this prior, a few closures do not change the covariances much.

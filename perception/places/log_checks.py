@@ -2,7 +2,7 @@
 
 The units of the odometry are recognised, and converted. The thresholds were measured on ten
 recorded logs and ten simulated drives. No good log reaches any of them
-(docs/measurements/robustness.md). Each check says what is wrong and what to do.
+(benchmarks/robustness.md). Each check says what is wrong and what to do.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ from ssh_abduction.data.trace import Action, Step, Trace
 
 Stop = tuple[Visit, Pose]  # a visit, and the pose of the robot in it
 # How much two visits to one place differ: standard deviations of its middle, in metres, and of the
-# direction of a way out, in radians (docs/measurements/logs.md).
+# direction of a way out, in radians (benchmarks/logs.md).
 MIDDLE, DIRECTION = 0.15, 0.1
 # A turn by less than this, in radians, goes straight on: it is no turn, and the visit has one step.
 AHEAD = math.radians(15)

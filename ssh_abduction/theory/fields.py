@@ -19,7 +19,7 @@ IN_TOLERANCE = ("alike", "gateways")
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
 # What is minimised by default. Displacements show that places differ, so a map with the fewest
 # places seldom has too few. Without displacements, it is better to minimise paths before places
-# (docs/measurements/truth.md).
+# (benchmarks/truth.md).
 AUTO: tuple[Count, ...] = ("auto",)
 PREFERRED: tuple[Count, ...] = ("dstates", "paths", "places")
 WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
