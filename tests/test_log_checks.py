@@ -20,6 +20,7 @@ from perception.places.importing import import_log, tracked
 from perception.places.track import Track
 from perception.readers.echoes import LaserOptions, interpret_log
 from perception.readers.scans import LaserScanner, RobotLog, Scan
+from simulator.robot import meetings
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.data.trace import Trace
@@ -182,6 +183,33 @@ def test_note_says_if_scans_that_contradict_others_are_far_from_them(
 
 def test_good_log_gets_no_warning(scans: tuple[Scan, ...]) -> None:
     assert notes_of(scans) == ""
+
+
+def corridor(niches: Sequence[float]) -> RobotLog:
+    """A drive of two rounds, 20 m to and fro, in a corridor without ends that may have niches."""
+    walls = [(-60, -1, 80, -1), (-60, 1, 80, 1)]
+    for x in niches:
+        walls += [(x, 1, x, 0.5), (x, 0.5, x + 1, 0.5), (x + 1, 0.5, x + 1, 1)]
+    way, turn = np.arange(0, 20, 0.4), np.arange(0, math.pi, 0.2)
+    x = np.concatenate([way, np.full(len(turn), 20), 20 - way, np.zeros(len(turn))])
+    heading = np.concatenate([0 * way, turn, 0 * way + math.pi, turn + math.pi])
+    poses = np.tile(np.column_stack([x, np.full(len(x), -0.3), heading]), (2, 1))
+    laser = LaserScanner(-math.pi / 2, math.pi / 180, 180, 8.0)
+    ranges = meetings(np.array(walls, float), poses, laser.bearings).min(axis=2)
+    ranges += np.random.default_rng(0).normal(0, 0.01, ranges.shape)
+    seen = zip(np.where(ranges < 8, ranges, np.inf), poses.tolist(), strict=True)
+    scans = [Scan(r, laser, (a, b, c), None, None, k) for k, (r, (a, b, c)) in enumerate(seen)]
+    return RobotLog(tuple(scans), source="corridor")
+
+
+@pytest.mark.parametrize("niches", [(), (2, 7.5, 11, 19)])
+def test_note_says_if_the_robot_comes_back_and_nothing_matches(niches: Sequence[float]) -> None:
+    """A bare corridor looks the same everywhere."""
+    told = list[str]()
+    imported = import_log(corridor(niches), tell=told.append)
+    assert bool(imported.trace.closures) == bool(niches)
+    assert any("no loop closure is found" in note for note in told) == (not niches)
+    assert tuple(told) == imported.notes
 
 
 @pytest.mark.parametrize("count", [2, 3])
