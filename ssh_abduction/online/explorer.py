@@ -34,7 +34,7 @@ map that is also closed and will always predict the same, as in a symmetric worl
 case the exploration ends as `inseparable`, and not as `done`.
 
 This does not prove that the map is true. A world may have more than `margin` further dstates, and
-only the best rival without a return is examined. docs/how-to/exploring.md measures how often the
+only the best rival without a return is examined. benchmarks/exploring.md measures how often the
 map is true.
 """
 
