@@ -59,9 +59,9 @@ def cheapest(trace: Trace, theory: Theory) -> tuple[float, set[Key]]:
         labels, places, _ = one
         positions = tuple(-1 - i if place is None else place for i, place in enumerate(places))
         at = [positions[label] for label in labels]
-        nats, _ = cost_of(trace, settled, labels, at, ())
         known = found.get((labels, places))
         if known is None or counts.paths < known[1]:
+            nats = known[0] if known else cost_of(trace, settled, labels, at, ())[0]
             known = found[labels, places] = nats, counts.paths, set()
         if counts.paths == known[1]:
             known[2].add(one)

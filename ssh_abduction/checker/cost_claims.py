@@ -30,7 +30,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.groups import firsts
@@ -38,6 +37,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Closure, Covariance, Displacement, Odometry
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.float64]
@@ -81,7 +81,7 @@ _Frame: TypeAlias = tuple[complex, float]  # a position, and a heading in radian
 
 def misfit(trace: Trace, dstates: Sequence[int], places: Sequence[int]) -> float:
     """Compute the misfit (the least chi-square) if each step is at a given dstate and place."""
-    with threadpool_limits(1, user_api="blas"):  # more threads only wait for each other
+    with one_thread("blas"):  # more threads only wait for each other
         return _Errors(trace, dstates, places).least()
 
 
@@ -165,7 +165,7 @@ def cost_of(
     """
     wrong = [step for kind, step in faults if kind == "jumped"]
     errors = _Errors(trace.without_displacements_at(wrong), dstates, at, aliases)
-    with threadpool_limits(1, user_api="blas"):  # more threads only wait for each other
+    with one_thread("blas"):  # more threads only wait for each other
         square = errors.least()
     model = _Occam(trace, theory)
     nats = square / 2 + errors.volume(model.wide) + model.of_steps()
