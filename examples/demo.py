@@ -41,12 +41,7 @@ def main() -> None:
     picture.write_text(to_svg(solution.maps[0]) + "\n", encoding="utf-8")
     print(f"\nmap 1 is drawn in {picture}")
     print("\na simulated robot drives through a house with doors, and its log is mapped")
-    log = folder / "house.log"
-    main_of_the_shell(
-        ["simulate", "doors", "--format", "carmen", "--set", "every=0.5", "-o", str(log)]
-    )
-    main_of_the_shell(["map", str(log), "-o", str(folder / "house"), "--set", "again=true"])
-    print(f"look at {folder / 'house' / 'report.html'}")
+    main_of_the_shell(["demo", "-o", str(folder), "--set", "open=false"])
 
 
 if __name__ == "__main__":
