@@ -22,7 +22,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.sparse.linalg import splu
 from scipy.special import gammaincc
@@ -49,8 +49,9 @@ SWEEPS, HELD = 20, 1e-2
 # a weight that keeps poses in place if no equation determines them.
 LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-12, 1e8, 100, 1e-10, 1e-4
 HELD_STILL = 1e-9
-# With at most this many unknowns, compute an inverse from a dense matrix.
-DENSE_INVERSE = 3000
+# With at most this many unknowns, compute an inverse from a dense matrix. A matrix whose product
+# with itself takes at most DENSE_PRODUCT multiplications is dense.
+DENSE_INVERSE, DENSE_PRODUCT = 3000, 3_000_000
 # The share of the diagonal that least squares add to it, far above the rounding errors.
 DAMPING = 1e-10
 
@@ -136,7 +137,7 @@ class Poses:
         for i, other in enumerate(others):
             by = other._jacobian(unknown, of_world=True)[: 3 * len(other._moved)]
             off = other._residuals(unknown)[: by.shape[0]].reshape(-1, 3)[rows]
-            by = by.toarray().reshape(-1, 3, self._size)[rows]
+            by = _dense(by).reshape(-1, 3, self._size)[rows]
             spread = factor.solve(by.reshape(-1, self._size).T).T.reshape(by.shape)
             whole = np.identity(3) + np.einsum("nij,nkj->nik", by, spread)
             squares[i] = np.einsum("ni,ni->n", off, np.linalg.solve(whole, off[..., None])[..., 0])
@@ -284,14 +285,14 @@ class Poses:
         """
         weights = self._weights(0)
         vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
-        columns = np.arange(len(vectors)), self._group[self._from]
-        turns = csr_array((vectors, columns), shape=(len(vectors), int(self._group.max()) + 1))
-        moves = diags_array(weights) @ self._moves()
-        mixed = (moves.T @ turns).toarray()
+        size = len(vectors), int(self._group.max()) + 1
+        turns = _matrix(vectors, np.arange(size[0]), self._group[self._from], size)
+        moves = _weighted(weights, self._moves())
+        mixed = _dense(moves.T @ turns)
         square = moves.T @ moves
         held = 1e-9 * max(float(square.diagonal().max()), 1.0)
         best = system_solved(square, np.full(self._positions, held), mixed)
-        form: NDArray[np.complex128] = (turns.conj().T @ turns).toarray() - mixed.conj().T @ best
+        form: NDArray[np.complex128] = _dense(turns.conj().T @ turns) - mixed.conj().T @ best
         return form
 
     def _moves(self) -> Any:
@@ -388,7 +389,7 @@ class Poses:
             of = np.append(of, np.repeat(np.concatenate([motion + k for k in range(3)]), 3))
         # Scale and drift have a prior each: a last row with a single 1.
         rows, of = np.append(rows, [3 * m, 3 * m + 1]), np.append(of, self._size - np.array([2, 1]))
-        return csr_array((np.append(values, [1.0, 1.0]), (rows, of)), shape=(3 * m + 2, self._size))
+        return _matrix(np.append(values, [1.0, 1.0]), rows, of, (3 * m + 2, self._size))
 
     def _factored(self, unknown: Array, wide: Array) -> Any:
         """Factor the information matrix of the unknowns.
@@ -410,7 +411,7 @@ class Poses:
         first = np.zeros(self._size)
         x = 2 * int(self._place[self._origin])
         first[[x, x + 1, 2 * self._positions + self._origin]] = 1 / wide
-        return splu((jacobian.T @ jacobian + diags_array(first)).tocsc())
+        return splu(csc_array(_raised(jacobian.T @ jacobian, first)))
 
     def _volume(self, unknown: Array, wide: Array) -> float:
         """Compute -log of the marginal likelihood without the misfit.
@@ -454,7 +455,7 @@ class Poses:
         settled = 0
         if exact.any():
             look_at_clock()
-            rows = self._jacobian(unknown)[: len(exact)][exact].toarray()
+            rows = _dense(self._jacobian(unknown)[: len(exact)][exact])
             # Turns at one place say nothing about positions. So most rows and columns are zero.
             rows = rows[rows.any(axis=1)][:, rows.any(axis=0)]
             settled = int(np.linalg.matrix_rank(rows)) if rows.size else 0
@@ -530,16 +531,51 @@ def _graph(first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_
     return csr_array((np.ones(len(first)), (first, second)), shape=(size, size))
 
 
+def _matrix(
+    values: NDArray[Any], rows: NDArray[np.int_], columns: NDArray[np.int_], shape: tuple[int, int]
+) -> Any:
+    """Make a matrix. Add up values with the same row and column.
+
+    A small one is dense, as scipy takes longer to make it sparse than to multiply it.
+    """
+    if shape[0] * shape[1] ** 2 > DENSE_PRODUCT:
+        return csr_array((values, (rows, columns)), shape=shape)
+    made = np.zeros(shape, dtype=values.dtype)
+    np.add.at(made, (rows, columns), values)
+    return made
+
+
+def _dense(matrix: Any) -> NDArray[Any]:
+    """Return a dense or sparse matrix as a dense one."""
+    dense: NDArray[Any] = matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
+    return dense
+
+
+def _weighted(weights: Array, matrix: Any) -> Any:
+    """Multiply each row of a dense or sparse matrix by its weight."""
+    if isinstance(matrix, np.ndarray):
+        return weights[:, None] * matrix
+    return diags_array(weights) @ matrix
+
+
+def _raised(square: Any, added: Array) -> Any:
+    """Add n numbers to the diagonal of a dense or sparse n x n matrix."""
+    return square + (np.diag(added) if isinstance(square, np.ndarray) else diags_array(added))
+
+
 def _differences(first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> Any:
     """Make the matrix that maps a vector x to the differences x[second] - x[first]."""
-    identity = eye_array(size, format="csr")
-    return identity[second] - identity[first]
+    each = np.arange(len(first))
+    values, rows = np.repeat([1.0, -1.0], len(first)), np.concatenate([each, each])
+    return _matrix(values, rows, np.concatenate([second, first]), (len(first), size))
 
 
 def system_solved(square: Any, added: Array, right: Any) -> Any:
     """Solve a linear system after adding n numbers to the diagonal of its n x n matrix."""
-    whole = (square + diags_array(added)).tocsc()
-    return splu(whole.astype(right.dtype)).solve(right)
+    whole = _raised(square, added)
+    if isinstance(whole, np.ndarray):
+        return np.linalg.solve(whole, right)
+    return splu(whole.tocsc().astype(right.dtype)).solve(right)
 
 
 def least_squares(some: Any, values: Array, weights: Array) -> Array:
@@ -547,12 +583,13 @@ def least_squares(some: Any, values: Array, weights: Array) -> Array:
 
     `values` may have several columns. Each is solved for by itself.
     """
-    squared = some.T @ diags_array(weights**2)
-    normal = squared @ some
+    weighted = _weighted(weights, some)
+    normal = weighted.T @ weighted
     scale = normal.diagonal()
     # A little damping makes the matrix regular, even if there are no equations.
     damping = DAMPING * (scale + (scale.max() or 1.0))
-    found: Array = system_solved(normal, damping, squared @ values)
+    right = weighted.T @ (values.T * weights).T
+    found: Array = system_solved(normal, damping, right)
     return found
 
 
@@ -580,7 +617,7 @@ def _block_inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
         # the Cholesky factor.
         order = np.concatenate([np.setdiff1d(np.arange(len(added)), rows), rows])
         with suppress(np.linalg.LinAlgError):
-            whole = square.toarray() + np.diag(added)
+            whole = _raised(_dense(square), added)
             factor = np.linalg.cholesky(whole[np.ix_(order, order)])
             first = len(order) - len(rows)
             root = solve_triangular(factor[first:, first:], np.identity(len(rows)), lower=True)
