@@ -89,10 +89,10 @@ def stream_visits(
 ) -> Iterator[Visit]:
     """Find the distinctive places that a robot passes, while it drives.
 
-    A visit is final, and yielded, when the robot is at most 125 m of trajectory beyond the last
-    scan of the stay, if scans are at most 0.5 m apart. Usually this is after 30 to 40 m. At the end
-    of the scans, the other visits follow. No visit is yielded before the units of the odometry are
-    recognised, which takes about 100 scans of a moving robot.
+    A visit is yielded when it is final: usually 30 to 40 m of driving after the last scan of the
+    stay, and at most 125 m if scans are at most 0.5 m apart. At the end of the scans, the other
+    visits follow. The first visit waits until the units of the odometry are recognised, which takes
+    about 100 scans of a moving robot.
 
     If the odometry is good, the visits are those of `import_log` before `partings` moves, joins and
     adds visits. A jump of the odometer is judged by earlier steps only.

@@ -257,10 +257,10 @@ class MapQuestion(jobs.FileQuestion):
         "-o --output FOLDER!": "folder to write; each of several logs gets a folder inside it",
         **shared.max_maps("minimal maps", 300),
         "--work-limit W": (
-            "units of work for the search, each about a second of a quiet core; the same map on "
-            "each machine (default: the time limit or, without one, a unit for 20 seconds that the "
-            "robot drove, and at least 30; a search that has no map "
-            "then goes on for up to 64 times as long)"
+            "units of work for the search. A unit is about a second of a quiet core, and equal "
+            "limits give equal maps on each machine (default: until the time limit or, without "
+            "one, a unit for 20 seconds of driving, and at least 30; up to 64 times as many if no "
+            "map is found by then)"
         ),
         "--time-limit S": "end the search after S seconds in any case",
         **shared.STRICT,

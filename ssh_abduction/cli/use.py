@@ -188,8 +188,8 @@ def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
         "--avoid X...": "dstates, places and regions that the route must not visit",
         "--by {actions,places,metres}": (
             "what to minimise. With actions or metres, a route uses only moves that the robot has "
-            "made. With places, it may use any move along a path of the map, and drive back where "
-            "it came from (default: actions or, if none lead there, places)"
+            "made. With places, it may also follow any path of the map, and drive back where the "
+            "robot came from (default: actions if such moves lead there, else places)"
         ),
         "--words": (
             "tell the shortest way in words: distances, turns, doors, and counted openings; needs "

@@ -280,8 +280,8 @@ class Region(SparseData):
     Attributes:
         id: Its number. A region comes after all regions that contain it.
         places: The ids of its places, ascending.
-        bounds: The directed paths that are known to have all its places on their right, as pairs
-            of a path and a direction (+1 or -1).
+        bounds: Directed paths, as pairs of a path and a direction (+1 or -1). All places of the
+            region are known to lie right of each.
         door: The place through which all known ways lead to the region; None if there is none. The
             door is not in the region.
         inside: The ids of the smallest regions that contain all its places and more.

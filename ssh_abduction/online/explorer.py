@@ -157,8 +157,8 @@ class Explorer:
         theory: The axioms, and what to minimise; Theory.topological() by default.
         margin: A return (two steps that the map has at one place or dstate) is in doubt while a map
             without it has at most this many dstates more. 0 doubts nothing.
-        time_limit: Seconds for each step, and as many again for each doubt. A step may take a
-            little longer. None waits for exact answers.
+        time_limit: Seconds for each step, and the same for each doubt. A step may take a little
+            longer. None waits for exact answers.
         max_maps: Keep at most this many maps; None keeps all.
 
     Raises:

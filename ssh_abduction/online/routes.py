@@ -222,10 +222,10 @@ def route(
             or region, such as "p3", "region2" or "kitchen", which means any dstate there; None for
             the dstate of the last step.
         goal: A dstate, place or region, named in the same way.
-        by: What to minimise. "actions" and "metres" use links only, so the robot did each move
-            before. "places" minimises travels, and also uses moves that the paths of the map imply,
-            or the ways back of all travels if there are no paths. None means "actions" or, if no
-            known links lead to the goal, "places".
+        by: What to minimise. "actions" and "metres" use links only: moves that the robot has made.
+            "places" minimises travels. It also uses moves that the robot has not made: along the
+            paths of the map or, if the map has no paths, back along each travel. None means
+            "actions" if links lead to the goal, else "places".
         avoid: Dstates, places and regions that the route must not visit, named in the same way.
         map: The number of the map to use, from 1, or its id.
 

@@ -296,7 +296,7 @@ def next_experiment(
         actions: Actions that the robot can do, in addition to the actions of links of the maps.
         can: A function from what the robot sees to the names of the actions that it can do there.
             If None, the robot can do any action that the star allows.
-        implied: Whether the experiment may use links that no rival has but that the axioms imply.
+        implied: Whether the experiment may use links that the axioms imply, but no rival has.
         time_limit: Seconds; None for no limit. At a limit the answer is the plan so far.
         memory_limit: MiB that the process may use; None for no limit.
         watch: Limits to use instead of `time_limit` and `memory_limit`. The caller can interrupt

@@ -284,10 +284,10 @@ def map_log(
         name: The name of the trace, or the names of the drives. None for no name, or for "drive 1",
             "drive 2" and so on.
         time_limit: Seconds after which the search ends in any case; None for no limit.
-        work_limit: Units of work for the search for minimal maps, each about a second of a quiet
-            core. One log and work limit give one map on each machine. None takes the time limit, or
-            a unit for 20 seconds that the robot drove, but at least 30; if no map is found then,
-            the search may do up to 64 times as much.
+        work_limit: Units of work for the search. A unit is about a second of a quiet core. One log
+            and work limit give one map on each machine. None: until the time limit or, if there is
+            none, a unit for 20 seconds of driving, and at least 30. If no map is found by then, the
+            search goes on for up to 64 times as many units.
         max_maps: List at most this many minimal maps; None lists all.
         corrections: Names and corrections of a person, to be obeyed.
         mapping: An object through which another thread can interrupt the mapping; None for none.

@@ -174,9 +174,9 @@ def find_backbone(
 ) -> Backbone | None:
     """Find the backbone: what all minimal maps share, also those that the solution does not list.
 
-    The trace is solved again. Then clingo looks for minimal maps that do not share what all known
-    ones share, until it has proven that there are none. If the solution already has a proven
-    backbone, or has no minimal map, its backbone is returned at once.
+    Solve the trace again. Then let clingo look for a minimal map that contradicts what all known
+    ones share, until it proves that there is none. If the solution already has a proven backbone,
+    or has no minimal map, return its backbone at once.
 
     >>> from ssh_abduction import Theory, Trace, solve
     >>> solution = solve(Trace.load("examples/aces3-route.jsonl")[:16], max_maps=1)

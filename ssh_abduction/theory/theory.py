@@ -101,8 +101,8 @@ class Theory(Choices):
         different: Pairs of steps known to be different dstates.
         elsewhere: Pairs of steps known to be at different places.
         same_place: Pairs of steps known to be at one place.
-        weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats:
-            minus the logarithm of their marginal likelihood, and FAULT nats for each fault times
+        weigh: How to compare maps. count: by the counts in `prefer`. cost: by their cost in nats,
+            which is minus the logarithm of their marginal likelihood; each fault adds 5 nats times
             its `misread`, `slipped`, `jumped` or `changed`. auto: cost if displacements are used,
             dstates come first in `prefer`, and there are no excuses.
     """

@@ -80,8 +80,8 @@ class Solution(MapSequence):
         within: The number of dstates above the minimum that a listed map may have.
         levels: The cost and the number of the minimal maps. With `within`, the same for each
             greater number of dstates.
-        shared: The backbone (what all minimal maps share) that the search found, also from maps
-            that are not in `maps`; None to compute it from `maps`.
+        shared: What all minimal maps share (the backbone). It may rest on maps that are not in
+            `maps`. None: it is computed from `maps`.
         trace: The trace; None in a solution that was read from a file without its trace.
         support: The data behind the certificate and the warnings.
     """
