@@ -68,7 +68,7 @@ def along(first: int, stop: int, name: str) -> Trace:
     return Trace.from_steps(views, ["travel"] * len(gone), displacements=gone, name=name)
 
 
-@pytest.mark.parametrize("places", [4, 12])
+@pytest.mark.parametrize("places", [pytest.param(4, marks=pytest.mark.slow), 12])
 def test_drive_joins_the_pieces_of_the_existing_map(places: int) -> None:
     """The first two drives have no place in common."""
     middle = places // 2

@@ -206,6 +206,7 @@ def test_relation_that_puts_walls_into_free_space_does_not_count() -> None:
     assert without_clashes(wrong, drive, drive) == []
 
 
+@pytest.mark.slow
 def test_join_logs_keeps_a_single_log(
     joint: tuple[RobotLog, Imported, list[Imported]], halves: tuple[RobotLog, RobotLog]
 ) -> None:
