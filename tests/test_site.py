@@ -28,11 +28,17 @@ def test_docstring_examples_become_blocks_of_code() -> None:
         ("../encodings", "there"),
         ("../README.md#try-it", "there"),
         ("formats.md#maps", "[there](formats.md#maps)"),
+        ("../benchmarks/truth.md#pairs", "[there](benchmarks/truth.md#pairs)"),
+        ("../benchmarks/truth.py", "there"),
     ],
 )
 def test_links_to_other_files_are_plain_text(link: str, shown: str) -> None:
     assert hooks.for_the_site(f"See [there]({link}).", "contributing.md") == f"See {shown}."
     assert hooks.for_the_site("[up](../index.md)", "tutorials/logs.md") == "[up](../index.md)"
+    measured = "![a](../docs/figures/a.png) [b](results/b.json) [c](logs.md)"
+    assert hooks.for_the_site(measured, "benchmarks/truth.md") == (
+        "![a](../figures/a.png) b [c](logs.md)"
+    )
 
 
 def test_names_imported_in_pages_have_a_reference_page() -> None:
@@ -101,4 +107,5 @@ def test_each_page_is_in_the_navigation_once() -> None:
     )
     made = {"index.md", "reference/index.md"}
     pages = {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
+    pages |= {f"benchmarks/{page.name}" for page in (ROOT / "benchmarks").glob("*.md")}
     assert sorted(listed) == sorted(pages | made)

@@ -1,7 +1,8 @@
 """Adds to the site of docs/ what mkdocs does not do by itself.
 
-The README becomes the first page, and each public name gets a page. GitHub shows the pages of
-docs/, too, so their links are relative. Links that leave docs/ become plain text here.
+The README becomes the first page, each public name gets a page, and so do the measurements in
+benchmarks/. Links of all pages work in a clone, so they are relative to the files there. Links to
+other files become plain text here.
 """
 
 from __future__ import annotations
@@ -152,6 +153,8 @@ def on_config(config: MkDocsConfig) -> None:
 def on_files(files: Files, config: MkDocsConfig) -> None:
     for uri, content in (("index.md", home()), ("reference/index.md", index()), *reference()):
         files.append(File.generated(config, uri, content=content))
+    for page in sorted((ROOT / "benchmarks").glob("*.md")):
+        files.append(File.generated(config, f"benchmarks/{page.name}", content=page.read_text()))
 
 
 def home() -> str:
@@ -195,15 +198,21 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def for_the_site(markdown: str, uri: str) -> str:
-    """The text of a page, in which links to files outside docs/ are plain text.
+    """The text of a page with its links as the site has them.
+
+    Links to files that are no pages or pictures of the site become plain text.
 
     Args:
         markdown: The text.
-        uri: The path of the page, from docs/ on.
+        uri: The path of the page: from docs/ on, or benchmarks/NAME.md.
     """
+    folder = posixpath.dirname(uri if uri.startswith("benchmarks/") else f"docs/{uri}")
 
     def mended(link: re.Match[str]) -> str:
-        target = posixpath.normpath(posixpath.join("docs", posixpath.dirname(uri), link[2]))
-        return link[0] if target == "docs" or target.startswith("docs/") else link[1]
+        target = posixpath.normpath(posixpath.join(folder, link[2]))
+        if not re.match(r"docs/|benchmarks/[\w-]+\.md$", target):
+            return link[1]
+        target = posixpath.relpath(target.removeprefix("docs/"), posixpath.dirname(uri) or ".")
+        return f"[{link[1]}]({target}{link[3]})"
 
-    return re.sub(r"\[([^][]*)\]\((\.\./[^)#\s]*)(?:#[^)\s]*|)\)", mended, markdown)
+    return re.sub(r"\[([^][]*)\]\(((?:\.\.|results)/[^)#\s]*)(#[^)\s]*|)\)", mended, markdown)
