@@ -19,7 +19,7 @@ from ssh_abduction.building.telling import told
 from ssh_abduction.checker.buildings import faults_of_corridors, faults_of_paths
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.errors import MapError
-from ssh_abduction.data.maps import DState, Fit, Name, Pose
+from ssh_abduction.data.maps import DState, Fit, MapPath, Name, Pose, Region
 from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solver.derived_paths import PRICE, best_pairings, chains_of, sides_of
@@ -187,6 +187,39 @@ def test_doors_cut_off_rooms_but_do_not_end_a_corridor() -> None:
     assert "15 m, 2.0 m wide" in text
 
 
+def test_rooms_beside_a_corridor_are_its_wings() -> None:
+    found = with_building(*drive(CROSS, TOUR, doors=[(1, 4), (2, 5), (1, 2)]))
+    assert found.building
+    assert {wing.side: wing.rooms for wing in found.building.wings} in (
+        {"left": (2,), "right": (3,)},
+        {"right": (2,), "left": (3,)},
+    )
+    tree = found.building.hierarchy()
+    rooms = [room for wing in tree["wings"] for room in wing["rooms"]] + tree["rooms"]
+    assert sorted(room["room"] for room in rooms) == [0, 1, 2, 3]
+    assert sorted(p for room in rooms for p in room["places"]) == [*range(6)]
+
+
+def test_outlines_of_rooms_end_at_their_doors() -> None:
+    """The corridor from x = 0 to 15 is 2 m wide. The room behind it begins at the door, y = 3."""
+    found = with_building(*drive(CROSS, TOUR, doors=[(1, 4)]))
+    corridor, room = (np.array(r.outline) for r in found.rooms)
+    assert corridor[:, 0].min() == pytest.approx(0, abs=0.2)
+    assert corridor[:, 0].max() == pytest.approx(15, abs=0.2)
+    assert room.min(axis=0) == pytest.approx((4, 3), abs=0.2)
+    assert room.max(axis=0) == pytest.approx((6, 6), abs=0.2)
+
+
+def test_paths_of_a_theory_get_courses_and_sides() -> None:
+    ssh_map, trace = drive(CROSS, TOUR)
+    street = MapPath(0, (0, 1, 2, 3))
+    regions = (Region(0, (5,), ((0, 1),)), Region(1, (4,), ((0, -1),)))
+    found = with_building(replace(ssh_map, paths=(street,), regions=regions), trace)
+    (path,) = found.paths
+    assert (path.line, path.length) == (tuple(LINE), 15.0)
+    assert (path.sure, path.left, path.right) == (None, (4,), (5,))
+
+
 def test_files_keep_paths_and_buildings() -> None:
     found = with_building(*drive(CROSS, TOUR, doors=[(1, 4)]))
     again = SSHMap.from_dict(found.to_dict())
@@ -286,12 +319,14 @@ def test_near_places_are_one_junction_only_if_the_robot_drove_between_them() -> 
 
 def test_maps_say_what_they_cannot_have() -> None:
     ssh_map, trace = drive(LINE, [0, 1, 2, 3])
-    bare = Trace(tuple(replace(step, extra={}) for step in trace.steps))
-    found = with_building(ssh_map, bare)
-    assert orders(found) == {(0, 1, 2, 3)}
-    assert found.building
-    assert "no widths" in found.building.notes[0]
-    assert not found.corridors
+    for kept, why in (((), "no scans"), (("course",), "no widths")):  # courses, as in version 0.1
+        extras = [{k: step.extra[k] for k in kept if k in step.extra} for step in trace.steps]
+        steps = [replace(s, extra=extra) for s, extra in zip(trace.steps, extras, strict=True)]
+        found = with_building(ssh_map, Trace(tuple(steps)))
+        assert orders(found) == {(0, 1, 2, 3)}
+        assert found.building
+        assert why in found.building.notes[0]
+        assert not found.corridors
     for wrong, why in (
         (replace(ssh_map, fit=None), "no poses"),
         (with_one_place(ssh_map), "one place"),

@@ -59,10 +59,14 @@ def loaded(text: str) -> AreaGraph:
         if tags[number]["osmAG:type"] == "area":
             assert ring[0] == ring[-1], "an area is closed"
             assert len(set(ring)) == len(ring) - 1 >= 3
-            assert tags[number]["osmAG:areaType"] in ("room", "corridor")
-            graph.add_node(number)
             rings[number] = [nodes[n] for n in ring]
             assert_simple(rings[number])
+            if tags[number]["osmAG:areaType"] != "structure":
+                assert tags[number]["osmAG:areaType"] in ("room", "corridor")
+                graph.add_node(number)
+            if parent := tags[number].get("osmAG:parent"):
+                assert tags[int(parent)]["osmAG:areaType"] == "structure"
+                assert tags[int(parent)]["level"] == tags[number]["level"]
     for number, ends in refs.items():
         if tags[number]["osmAG:type"] == "passage":
             one, other = (int(tags[number][f"osmAG:{end}"]) for end in ("from", "to"))
@@ -77,7 +81,7 @@ def loaded(text: str) -> AreaGraph:
                 assert ends[1] in refs[other]
             graph.add_edge(one, other, key=number)
         else:
-            assert number in graph
+            assert number in rings
     return AreaGraph(graph, rings, tags)
 
 
@@ -116,6 +120,21 @@ def test_a_planner_finds_routes_through_the_areas(house: SSHMap) -> None:
     assert found.tags[number["room 0"]]["corridors"] == "street"
 
 
+def test_rooms_are_in_wings_and_wings_in_the_building(house: SSHMap) -> None:
+    found = loaded(export_map(house, "osm"))
+    names = {number: tags.get("name") for number, tags in found.tags.items()}
+    parents = {
+        names[n]: names[int(tags["osmAG:parent"])]
+        for n, tags in found.tags.items()
+        if "osmAG:parent" in tags
+    }
+    sides = {"left of street", "right of street"}
+    assert {parents["kitchen"], parents["room 3"]} == sides
+    whole = "building, level 0"
+    assert parents["room 0"] == parents["room 1"] == whole
+    assert all(parents[side] == whole for side in sides)
+
+
 def test_areas_contain_their_places_and_doors_their_middle(house: SSHMap) -> None:
     text = export_map(house, "osm")
     found = loaded(text)
@@ -124,7 +143,7 @@ def test_areas_contain_their_places_and_doors_their_middle(house: SSHMap) -> Non
         ring = found.rings[number[house.name_of("room", room.id) or f"room {room.id}"]]
         corners = np.array([[z.real, z.imag] for z in ring])
         # The place at the end of a corridor is on the ring.
-        inward = 0.99 * np.array([CROSS[p] for p in room.places]) + 0.01 * corners.mean(axis=0)
+        inward = 0.97 * np.array([CROSS[p] for p in room.places]) + 0.03 * corners.mean(axis=0)
         assert points_in_poly(inward, corners).all()
     root = ET.fromstring(text)
     at = {n.attrib["id"]: n.attrib for n in root.iter("node")}
@@ -147,7 +166,7 @@ def test_lifts_join_floors_and_pieces_lie_apart(floors: bool) -> None:
     levels = [found.tags[n]["level"] for n in found.graph]
     assert levels == (["0"] * 4 + ["1"] * 2 if floors else ["0"] * 6)
     assert nx.number_connected_components(found.graph) == (1 if floors else 2)
-    heights = [[z.imag for z in ring] for ring in found.rings.values()]
+    heights = [[z.imag for z in found.rings[n]] for n in found.graph]
     assert max(max(h) for h in heights[4:]) < min(min(h) for h in heights[:4])
 
 
@@ -165,7 +184,7 @@ def test_maps_without_rooms_say_why() -> None:
     with pytest.raises(MapError, match="a map with rooms, got one without; map a robot's log"):
         export_map(ssh_map, "osm")
     bare = replace(trace, steps=tuple(replace(step, extra={}) for step in trace.steps))
-    with pytest.raises(MapError, match="no widths"):
+    with pytest.raises(MapError, match="no scans"):
         export_map(with_building(ssh_map, bare), "osm")
     with pytest.raises(MapError, match="expected none for osm, which shows rooms"):
         export_map(with_building(ssh_map, trace), "osm", level="places")

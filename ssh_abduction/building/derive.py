@@ -6,6 +6,7 @@ and its trace, after the search for maps.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from ssh_abduction.building.edges import FloorPlan
@@ -13,6 +14,7 @@ from ssh_abduction.building.rooms import corridors_of, room_of_places, rooms_of,
 from ssh_abduction.building.straight_paths import paths_of, ways_of
 from ssh_abduction.data.building import Indoors
 from ssh_abduction.data.groups import gathered
+from ssh_abduction.data.map_parts import MapPath, right_of
 from ssh_abduction.data.maps import SSHMap, check_of_trace, checked_map
 from ssh_abduction.data.trace import Trace, checked_trace
 
@@ -22,8 +24,11 @@ NO_POSES = (
 )
 NO_PLACES = "paths: the map has no places, so it has no paths; solve with --theory topological"
 NO_WIDTHS = (
-    "corridors, doors, rooms: the trace has no widths, so only paths were derived; import the log "
+    "corridors, doors, rooms: the trace has no widths, so the map has only paths; import the log "
     "again"
+)
+NO_SCANS = (
+    "corridors, doors, rooms: the trace has no scans, so the map has only paths; map a robot's log"
 )
 NO_TRAVEL = "paths: the map has one place, so it has no path; take a longer drive"
 
@@ -31,7 +36,7 @@ NO_TRAVEL = "paths: the map has one place, so it has no path; take a longer driv
 def with_building(ssh_map: SSHMap, trace: Trace) -> SSHMap:
     """Return the same map with its paths, corridors, doors and rooms.
 
-    A map that has paths of its theory keeps them.
+    A map that has paths of its theory keeps them, with their courses and sides.
 
     Args:
         ssh_map: A map of the trace.
@@ -51,19 +56,33 @@ def with_building(ssh_map: SSHMap, trace: Trace) -> SSHMap:
     check_of_trace([ssh_map], checked_trace(trace), "map", views=False)
     if not ssh_map.places or not ssh_map.fit or not ssh_map.fit.poses:
         note = NO_POSES if ssh_map.places else NO_PLACES
-        return replace(ssh_map, building=Indoors(notes=(note,)), paths=ssh_map.theory_paths)
+        return replace(ssh_map, building=Indoors(notes=(note,)), paths=_theory_paths(ssh_map))
     plan = FloorPlan.of(ssh_map, trace)
     junctions = gathered((name, p) for p, name in plan.name.items()).values()
     listed = tuple(tuple(sorted(some)) for some in junctions if len(some) > 1)
     if not plan.edges:
         empty = Indoors(junctions=listed, notes=(NO_TRAVEL,))
-        return replace(ssh_map, building=empty, paths=ssh_map.theory_paths)
+        return replace(ssh_map, building=empty, paths=_theory_paths(ssh_map))
     room = room_of_places(plan)
     doors = with_doors(plan, room, ssh_map) if plan.measured else ()
     ways = ways_of(plan)
     paths = paths_of(plan, ways)
     corridors = corridors_of(plan, ways, paths)
     rooms = rooms_of(plan, room, doors, corridors) if plan.measured else ()
-    notes = () if plan.measured else (NO_WIDTHS,)
+    scanned = any("course" in step.extra for step in trace.steps)
+    notes = () if plan.measured else (NO_WIDTHS if scanned else NO_SCANS,)
     building = Indoors(corridors, rooms, doors, listed, notes)
-    return replace(ssh_map, building=building, paths=ssh_map.theory_paths or paths)
+    return replace(ssh_map, building=building, paths=_theory_paths(ssh_map) or paths)
+
+
+def _theory_paths(ssh_map: SSHMap) -> tuple[MapPath, ...]:
+    """Add the course and the sides to the paths of the theory, as far as they are known."""
+    poses = ssh_map.fit.poses if ssh_map.fit else ()
+    at = {s.place: (p.x, p.y) for s, p in zip(ssh_map.dstates, poses, strict=False)}
+    regions, found = ssh_map.regions or (), []
+    for path in ssh_map.theory_paths:
+        line = tuple(at[p] for p in path.order if p in at)
+        length = round(sum(map(math.dist, line, line[1:])), 2) if len(line) > 1 else None
+        left, right = (right_of(regions, path.id, way) for way in (-1, 1))
+        found.append(replace(path, line=line, length=length, left=left, right=right))
+    return tuple(found)

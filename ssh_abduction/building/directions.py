@@ -52,52 +52,65 @@ def directions_to(
     Raises:
         MapError: The map has no poses, or no edges lead there.
     """
-    if not ssh_map.fit or not ssh_map.fit.poses or not ssh_map.places:
-        raise MapError(
-            "words: expected a map with places and poses, got one without; solve a trace with "
-            "displacements, or leave out --words"
-        )
-    plan = FloorPlan.of(ssh_map, trace)
-    begin, end = ({plan.name[p] for p in some} for some in (start, goal))
-    if begin & end:
-        return ("there is nothing to do: the start is at the goal",)
-    graph: nx.MultiGraph[int] = nx.MultiGraph()
-    for x, edge in enumerate(plan.edges):
-        graph.add_edge(*edge.ends, key=x, metres=edge.length)
-    sources = begin & set(graph)
-    reached, nodes = (
-        nx.multi_source_dijkstra(graph, sources, weight="metres") if sources else ({}, {})
-    )
-    found = min(((reached[p], p) for p in end if p in reached), default=None)
-    if found is None:
-        raise MapError(
-            "to: expected a goal to which travels of the robot lead, got one in another part of "
-            "the map; drive on"
-        )
-    return tuple(_told(ssh_map, plan, nodes[found[1]]))
+    guide = Guide(ssh_map, trace)
+    return tuple(guide.told(guide.ends_to(start, goal)))
 
 
-def _told(ssh_map: SSHMap, plan: FloorPlan, nodes: Sequence[int]) -> Iterator[str]:
-    """Tell the way along nodes of the plan."""
-    ways = ways_of(plan)
-    ends = []
-    for p, q in pairwise(nodes):
-        options = [
-            2 * x + k
-            for x, edge in enumerate(plan.edges)
-            for k in (0, 1)
-            if (edge.ends[k], edge.ends[1 - k]) == (p, q)
-        ]
-        ends.append(min(options, key=lambda e: plan.edges[e // 2].length))
-    way_of = {e // 2: n for n, way in enumerate(ways) for e in way.ends}
-    legs = [list(run) for _, run in groupby(ends, key=lambda e: way_of[e // 2])]
-    for k, leg in enumerate(legs):
-        turn = _turn(plan, leg[-1], legs[k + 1][0]) if k + 1 < len(legs) else None
-        yield _leg(ssh_map, plan, leg, turn)
-        if turn is None:
-            continue
-        into = _corridor(ssh_map, [plan.edges[e // 2] for e in legs[k + 1]])
-        yield turn + (f" into {into}" if into and turn.startswith("turn") else "")
+class Guide:
+    """Finds and tells ways through the plan of one map."""
+
+    def __init__(self, ssh_map: SSHMap, trace: Trace) -> None:
+        if not ssh_map.fit or not ssh_map.fit.poses or not ssh_map.places:
+            raise MapError(
+                "words: expected a map with places and poses, got one without; solve a trace with "
+                "displacements, or leave out --words"
+            )
+        self._map, self.plan = ssh_map, FloorPlan.of(ssh_map, trace)
+        ways = ways_of(self.plan)
+        self._way_of = {e // 2: n for n, way in enumerate(ways) for e in way.ends}
+
+    def ends_to(self, start: Collection[int], goal: Collection[int]) -> list[int]:
+        """Find the shortest way: the ends at which its edges begin; empty at the goal.
+
+        An end is 2 x the number of an edge, plus 0 or 1. Raises MapError if no edges lead there.
+        """
+        begin, end = ({self.plan.name[p] for p in some} for some in (start, goal))
+        graph: nx.MultiGraph[int] = nx.MultiGraph()
+        for x, edge in enumerate(self.plan.edges):
+            graph.add_edge(*edge.ends, key=x, metres=edge.length)
+        found = begin & set(graph)
+        reached, nodes = (
+            nx.multi_source_dijkstra(graph, found, weight="metres") if found else ({}, {})
+        )
+        nearest = min(((reached[p], p) for p in end if p in reached), default=None)
+        if nearest is None and not begin & end:
+            raise MapError(
+                "to: expected a goal to which travels of the robot lead, got one in another part "
+                "of the map; drive on"
+            )
+        ends = []
+        for p, q in pairwise(nodes[nearest[1]] if nearest else ()):
+            options = [
+                2 * x + k
+                for x, edge in enumerate(self.plan.edges)
+                for k in (0, 1)
+                if (edge.ends[k], edge.ends[1 - k]) == (p, q)
+            ]
+            ends.append(min(options, key=lambda e: self.plan.edges[e // 2].length))
+        return ends
+
+    def told(self, ends: Sequence[int]) -> Iterator[str]:
+        """Tell a way along edges, given by the ends at which they begin."""
+        if not ends:
+            yield "there is nothing to do: the start is at the goal"
+        legs = [list(run) for _, run in groupby(ends, key=lambda e: self._way_of[e // 2])]
+        for k, leg in enumerate(legs):
+            turn = _turn(self.plan, leg[-1], legs[k + 1][0]) if k + 1 < len(legs) else None
+            yield _leg(self._map, self.plan, leg, turn)
+            if turn is None:
+                continue
+            into = _corridor(self._map, [self.plan.edges[e // 2] for e in legs[k + 1]])
+            yield turn + (f" into {into}" if into and turn.startswith("turn") else "")
 
 
 def _turn(plan: FloorPlan, last: int, onward: int) -> str:

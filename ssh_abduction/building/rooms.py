@@ -13,8 +13,10 @@ from itertools import groupby, pairwise
 
 import networkx as nx
 import numpy as np
+from scipy import ndimage
 
-from ssh_abduction.building.edges import FloorPlan, walls_beside
+from perception.places.passages import directions
+from ssh_abduction.building.edges import FloorPlan
 from ssh_abduction.building.straight_paths import PairedWay, branches, chain_points
 from ssh_abduction.building.travels import Array
 from ssh_abduction.data.building import Corridor, MapDoor, MapRoom, WayOut
@@ -32,7 +34,7 @@ SHORT, SQUARE, END, WIDEST = 2.0, 1.3, 2.0, 30
 # The robot never drove through some openings. Leave out those of them that are less than BESIDE
 # metres from an opening that it drove through.
 BESIDE = 1.2
-OUTLINE = 8  # A room has an outline if at least this many points of its walls were seen.
+GRID, SPIKE = 0.1, 0.6  # metres: a cell in which outlines are drawn, and the least width of a room
 Part = tuple[int, int]  # the first and the last point of a part of a way
 
 
@@ -194,29 +196,52 @@ def rooms_of(
     plan: FloorPlan, room: dict[int, int], doors: Sequence[MapDoor], corridors: Sequence[Corridor]
 ) -> tuple[MapRoom, ...]:
     """Make the rooms, from the room of each place. A room of corners alone has no places."""
+    outlines = _outlines(plan, room)
     return tuple(
         MapRoom(
             k,
             tuple(sorted(p for p, name in plan.name.items() if room[name] == k)),
             tuple(door.id for door in doors if k in door.rooms),
             tuple(c.id for c in corridors if any(room[p] == k for p in c.order)),
-            _outline(plan, {p for p, own in room.items() if own == k}),
+            outlines.get(k, ()),
         )
         for k in sorted({*room.values()})
     )
 
 
-def _outline(plan: FloorPlan, places: set[int]) -> tuple[tuple[float, float], ...]:
-    """The convex hull of the walls that were seen along the edges of a room."""
-    from scipy.spatial import ConvexHull, QhullError
+def _outlines(plan: FloorPlan, room: dict[int, int]) -> dict[int, tuple[tuple[float, float], ...]]:
+    """Find the polygon of the free space of each room: what lies between the walls along its ways.
 
-    inside = [walls_beside(edge) for edge in plan.edges if places.issuperset(edge.ends)]
-    points: Array = np.concatenate([np.zeros((0, 2)), *inside])
-    if len(points) < OUTLINE:
-        return ()
-    try:
-        return tuple(
-            (round(float(x), 2), round(float(y), 2)) for x, y in points[ConvexHull(points).vertices]
-        )
-    except QhullError:  # All walls are on one line.
-        return ()
+    Edges are cut at their doors. Free space that is narrower than SPIKE metres, such as the view
+    through a door, is left out.
+    """
+    from skimage.draw import polygon
+    from skimage.measure import approximate_polygon, find_contours
+
+    strips: dict[int, list[Array]] = {}
+    for edge in plan.edges:
+        ahead = directions(edge.course)
+        left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+        wide = ndimage.median_filter(edge.widths, (3, 1))
+        sides = edge.course + wide[:, [0]] * left, edge.course - wide[:, [1]] * left
+        stops = [0, *(gap.at for gap in edge.doors), len(edge.course) - 1]
+        for end, begin, stop in ((edge.ends[0], *stops[:2]), (edge.ends[1], *stops[-2:])):
+            for k in range(begin, stop):
+                corners = [sides[0][k], sides[0][k + 1], sides[1][k + 1], sides[1][k]]
+                if np.isfinite(corners).all():
+                    strips.setdefault(room[end], []).append(np.array(corners))
+    found = {}
+    for number, quads in strips.items():
+        corner = np.concatenate(quads).min(axis=0) - 2 * GRID
+        size = np.ceil((np.concatenate(quads).max(axis=0) - corner) / GRID).astype(int) + 3
+        free = np.zeros(size, dtype=bool)
+        for quad in quads:
+            free[polygon(*((quad - corner) / GRID).T, size)] = True
+        free = ndimage.binary_opening(free, iterations=round(SPIKE / GRID / 2))
+        rings = find_contours(np.pad(free, 1).astype(float), 0.5)
+        if rings:
+            ring = approximate_polygon(max(rings, key=len), 1.5)[:-1]
+            found[number] = tuple(
+                (round(float(x), 2), round(float(y), 2)) for x, y in corner + (ring - 1) * GRID
+            )
+    return found

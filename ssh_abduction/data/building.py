@@ -74,7 +74,7 @@ class MapRoom(SparseData):
         places: Its places, ascending.
         doors: The ids of its doors.
         corridors: The ids of the corridors that have places in it.
-        outline: The polygon of its walls where they were seen; empty if too few were.
+        outline: The polygon of its free space between the walls that were seen; empty if none were.
     """
 
     id: int
@@ -106,6 +106,21 @@ class MapDoor(SparseData):
 
 
 @dataclass(frozen=True, slots=True)
+class Wing:
+    """The rooms on one side of a corridor.
+
+    Attributes:
+        corridor: The id of the corridor.
+        side: "left" or "right" of it.
+        rooms: The ids of the rooms, ascending.
+    """
+
+    corridor: int
+    side: str
+    rooms: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Indoors(SparseData):
     """What follows from the finished map of a building.
 
@@ -122,6 +137,52 @@ class Indoors(SparseData):
     doors: tuple[MapDoor, ...] = ()
     junctions: tuple[tuple[int, ...], ...] = ()
     notes: tuple[str, ...] = ()
+
+    @property
+    def wings(self) -> tuple[Wing, ...]:
+        """The sides of corridors on which whole rooms lie. A room is in one wing at most.
+
+        If it lies beside several corridors, a corridor with a door or way to it counts, then the
+        longest one.
+        """
+        found: dict[tuple[int, str], list[int]] = {}
+        for room in self.rooms:
+            beside = [
+                (not any(o.side == side and o.to in room.places for o in c.openings), c.id, side)
+                for c in self.corridors
+                for side, places in (("left", c.left), ("right", c.right))
+                if room.places and set(room.places) <= set(places)
+            ]
+            if beside:
+                found.setdefault(min(beside)[1:], []).append(room.id)
+        return tuple(Wing(*key, tuple(found[key])) for key in sorted(found))
+
+    def hierarchy(self) -> dict[str, Any]:
+        """Return the building as nested plain data: wings, rooms, junctions and places.
+
+        Rooms that are in no wing, such as that of a corridor, come behind the wings.
+        """
+        wings = self.wings
+
+        def room(number: int) -> dict[str, Any]:
+            places = self.rooms[number].places
+            junctions = [list(some) for some in self.junctions if set(some) <= set(places)]
+            joined = {p for some in junctions for p in some}
+            single = [p for p in places if p not in joined]
+            return {"room": number, "junctions": junctions, "places": single}
+
+        inside = {number for wing in wings for number in wing.rooms}
+        return {
+            "wings": [
+                {"corridor": w.corridor, "side": w.side, "rooms": [*map(room, w.rooms)]}
+                for w in wings
+            ],
+            "rooms": [room(r.id) for r in self.rooms if r.id not in inside],
+        }
+
+    def wing_of(self, room: int | None) -> Wing | None:
+        """The wing of a room; None if it has none."""
+        return next((wing for wing in self.wings if room in wing.rooms), None)
 
     def room_of(self, place: int | None) -> int | None:
         """The id of the room of a place; None if it has none."""

@@ -1,12 +1,14 @@
 """Write the rooms and doors of a map as an area graph in OpenStreetMap XML (osmAG).
 
 An area graph has areas, which are closed ways, and passages, which are ways of two nodes that both
-areas share. Areas are the rooms, and passages are the doors, or lifts and stairs.
+areas share. Areas are the rooms, and passages are the doors, or lifts and stairs. Areas around
+others, called structures, are the wings and the building on each level. Each area names its parent.
 
 References:
     Hou et al. 2019, "Area Graph: Generation of Topological Maps using the Voronoi Diagram".
     Feng et al. 2023, "osmAG: Hierarchical Semantic Topometric Area Graph Maps in the OSM Format for
-    Mobile Robotics". Passages name their areas by the ids of the ways ("fix_id").
+    Mobile Robotics". Passages name their areas, and areas their parents, by the ids of the ways
+    ("fix_id").
 """
 
 from __future__ import annotations
@@ -16,12 +18,17 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations, pairwise
+
+from scipy.spatial import ConvexHull
 
 from ssh_abduction.data.building import MapDoor, MapRoom
 from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import only_known
 from ssh_abduction.output.layout import drawable_poses
+from ssh_abduction.output.roads import wing_name
 
 DEGREE = math.radians(6378137.0)  # metres of a degree at the equator, where the map is put
 RADIUS = 0.5  # in metres: half the side of the square at a place of a room without an outline
@@ -72,6 +79,13 @@ def osm_areas(ssh_map: SSHMap) -> str:
             name = ssh_map.name_of("door", door.id) or f"door {door.id}"
             said = {"name": name, "door": "yes", "width": f"{door.width:.2f}"}
             graph.passage(gaps[door.id], door.rooms, level=_level(ssh_map, door.dstates[0]), **said)
+    top = dict.fromkeys(graph.areas.values())
+    for wing in ssh_map.building.wings if ssh_map.building else ():
+        areas = [graph.areas[room] for room in wing.rooms]
+        said = {"name": wing_name(ssh_map, wing) or "", "level": graph.level(areas[0])}
+        top = dict.fromkeys([*(a for a in top if a not in areas), graph.around(areas, **said)])
+    for level, areas in gathered((graph.level(area), area) for area in top).items():
+        graph.around(areas, name=f"building, level {level}", level=level)
     lifts = set()
     for s, action, x in ssh_map.links:
         one, other = ssh_map.dstates[s], ssh_map.dstates[x]
@@ -103,6 +117,22 @@ def _room_tags(ssh_map: SSHMap, room: MapRoom, frame: int) -> dict[str, str]:
     }
 
 
+def _distance(z: complex, a: complex, b: complex) -> float:
+    """The distance of a point from the side between two corners."""
+    off = abs(b - a) ** 2
+    share = ((z - a) * (b - a).conjugate()).real / off if off else 0.0
+    return abs(z - a - min(max(share, 0.0), 1.0) * (b - a))
+
+
+def _cross(a: complex, b: complex, c: complex, d: complex) -> bool:
+    """Whether the lines from a to b and from c to d cross, within both."""
+
+    def turn(p: complex, q: complex, z: complex) -> float:
+        return ((q - p).conjugate() * (z - p)).imag
+
+    return turn(a, b, c) * turn(a, b, d) < 0 and turn(c, d, a) * turn(c, d, b) < 0
+
+
 @dataclass
 class _AreaGraph:
     """An area graph while it is written. New things in OpenStreetMap have negative ids."""
@@ -121,6 +151,10 @@ class _AreaGraph:
         self.ways.append((nodes, tags))
         return -len(self.ways)
 
+    def level(self, area: int) -> str:
+        """The level of an area."""
+        return self.ways[-area - 1][1]["level"]
+
     def passage(self, nodes: Sequence[int], rooms: Sequence[int], **tags: str) -> None:
         """Add a passage between two rooms."""
         ends = {
@@ -133,23 +167,49 @@ class _AreaGraph:
         return min(self.ways[-self.areas[room] - 1][0], key=lambda n: abs(self.nodes[n] - at))
 
     def ring(self, walls: Sequence[complex], gaps: Sequence[Sequence[int]]) -> list[int]:
-        """Order walls and the ends of doors around their middle, without walls within a door."""
-        ends = {n: self.nodes[n] for pair in gaps for n in pair}
-        middle = sum([*walls, *ends.values()]) / (len(walls) + len(ends))
-        sides = [[self.nodes[n] - middle for n in pair] for pair in gaps]
+        """Make the ring of a room from its walls, with the ends of each door in the nearest wall.
 
-        def within(z: complex) -> bool:
-            """Whether a wall is seen from the middle through a door."""
-            return any(
-                (a.conjugate() * z).imag * (z.conjugate() * b).imag > 0
-                and (z.conjugate() * (a + b)).real > 0
-                for a, b in sides
-            )
+        Corners of walls within a door are left out, unless too few would be left. A ring that
+        crosses itself is sorted around its middle.
+        """
+        ring, doors = [self.node(z) for z in walls], {n for gap in gaps for n in gap}
+        for gap in gaps:
+            one, other = (self.nodes[n] for n in gap)
+            reach = abs(one - other) / 2
+            near = {n for n in ring if abs(self.nodes[n] - (one + other) / 2) <= reach} - doors
+            if len(ring) - len(near) > 1:
+                ring = [n for n in ring if n not in near]
+            ring = self._with_door(ring, gap)
+        at = [self.nodes[n] for n in ring]
+        if any(_cross(*s, *t) for s, t in combinations(pairwise([*at, at[0]]), 2)):
+            middle = sum(at) / len(at)
+            ring.sort(key=lambda n: cmath.phase(self.nodes[n] - middle))
+        return ring
 
-        kept = [z for z in walls if not within(z - middle)]
-        enough = len(kept) + len(ends) > 2
-        around = ends | {self.node(z): z for z in (kept if enough else walls)}
-        return sorted(around, key=lambda n: cmath.phase(around[n] - middle))
+    def _with_door(self, ring: list[int], gap: Sequence[int]) -> list[int]:
+        """Put the ends of a door into the nearest side of a ring where it then crosses no side."""
+        corners, ends = [self.nodes[n] for n in [*ring, ring[0]]], [self.nodes[n] for n in gap]
+        sides, middle = [*pairwise(corners)], sum(ends) / 2
+
+        def crosses(k: int, way: int) -> bool:
+            chain = [*pairwise([corners[k], *ends[::way], corners[k + 1]])]
+            return any(_cross(*one, *other) for one in chain for other in [*sides, *chain])
+
+        order = sorted(range(len(ring)), key=lambda k: _distance(middle, *sides[k]))
+        ways = [(k, way) for k in order for way in (1, -1)]
+        k, way = next((w for w in ways if not crosses(*w)), ways[0])
+        return [*ring[: k + 1], *gap[::way], *ring[k + 1 :]]
+
+    def around(self, areas: Sequence[int], **tags: str) -> int:
+        """Add a structure around areas, and make it their parent."""
+        nodes = [n for area in areas for n in self.ways[-area - 1][0][:-1]]
+        hull = ConvexHull([[self.nodes[n].real, self.nodes[n].imag] for n in nodes]).vertices
+        ring = [nodes[k] for k in hull]
+        said = {"osmAG:type": "area", "osmAG:areaType": "structure"}
+        structure = self.way([*ring, ring[0]], **tags, **said)
+        for area in areas:
+            self.ways[-area - 1][1]["osmAG:parent"] = str(structure)
+        return structure
 
     def text(self) -> str:
         """The text of the file."""

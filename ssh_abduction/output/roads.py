@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise, product
 from typing import Any, TypeAlias
 
+from ssh_abduction.data.building import Indoors, Wing
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.map_parts import ids_at
@@ -45,6 +46,7 @@ class Stop:
         regions: The ids of the regions that contain it.
         region_names: The names that a person gave to these regions.
         room: The name or number of its room, such as "room 3"; None if it has none.
+        wing: The wing of its room, such as "left of corridor 2"; None if it has none.
         corridor: The name or number of its corridor; None if it has none.
     """
 
@@ -58,6 +60,7 @@ class Stop:
     regions: tuple[int, ...] = ()
     region_names: tuple[str, ...] = ()
     room: str | None = None
+    wing: str | None = None
     corridor: str | None = None
 
     @property
@@ -65,7 +68,7 @@ class Stop:
         """The views of the stop, and its regions if there are any, as texts for files."""
         regions = {"regions": " ".join(map(str, self.regions))} if self.regions else {}
         names = {"region_names": ", ".join(self.region_names)} if self.region_names else {}
-        indoors = only_known(room=self.room, corridor=self.corridor)
+        indoors = only_known(room=self.room, wing=self.wing, corridor=self.corridor)
         return {"views": " ".join(map(str, self.views)), **regions, **names, **indoors}
 
 
@@ -209,6 +212,7 @@ def _joined(before: Road, after: Road) -> Road:
 
 def _stops(ssh_map: SSHMap, drawn: Layout, level: str) -> Iterator[Stop]:
     """Make a stop for each place, or for each dstate."""
+    building = ssh_map.building or Indoors()
     members = gathered((s.place if level == "places" else s.id, s) for s in ssh_map.dstates)
     for number in ssh_map.places if level == "places" else range(len(ssh_map.dstates)):
         here = members.get(number, [])
@@ -227,16 +231,24 @@ def _stops(ssh_map: SSHMap, drawn: Layout, level: str) -> Iterator[Stop]:
             ssh_map.name_of("place", place),
             regions,
             tuple(name for name in names if name is not None),
-            _short(ssh_map, "room", ssh_map.building and ssh_map.building.room_of(place)),
-            _short(ssh_map, "corridor", ssh_map.building and ssh_map.building.corridor_of(place)),
+            short_name(ssh_map, "room", room := building.room_of(place)),
+            wing_name(ssh_map, building.wing_of(room)),
+            short_name(ssh_map, "corridor", building.corridor_of(place)),
         )
 
 
-def _short(ssh_map: SSHMap, kind: str, number: Any) -> str | None:
+def short_name(ssh_map: SSHMap, kind: str, number: Any) -> str | None:
     """The name of a room, corridor or door, or its kind and number; None without a number."""
     if number is None:
         return None
     return ssh_map.name_of(kind, number) or f"{kind} {number}"
+
+
+def wing_name(ssh_map: SSHMap, wing: Wing | None) -> str | None:
+    """Name a wing by its corridor, such as "left of corridor 2"; None without a wing."""
+    if wing is None:
+        return None
+    return f"{wing.side} of {short_name(ssh_map, 'corridor', wing.corridor)}"
 
 
 def _indoors(ssh_map: SSHMap, a: int, b: int) -> dict[str, str | float]:
@@ -245,8 +257,8 @@ def _indoors(ssh_map: SSHMap, a: int, b: int) -> dict[str, str | float]:
     door = next((d for d in ssh_map.doors if {a, b} == {*d.places}), None)
     widths = [thing.width for thing in (corridor, door) if thing is not None]
     return only_known(
-        corridor=_short(ssh_map, "corridor", corridor and corridor.id),
-        door=_short(ssh_map, "door", door and door.id),
+        corridor=short_name(ssh_map, "corridor", corridor and corridor.id),
+        door=short_name(ssh_map, "door", door and door.id),
         width=min(widths, default=None),
     )
 

@@ -351,11 +351,8 @@ def _with_poses(solution: Solution, trace: Trace) -> Solution:
 
 
 def _built(solution: Solution, trace: Trace) -> Solution:
-    """Derive the paths, corridors, doors and rooms of the first map."""
-    if not solution.maps:
-        return solution
-    first, *others = solution.maps
-    return replace(solution, maps=(with_building(first, trace), *others))
+    """Derive the paths, corridors, doors and rooms of all maps."""
+    return replace(solution, maps=tuple(with_building(each, trace) for each in solution.maps))
 
 
 def _doubted(solution: Solution) -> Solution:
