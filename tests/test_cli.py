@@ -724,7 +724,7 @@ def test_simulate_writes_the_format_that_the_name_says(
     assert (tmp_path / "x.log").read_text().count("\nROBOTLASER1 ") > 10
 
 
-@pytest.mark.parametrize("name", ["run.json", "report.html"])
+@pytest.mark.parametrize("name", ["run.json", "page.html"])
 def test_map_keeps_the_files_of_another_program(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

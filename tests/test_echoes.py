@@ -304,7 +304,7 @@ def test_import_and_map_share_notes_and_options(
         assert said.count(f"warning: {note}") == 1
     assert "Scans come from" not in said  # it is no warning, but the report has it
     if verb == "map":
-        for file in ("run.json", "report.html"):
+        for file in ("run.json", "page.html"):
             text = (tmp_path / "out" / file).read_text()
             assert "Scans come from /scan, odometry from /odom." in text
             assert "Ranges of 5 m repeat" in text

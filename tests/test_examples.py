@@ -80,7 +80,7 @@ def test_demo_prints_maps_and_writes_a_report(tmp_path: Path) -> None:
     assert out.count("satisfies every axiom") == 4
     assert "what tells them apart" in out
     assert "11 places. 5 pairs of visits joined, none doubtful." in out
-    assert (tmp_path / "house" / "report.html").exists()
+    assert (tmp_path / "house" / "page.html").exists()
     assert (tmp_path / "aces3-map.svg").read_text().startswith("<svg ")
 
 

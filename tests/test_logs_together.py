@@ -33,9 +33,10 @@ from ssh_abduction.data.drives import starts_of
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.output.layout import layout
+from ssh_abduction.page.html import ground_in
 from ssh_abduction.robot_logs import log_maps, log_report
+from ssh_abduction.robot_logs.log_ground import ASIDE, laid_over
 from ssh_abduction.robot_logs.log_maps import BARE, map_log
-from ssh_abduction.robot_logs.log_picture import ASIDE, colour_of, laid_over
 from ssh_abduction.solver import Solution, solve
 from ssh_abduction.solver.sources.metric.joint_drives import Joining
 from ssh_abduction.solver.steps.log import Log
@@ -257,16 +258,15 @@ def test_map_together_joins_two_drives(folder: Path) -> None:
     assert all(ssh_map.place_of(i) == ssh_map.place_of(j) for i, j in near)
 
 
-def test_report_shows_drives_in_colours_and_their_joins(folder: Path) -> None:
-    report = (folder / "report.html").read_text()
-    for k in range(2):
-        assert f'stroke="{colour_of(k)}"' in report
-        assert f'<span style="color:{colour_of(k)}">' in report
-    assert "<h2>Drives</h2><table>" in report
-    assert "The map joins all 2 drives: monday, tuesday." in report
-    assert "<h2>Joins between drives</h2><table>" in report
-    assert "<td>monday:" in report
-    assert "<td>tuesday:" in report
+def test_report_shows_drives_and_their_joins(folder: Path) -> None:
+    found = ground_in(folder / "page.html", len(Trace.load(folder / "trace.jsonl")))
+    assert found is not None
+    report = {section.title: section for section in found.sections}
+    assert report["Drives"].lines == ["The map joins all 2 drives: monday, tuesday."]
+    assert [row[0] for row in report["Drives"].table] == ["drive", "monday", "tuesday"]
+    joins = report["Joins between drives"].table[1:]
+    assert joins
+    assert all(a.startswith("monday:") and b.startswith("tuesday:") for a, b, _ in joins)
 
 
 def test_joint_run_of_the_same_logs_is_skipped(
@@ -337,16 +337,16 @@ def test_joint_track_lays_drives_over_each_other(
         return max(math.dist(poses[a][:2], poses[b][:2]) for a, b in twins)
 
     assert apart(track) > 5
-    laid = laid_over(track, imported, ssh_map)
+    laid = laid_over(imported, ssh_map)
     assert apart(laid) < 0.5
-    # The drives keep their shapes.
+    # The drives nearly keep their shapes.
     for first, last in ((0, start - 1), (start, len(track) - 1)):
         np.testing.assert_allclose(
-            displacement_between(laid[first], laid[last]),
-            displacement_between(track[first], track[last]),
-            atol=1e-6,
+            displacement_between(laid[first], laid[last])[:2],
+            displacement_between(track[first], track[last])[:2],
+            atol=0.5,
         )
-    beside = laid_over(track, imported, None)
+    beside = laid_over(imported, None)
     left, right = np.array(beside[:start]), np.array(beside[start:])
     assert right[:, 0].min() == pytest.approx(left[:, 0].max() + ASIDE)
 
@@ -355,9 +355,10 @@ def test_report_turns_drives_as_the_drawing_of_the_map_does(
     mapped: tuple[Imported, list[Pose], SSHMap],
 ) -> None:
     imported, track, ssh_map = mapped
-    turned = [moved((3.0, -7.0, 1.2), pose) for pose in track]
-    laid = laid_over(track, imported, ssh_map)
-    off = np.subtract(laid, laid_over(turned, imported, ssh_map))
+    turned = np.array([moved((3.0, -7.0, 1.2), pose) for pose in track])
+    laid = laid_over(imported, ssh_map)
+    elsewhere = replace(imported, track=replace(imported.track, poses=turned))
+    off = np.subtract(laid, laid_over(elsewhere, ssh_map))
     np.testing.assert_allclose(off[:, :2], np.broadcast_to(off[0, :2], (len(track), 2)), atol=1e-6)
     drawn = layout(ssh_map).places
     first, far = ssh_map.place_of(0), max(drawn, key=lambda p: math.dist(drawn[p], (0.0, 0.0)))
@@ -407,6 +408,9 @@ def test_report_names_a_drive_that_shares_no_place() -> None:
         joint = together([Trace.from_steps(views, ["travel"], name=name) for name, views in drives])
     run = {"drives": [{"scans": 9, "metres": 5.0, "visits": 2, "steps": 2}] * 2}
     imported: Any = SimpleNamespace(trace=joint)
-    told = "".join(log_report._drives(imported, solve(joint, Theory.causal()), run))
-    assert "The map is in 2 pieces that share no place: monday alone; tuesday alone." in told
-    assert "monday and tuesday: nothing in common in any of the maps." in told
+    drives, joins = log_report._drives(imported, solve(joint, Theory.causal()), run)
+    assert drives.lines == (
+        "The map is in 2 pieces that share no place: monday alone; tuesday alone.",
+    )
+    assert joins.lines == ["monday and tuesday: nothing in common in any of the maps."]
+    assert not joins.table

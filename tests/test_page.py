@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,10 @@ import numpy as np
 import pytest
 from in_processes import until
 
+from perception.readers.logs import read_log
 from ssh_abduction import Localiser, Solution, SSHMap, Theory, Trace, solve, view_page
 from ssh_abduction.cli import main
+from ssh_abduction.cli.correct import correct_pair
 from ssh_abduction.data import Action, DState, MapError, Step, TraceError, together
 from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
@@ -32,6 +35,7 @@ from ssh_abduction.page.content import ALPHABET, DRAWN, LOST, beams_of, content_
 from ssh_abduction.page.html import Page
 from ssh_abduction.page.server import PageServer
 from ssh_abduction.rivals import Listing
+from ssh_abduction.robot_logs.log_maps import map_log
 from ssh_abduction.runtime.workers import _under_way
 from ssh_abduction.solver import Watch
 
@@ -55,6 +59,21 @@ def rivals() -> Solution:
 @pytest.fixture(scope="module")
 def content(route: Trace, rivals: Solution) -> dict[str, Any]:
     return content_of(rivals, route)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    log = tmp_path_factory.mktemp("logs") / "round.log"
+    assert main(["simulate", "triangle", "-o", str(log), "--set", "every=0.5"]) == 0
+    return map_log(read_log(log), name="round", work_limit=1).files()
+
+
+@pytest.fixture
+def house(made: dict[str, bytes], tmp_path: Path) -> Path:
+    """The folder of the map of a log."""
+    for name, data in made.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path
 
 
 @pytest.mark.slow
@@ -446,6 +465,9 @@ class Shown:
     def __getitem__(self, name: str) -> Any:
         return self.browser.find_element("id", name)
 
+    def drawn(self, selector: str) -> Any:
+        return self.browser.find_element("css selector", selector)
+
     def click(self, name: str) -> None:
         self.browser.execute_script("document.getElementById(arguments[0]).click()", name)
 
@@ -676,3 +698,65 @@ def test_no_two_elements_of_the_page_have_one_id() -> None:
     template = (html.HERE / "page.html").read_text("utf-8")
     ids = re.findall(r'id="([^"]+)"', template)
     assert len(ids) == len(set(ids)) > 10
+
+
+def test_server_writes_what_a_person_says_of_two_steps(
+    house: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = house / "maps.json"
+    solution, trace = Solution.load(maps), Trace.load(house / "trace.jsonl")
+    ground = html.ground_in(house / "page.html", len(trace))
+    correct = partial(correct_pair, str(maps))
+    with PageServer(Listing.of(solution), trace, ground=ground, correct=correct) as served:
+        assert b'"corrects":true' in served.page
+        watch = Watch(None)
+        told = served.answer("correct", {"kind": "elsewhere", "pair": [0, 1]}, watch)["text"]
+        assert "to obey: ssh-abduction solve" in told
+        assert "elsewhere" in (house / "corrections.yaml").read_text()
+        assert "made-before" in (house / "page.html").read_text()
+        for wrong in ({"kind": "x", "pair": [0, 1]}, {"kind": "same", "pair": [0, 999]}):
+            with pytest.raises(MapError, match="expected"):
+                served.answer("correct", wrong, watch)
+    with PageServer(Listing.of(solution), trace) as served:
+        assert b'"corrects":false' in served.page
+        with pytest.raises(MapError, match="expected explain or solve"):
+            served.answer("correct", {"kind": "elsewhere", "pair": [0, 1]}, watch)
+
+
+def test_view_refuses_a_used_port_and_other_folders(
+    house: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["view", str(house), "--serve", "--set", f"port={port}"]) == 1
+    assert f"port: expected a free port, got {port}" in capsys.readouterr().err
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "page.html").write_text("mine")
+    assert main(["view", str(other), "--serve"]) == 1
+    assert "expected" in capsys.readouterr().err
+    assert [path.name for path in other.iterdir()] == ["page.html"]
+    assert (other / "page.html").read_text() == "mine"
+
+
+def test_page_over_walls_in_the_browser(browser: Any, house: Path) -> None:
+    page = Shown(browser, (house / "page.html").as_uri())
+    assert browser.find_elements("css selector", ".walls")
+    assert browser.find_elements("css selector", ".ground .street")
+    assert not browser.find_elements("css selector", "svg .dstate")  # arrows are off at first
+    assert page.drawn(".laser").get_attribute("d") != ""
+    page.click("layer-arrows")
+    assert browser.find_elements("css selector", "figure .dstate")
+    page["find"].send_keys("0\ue007")  # Enter
+    assert page["found"].text == "place 0"
+    assert browser.find_elements("css selector", ".found")
+    browser.execute_script("pick(0); pick(3)")
+    assert len(browser.find_elements("css selector", "#scans svg")) == 2
+    page.click("reject")
+    assert "ssh-abduction correct maps.json --elsewhere round:0,round:3" in page["answer"].text
+    assert browser.find_elements("css selector", "#report details:not([open])")
+    browser.execute_script("document.querySelector('#drawings svg').focus()")
+    before = browser.execute_script("return camera.dx")
+    browser.switch_to.active_element.send_keys("\ue014")  # the right arrow
+    assert browser.execute_script("return camera.dx") == before - 60
+    assert page.complaints == []

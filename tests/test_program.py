@@ -181,7 +181,7 @@ def test_interrupted_map_run_is_repeated_by_the_next_call(
     assert "The run was interrupted" in capsys.readouterr().err
     run = json.loads((runs / "run.json").read_text())
     assert (run["interrupted"], run["status"]) == (True, "optimal")
-    assert "The run was interrupted" in (runs / "report.html").read_text()
+    assert "The run was interrupted" in (runs / "page.html").read_text()
     assert Solution.load(runs / "maps.json").maps
     assert main(["map", str(log), "-o", str(runs)]) == 0
     assert json.loads((runs / "run.json").read_text())["interrupted"] is False

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import pytest
 
 from perception.readers.logs import read_log
-from ssh_abduction import Solution, Trace
+from ssh_abduction import Trace
 from ssh_abduction.cli import main
+from ssh_abduction.page.html import ground_in
 from ssh_abduction.robot_logs.log_maps import map_log
 from ssh_abduction.robot_logs.run_folder import NOTICE, with_notice
 
@@ -35,22 +35,29 @@ def notice(file: Path) -> str:
 
 
 def test_each_change_reaches_the_page_or_is_said_on_it(house: Path) -> None:
-    page, report, maps = (house / name for name in ("page.html", "report.html", "maps.json"))
-    assert notice(page) == notice(report) == ""
+    page, maps = house / "page.html", house / "maps.json"
+    steps = len(Trace.load(house / "trace.jsonl"))
+    first = ground_in(page, steps)
+    assert first is not None
+    assert len(first.sections) > 3
+    assert notice(page) == ""
     assert main(["name", str(house), "p0", "pantry"]) == 0
     assert "pantry" in page.read_text()
     assert notice(page) == ""
-    assert "before the last names" in notice(report)
+    assert ground_in(page, steps) == first
     assert main(["correct", str(house), "--different", "round:0,round:1"]) == 0
     assert "before the last correction" in notice(page)
-    assert "before the last correction" in notice(report)
     assert main(["name", str(house), "p0", "cellar"]) == 0
     assert "before the last correction" in notice(page)  # still waits for a search
     before = (house / "recogniser.skops").read_bytes()
     assert main(["solve", str(house), "--theory", "causal", "-o", str(maps)]) == 0
     assert notice(page) == ""
-    assert "page.html shows the new map" in notice(report)
-    assert report.read_text().count("made-before") == 2  # the style and one notice
+    last = ground_in(page, steps)
+    assert last is not None
+    assert last.seen == first.seen  # the page keeps its walls, and says whose they are
+    assert [section.title for section in last.sections] == ["Summary", "The log"]
+    assert "walls are where the map before it put them" in last.sections[0].lines[0]
+    assert page.read_text().count("made-before") == 1  # the style
     assert json.loads((house / "run.json").read_text())["theory"]["level"] == "causal"
     assert (house / "recogniser.skops").read_bytes() != before
 
@@ -62,6 +69,7 @@ def test_other_drives_replace_the_trace_of_the_folder(house: Path, tmp_path: Pat
     assert main(["solve", str(other), "--theory", "causal", "-o", maps]) == 0
     assert len(Trace.load(house / "trace.jsonl")) == 3
     assert not (house / "recogniser.skops").exists()
+    assert ground_in(house / "page.html", 3) is None
     assert main(["show", str(house)]) == 0
 
 
@@ -71,11 +79,3 @@ def test_notice_replaces_an_earlier_one_and_escapes() -> None:
     assert "a &lt; b</p>\n<h1>map" in once
     assert with_notice(once, "c").count("<p ") == 1
     assert with_notice(once, "") == page
-
-
-def test_each_place_has_its_number_in_the_report(house: Path) -> None:
-    """Those that the robot only passed show it when pointed at."""
-    (ssh_map, *_) = Solution.load(house / "maps.json").maps
-    text = (house / "report.html").read_text()
-    for place in ssh_map.places:
-        assert f"<title>place {place}</title>" in text or re.search(rf">{place}</text>", text)

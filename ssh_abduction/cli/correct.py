@@ -323,6 +323,17 @@ def run_correct(options: argparse.Namespace) -> int:
     return 0
 
 
+def correct_pair(maps: str, kind: str, first: int, second: int) -> str:
+    """Write what a person says of two steps beside a file of maps, and return it as a sentence."""
+    saved = SavedMap.load(maps)
+    steps = [step_name(saved.drives, step) for step in (first, second)]
+    said = saved.corrections.with_pair(kind, *steps)
+    file = saved.save(said)
+    keep_folder_whole(saved.file, "corrections")
+    told = saved.in_words(Said(kind, (steps[0], steps[1])))
+    return f"{told}\nwritten to {named(file)}; {_how_to_obey(saved.file)}"
+
+
 def _how_to_obey(maps: Path) -> str:
     """Write the command that solves again and obeys the corrections beside a file of maps."""
     if shared.trace_beside(str(maps)) is None:

@@ -264,7 +264,7 @@ def named_after(path: str) -> str:
 
 
 # RUN is written last: it marks a run as finished.
-FILES = (TRACE, MAPS, "page.html", "report.html", RUN)
+FILES = (TRACE, MAPS, "page.html", RUN)
 OURS = (MAPS, RUN)  # the files whose content says that map wrote the folder
 LONGEST = 255  # the most bytes of the name of a folder
 DIGITS = 8  # of a log's digest, appended to its name if another log has the same name

@@ -276,7 +276,7 @@ class MapQuestion(jobs.FileQuestion):
 def run_map(options: argparse.Namespace) -> int:
     """Map a building from a robot's log.
 
-    Find the minimal maps of a building. Writes trace.jsonl, maps.json, page.html, report.html and
+    Find the minimal maps of a building. Writes trace.jsonl, maps.json, page.html and
     run.json into a folder. With several logs, each gets its own folder, and its result is
     a verdict with a line of details.
     Logs that are already mapped with the same settings are skipped. With --together, the logs are

@@ -12,11 +12,12 @@ import tempfile
 import webbrowser
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli import shared
-from ssh_abduction.cli.correct import as_corrected
+from ssh_abduction.cli.correct import as_corrected, correct_pair
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import trace_path, verb
 from ssh_abduction.cli.text import describe, steps_in_words, table
@@ -43,7 +44,7 @@ from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from ssh_abduction.online.localiser import Localiser
-    from ssh_abduction.page.content import Called, Run
+    from ssh_abduction.page.content import Called, Ground, Run
 
 
 HEAD = ("step", "action", "seen", "", "dstate")
@@ -475,13 +476,21 @@ def run_view(options: argparse.Namespace) -> int:
     if options.serve:
         assert trace is not None
         return _serve(options, listing, trace, theory, localised, called)
-    page = Page(content_of(listing, trace, localised, called))
+    page = Page(content_of(listing, trace, localised, called, _ground(options, trace)))
     file = options.output or str(Path(tempfile.mkdtemp(prefix="ssh-abduction-")) / "maps.html")
     page.save(file)
     print(file)
     if not options.output and options.open:
         webbrowser.open(Path(file).absolute().as_uri())
     return 0
+
+
+def _ground(options: argparse.Namespace, trace: Trace | None) -> Ground | None:
+    """Read the walls and the report from the page that `map` wrote beside the maps, if any."""
+    from ssh_abduction.page.html import ground_in
+
+    beside_maps = Path(options.maps).parent / "page.html"
+    return None if trace is None or options.maps == "-" else ground_in(beside_maps, len(trace))
 
 
 def _check(options: argparse.Namespace, trace: Trace | None) -> None:
@@ -556,13 +565,17 @@ def _serve(
 
     from ssh_abduction.page.server import PageServer
 
-    where: dict[str, Any] = {"port": options.port, "time_limit": options.time_limit}
-    try:
-        server = PageServer(listing, trace, theory, run=localised, called=called, **where)
-    except OSError as error:
-        raise AbductionError(
-            f"port: expected a free port, got {options.port}: {error.strerror}; name another one"
-        ) from None
+    server = PageServer(
+        listing,
+        trace,
+        theory,
+        run=localised,
+        called=called,
+        port=options.port,
+        time_limit=options.time_limit,
+        ground=_ground(options, trace),
+        correct=None if options.maps == "-" else partial(correct_pair, options.maps),
+    )
     with server:
         print(server.url, flush=True)
         if options.open:

@@ -39,7 +39,8 @@ from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.data.words import counted
-from ssh_abduction.output.layout import Layout, layout
+from ssh_abduction.output.layout import Layout, drawable_poses, layout
+from ssh_abduction.output.roads import undecided_places
 from ssh_abduction.output.scene import axes
 from ssh_abduction.rivals.comparison import Choice, compare
 from ssh_abduction.rivals.listing import DrivePair, Listing, Maps, joins_of_drives
@@ -76,15 +77,38 @@ class Called:
     flags: str = ""  # the flags that choose the theory
 
 
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of the page below the map, folded at first: sentences, and a table."""
+
+    title: str
+    lines: Sequence[str] = ()
+    table: Sequence[Sequence[object]] = ()  # the rows, the head first
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """What is known of the log of a map: what the laser saw, and a report."""
+
+    seen: Mapping[str, Any] | None = None  # as `robot_logs.log_ground.ground_of` makes it
+    sections: Sequence[Section] = ()
+
+
 def content_of(
-    source: Maps, trace: Trace | None = None, run: Run | None = None, called: Called | None = None
+    source: Maps,
+    trace: Trace | None = None,
+    run: Run | None = None,
+    called: Called | None = None,
+    ground: Ground | None = None,
 ) -> dict[str, Any]:
     """Make the content of the page as a dict for JSON.
 
     Actions and images come from the trace, if it is known. `run` is a run of a robot that was
     localised in the maps, to be replayed. `called` has file names and flags for the commands that
-    the page shows; None for placeholders. Raises MapError if the maps are not of one trace, or not
-    of this one, and TraceError if the header of the trace describes its images wrongly.
+    the page shows; None for placeholders. On a `ground`, all maps are drawn over the walls that
+    the laser saw: a place is where its visits were. Raises MapError if the maps are not of one
+    trace, or not of this one, and TraceError if the header of the trace describes its images
+    wrongly.
     """
     listing = Listing.of(source)
     called = called or Called()
@@ -96,12 +120,17 @@ def content_of(
     # List what maps share once, and let each map refer to it by number, in the order of first use.
     shared = _SharedParts()
     entries = [_entry(ssh_map, name, shared) for ssh_map, name in zip(maps, found.ids, strict=True)]
-    layouts = _layouts(maps, entries, trace)
-    drawings = [_numbers(drawn, maps[i]) for i, drawn in layouts]
-    spots = _spots(maps[0], layouts[0][1])
+    ground = ground or Ground()
+    if ground.seen:
+        drawings, spots = [], [(x, y, heading) for x, y, heading in ground.seen["spots"]]
+    else:
+        layouts = _layouts(maps, entries, trace)
+        drawings = [_numbers(drawn, maps[i]) for i, drawn in layouts]
+        spots = _spots(maps[0], layouts[0][1])
     return {
         **attributes_of(found, "sentence", "minimal", "complete"),
         **attributes_of(listing, "verdict", "sureness", "warnings"),
+        "name": listing.drives[0].name if listing.drives else "",
         "joins": _joins(listing),
         **_drives(listing),
         "file": called.maps,
@@ -120,6 +149,28 @@ def content_of(
             [round(x, 3), round(y, 3), None if h is None else round(h, 3)] for x, y, h in spots
         ],
         "overview": overview(maps, spots),
+        "ground": ground.seen,
+        "indoors": _indoors(maps[0]) if ground.seen else {},
+        "report": [asdict(section) for section in ground.sections],
+    }
+
+
+def _indoors(first: SSHMap) -> dict[str, Any]:
+    """The corridors, doors and rooms of the first map, with names, and ellipses of its places."""
+    if not drawable_poses(first):
+        return {}
+    found = layout(first)
+    return {
+        "corridors": [
+            {"title": first.called("corridor", c.id), "path": c.path, "line": c.line}
+            for c in first.corridors
+        ],
+        "rooms": [
+            {"title": first.called("room", room.id), "line": room.outline, "places": room.places}
+            for room in first.rooms
+        ],
+        "doors": [{"title": first.called("door", d.id), "at": d.at} for d in first.doors],
+        "ellipses": _ellipses(found, first, 1.0),
     }
 
 
@@ -143,6 +194,8 @@ def _entry(ssh_map: SSHMap, name: str, shared: _SharedParts) -> dict[str, Any]:
     }
     if leaps := _leaps(ssh_map):
         entry["leaps"] = leaps
+    if passed := undecided_places(ssh_map):
+        entry["passed"] = sorted(passed)  # the robot only passed them
     if ssh_map.regions:
         regions = tuple((r.places, r.bounds, r.door) for r in ssh_map.regions)
         entry["regions"] = shared.regions[regions]
@@ -299,7 +352,7 @@ def _lifts(ssh_map: SSHMap) -> dict[tuple[int, int], set[str]]:
 def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
     """The ellipses of uncertain positions: of the first dstate of each place.
 
-    Each has the dstate, two standard deviations, and the angle of the first axis in radians
+    Each has the position, two standard deviations, and the angle of the first axis in radians
     counterclockwise.
     """
     extent = max(
@@ -314,7 +367,9 @@ def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
         seen.add(s.place)
         (major, minor), angle = axes(found.spreads[s.id])
         if 0 < major <= CUT * extent and math.isfinite(angle):
-            ellipses.append([s.id, round(major / unit, 3), round(minor / unit, 3), round(angle, 3)])
+            x, y, _ = found.dstates[s.id]
+            numbers = x / unit, y / unit, major / unit, minor / unit, angle
+            ellipses.append([round(number, 3) for number in numbers])
     return ellipses
 
 

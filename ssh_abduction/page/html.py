@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -18,7 +19,7 @@ from ssh_abduction.data.files import filled
 from ssh_abduction.data.map_parts import write_map
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
-from ssh_abduction.page.content import Run, content_of
+from ssh_abduction.page.content import Ground, Run, Section, content_of
 from ssh_abduction.rivals.listing import Maps
 
 HERE = Path(__file__).parent
@@ -27,6 +28,8 @@ SCRIPTS = (
     "base",
     "maps",
     "camera",
+    "find",
+    "ground",
     "figures",
     "regions",
     "paint",
@@ -38,6 +41,9 @@ SCRIPTS = (
 )
 # Characters in JSON that could end the script element or a line of the script.
 ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
+
+
+CONTENT = re.compile('<script type="application/json" id="content">(.*?)</script>', re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +89,7 @@ def view_page(
     *,
     run: Trace | None = None,
     beliefs: Callable[[SSHMap], Iterable[Any] | None] | None = None,
+    ground: Ground | None = None,
 ) -> Page:
     """Make a page that shows maps, what they share, and where they differ.
 
@@ -94,6 +101,7 @@ def view_page(
         beliefs: A function that takes a map and returns the belief at each step of the run, such as
             `lambda m: Localiser(m).beliefs(run)`. It returns None for a map in which the robot was
             not localised.
+        ground: What is known of the log of the maps: what the laser saw, and a report.
 
     Raises:
         MapError: The maps are of several traces or not of `trace`, or only one of `run` and
@@ -110,7 +118,22 @@ def view_page(
             "the other one"
         )
     localised = None if run is None or beliefs is None else Run(run, beliefs)
-    return Page(content_of(source, trace, localised))
+    return Page(content_of(source, trace, localised, ground=ground))
+
+
+def ground_in(file: str | os.PathLike[str], steps: int) -> Ground | None:
+    """Read from a page what is known of the log of its maps; None if it is of no such log.
+
+    `steps` is the number of steps of the trace.
+    """
+    try:
+        found = CONTENT.search(Path(file).read_text(encoding="utf-8"))
+        content = json.loads(found[1]) if found else {}
+        if len(content["ground"]["spots"]) != steps:
+            return None
+        return Ground(content["ground"], [Section(**section) for section in content["report"]])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:
@@ -124,7 +147,7 @@ def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:
     asked = "self" if served else "none"
     policy = (
         f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; "
-        f"connect-src '{asked}'; base-uri 'none'; form-action 'none'"
+        f"img-src data:; connect-src '{asked}'; base-uri 'none'; form-action 'none'"
     )
     return filled(HERE / "page.html", policy=policy, style=style, script=script, content=text)
 

@@ -18,20 +18,21 @@ import select
 import socket
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from ssh_abduction.data.checks import a_list, one_of
+from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.errors import AbductionError, MapError, brief
 from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page import answers
-from ssh_abduction.page.content import Called, Run, content_of
+from ssh_abduction.page.content import Called, Ground, Run, content_of
 from ssh_abduction.page.html import html_of
-from ssh_abduction.rivals.listing import Listing, PairInMap
+from ssh_abduction.rivals.listing import Listing, Maps, PairInMap
 from ssh_abduction.solver import LimitError, Watch, in_process
 from ssh_abduction.theory.theory import Theory
 
@@ -55,9 +56,12 @@ class PageServer(ThreadingHTTPServer):
         port: The port to listen on; 0 for any free one.
         max_maps: The largest number of maps in an answer; None for all.
         time_limit: Seconds for each answer; None for no limit.
+        ground: What is known of the log of the maps.
+        correct: A function that writes what a person says of two steps, by its kind (such as
+            "elsewhere") and the steps, and returns a sentence. None if nothing can be written.
 
     Raises:
-        MapError: The maps are not of the trace.
+        MapError: The maps are not of the trace, or the port is in use or may not be used.
     """
 
     daemon_threads = True
@@ -74,14 +78,26 @@ class PageServer(ThreadingHTTPServer):
         port: int = 0,
         max_maps: int | None = 100,
         time_limit: float | None = 30.0,
+        ground: Ground | None = None,
+        correct: Callable[[str, int, int], str] | None = None,
     ) -> None:
         self._trace, self._theory, self._maps, self._limit = trace, theory, max_maps, time_limit
         self._listing = listing
         self._run, self._called = run, called or Called(listing.source)
-        self.page = html_of(content_of(listing, trace, run, self._called), served=True).encode()
+        self._ground, self._correct = ground, correct
+        self.page = html_of(self._content(listing), served=True).encode()
         self._token = secrets.token_urlsafe(24)
         self._one_at_a_time = threading.Lock()
-        super().__init__(("127.0.0.1", port), _Handler)
+        try:
+            super().__init__(("127.0.0.1", port), _Handler)
+        except (OSError, OverflowError) as error:
+            raise MapError(
+                f"port: expected a free port, got {port} ({error}); name another one, or 0 for any"
+            ) from None
+
+    def _content(self, maps: Maps) -> dict[str, Any]:
+        content = content_of(maps, self._trace, self._run, self._called, self._ground)
+        return {**content, "corrects": self._correct is not None}
 
     @property
     def port(self) -> int:
@@ -99,32 +115,36 @@ class PageServer(ThreadingHTTPServer):
         return rest if hmac.compare_digest(token.encode(), self._token.encode()) else None
 
     def answer(self, question: str, data: Mapping[str, Any], watch: Watch) -> dict[str, Any]:
-        """Answer "explain", why two steps are one dstate or not, or "solve", to find maps.
+        """Answer "explain", why two steps are one dstate or not, "solve", or "correct".
 
-        `data` has `pair`, the two steps to explain; and `same` and `different`, lists of pairs of
+        "solve" finds maps, and "correct" writes what a person says of two steps. `data` has `pair`,
+        the two steps; `kind`, what is said of them; and `same` and `different`, lists of pairs of
         steps that are assumed to be one dstate, or different ones. The answer has `text`; and
         `assuming`, the cost of each assumption, or `content`, the new content of the page. Raises
         AbductionError for a malformed question or one without an answer, and LimitError.
         """
-        one_of("question", question, ("explain", "solve"), MapError, mend="ask one of the two")
+        known = ("explain", "solve", *(["correct"] if self._correct else []))
+        one_of("question", question, known, MapError, mend="ask one of these")
+        if self._correct and question == "correct":
+            kind = one_of("kind", data.get("kind"), ASSERTIONS, MapError, mend="take one of these")
+            return {"text": self._correct(kind, *self._pair(data.get("pair")))}
         theory = self._assuming(data)
         pair = self._pair(data.get("pair")) if question == "explain" else None
-        known = self._listing.maps
+        maps = self._listing.maps
         with self._turn(watch):
             if pair is not None:
-                asked = self._trace, *pair, theory, known, self._limit
+                asked = self._trace, *pair, theory, maps, self._limit
                 why = in_process(answers.pair_explained, *asked, watch=watch)
                 # The maps of the page tell more, unless the user assumes more.
                 as_mapped = theory == (self._theory or Theory.topological())
                 said = PairInMap.of(self._listing, *pair) if as_mapped else None
                 text = "\n".join(map(str, filter(None, (said, why))))
                 return {"text": text, "assuming": why.assuming}
-            search = self._trace, theory, known, self._maps, self._limit
+            search = self._trace, theory, maps, self._maps, self._limit
             found = in_process(answers.solved_with, *search, watch=watch)
         if not found.maps:
             return {"text": found.headline}
-        content = content_of(found, self._trace, self._run, self._called)
-        return {"text": found.headline, "content": content}
+        return {"text": found.headline, "content": self._content(found)}
 
     @contextmanager
     def _turn(self, watch: Watch) -> Iterator[None]:

@@ -35,7 +35,9 @@ from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation.rungs import UnderWay
+from ssh_abduction.page.content import Ground
 from ssh_abduction.page.html import view_page
+from ssh_abduction.robot_logs.log_ground import ground_of
 from ssh_abduction.robot_logs.log_report import may_misread, report
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver import (
@@ -170,8 +172,9 @@ class LogMap:
             "maps.json": f"{json_line(solution.to_dict())}\n",
         }
         if solution.maps:
-            found["page.html"] = view_page(solution, trace).html
-        found["report.html"] = report(self.log, self.imported, solution, self.to_dict())
+            seen = ground_of(self.log, self.imported, solution.maps[0])
+            told = report(self.log, self.imported, solution, self.to_dict())
+            found["page.html"] = view_page(solution, trace, ground=Ground(seen, told)).html
         files = {name: text.encode() for name, text in found.items()}
         if solution.maps:
             files["recogniser.skops"] = written(recogniser_of(trace, solution.maps[0]))

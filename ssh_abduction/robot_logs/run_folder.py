@@ -14,41 +14,44 @@ from ssh_abduction.data.corrections import beside, load_corrections
 from ssh_abduction.data.drives import fingerprints_of
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.page.html import view_page
+from ssh_abduction.page.content import Section
+from ssh_abduction.page.html import ground_in, view_page
 from ssh_abduction.robot_logs.log_maps import recogniser_of
+from ssh_abduction.robot_logs.log_report import OF_LOG
 from ssh_abduction.solver import Solution, with_names
 
 NOTICE = re.compile(r'<p id="made-before" role="alert">.*?</p>\n', re.DOTALL)
-# What changed the folder, and what the report, which needs the log, then says.
-CHANGES = {
-    "names": "Made before the last names were given. page.html has them.",
-    "corrections": "Made before the last correction. Solve again to obey it.",
-    "maps": "Made before the map was last solved. page.html shows the new map.",
-}
-AGAIN = " To make this report again, map the log again into this folder."
+CORRECTED = "Made before the last correction. Solve again to obey it."
+SOLVED = (
+    "The map was solved again. The walls are where the map before it put them. To draw them anew, "
+    "map the log again into this folder."
+)
 
 
 def bring_up_to_date(maps: Path, change: Literal["names", "corrections", "maps"]) -> None:
     """Rewrite the files of a folder of `map` after `maps` or the corrections beside it changed.
 
-    The page and the recogniser are made again. The report gets a notice, and the page, too, while
-    corrections wait for a search. Does nothing in a folder that `map` did not write.
+    The page and the recogniser are made again. The page gets a notice while corrections wait for a
+    search. Does nothing in a folder that `map` did not write.
     """
     folder = maps.parent
-    page, report, run = (folder / name for name in ("page.html", "report.html", "run.json"))
+    page, run = folder / "page.html", folder / "run.json"
     if maps.name != "maps.json" or not run.is_file() or not (folder / "trace.jsonl").is_file():
         return
     solution, trace = Solution.load(maps), Trace.load(folder / "trace.jsonl")
     if not solution.maps:
         return
+    ground = ground_in(page, len(trace))
     waits = page.is_file() and NOTICE.search(page.read_text(encoding="utf-8"))
-    notice = CHANGES["corrections"] if change == "corrections" or waits else ""
+    is_old = change == "corrections" or (waits and change == "names")
     if change == "maps":
-        notice = ""
         own = solution.trace
         if own is not None and fingerprints_of(own) != fingerprints_of(trace):
-            trace = own  # other drives, or more of them, were solved into this folder
+            trace, ground = own, None  # other drives, or more of them, were solved into this folder
             trace.save(folder / "trace.jsonl")
+        if ground is not None:
+            kept = [section for section in ground.sections if section.title == OF_LOG]
+            ground = replace(ground, sections=(Section("Summary", (SOLVED,)), *kept))
         if all(step.image is not None for step in trace.steps):
             recogniser = written(recogniser_of(trace, solution.maps[0]))
             write_file(folder / "recogniser.skops", recogniser)
@@ -61,11 +64,8 @@ def bring_up_to_date(maps: Path, change: Literal["names", "corrections", "maps"]
         write_file(run, (json.dumps(fields, indent=2, ensure_ascii=False) + "\n").encode())
     if (file := beside(maps)) is not None:
         solution = with_names(load_corrections(file), replace(solution, trace=trace), trace)
-    text = with_notice(view_page(solution, trace).html, notice)
-    write_file(page, text.encode())
-    if report.is_file():
-        old = report.read_text(encoding="utf-8")
-        write_file(report, with_notice(old, CHANGES[change] + AGAIN).encode())
+    text = view_page(solution, trace, ground=ground).html
+    write_file(page, with_notice(text, CORRECTED if is_old else "").encode())
 
 
 def with_notice(text: str, notice: str) -> str:

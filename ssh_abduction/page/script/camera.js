@@ -13,13 +13,17 @@ function homeOf(points, svg) {
     most = (v) => v.reduce((a, b) => Math.max(a, b), -Infinity);
   const [l, r, b, t] = [least(xs), most(xs), least(ys), most(ys)],
     box = svg.getBoundingClientRect(),
-    margin = Math.min(55, box.width / 7, box.height / 6);
+    margin = Math.min(data.ground ? 20 : 55, box.width / 7, box.height / 6);
   const k = Math.min(
     (box.width - 2 * margin) / Math.max(r - l, 1e-9),
     (box.height - 2 * margin - 12) / Math.max(t - b, 1e-9),
-    230 / crowding(points),
+    data.ground ? Infinity : 230 / crowding(points),
   );
   return { x: (l + r) / 2, y: (b + t) / 2, k: Math.max(k, 0.1) };
+}
+
+function extentOf(figure) {
+  return figure.extent ?? figure.points;
 }
 
 // Give drawings in metres one home, so that they can be compared, and each other one its own.
@@ -28,7 +32,7 @@ function settle() {
     figures.every((figure) => figure.layout?.metric) ||
     figures.every((figure) => figure.layout === figures[0].layout);
   homes = figures.map((figure) =>
-    homeOf(together ? figures.flatMap((one) => one.points) : figure.points, figure.svg),
+    homeOf(together ? figures.flatMap(extentOf) : extentOf(figure), figure.svg),
   );
   camera = { dx: 0, dy: 0, z: 1 };
 }
@@ -40,7 +44,7 @@ function settled() {
     figures.every((figure, i) => {
       const box = figure.svg.getBoundingClientRect(),
         home = homes[i];
-      return figure.points.every(
+      return extentOf(figure).every(
         ([x, y]) =>
           Math.abs(x - home.x) * home.k < box.width / 2 - 12 &&
           Math.abs(y - home.y) * home.k < box.height / 2 - 12,
@@ -93,6 +97,16 @@ function movable(figure) {
     },
     { passive: false },
   );
+  const pans = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] };
+  svg.addEventListener("keydown", (event) => {
+    const by = pans[event.key];
+    if (!by || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    event.stopPropagation();
+    camera.dx += by[0];
+    camera.dy += by[1];
+    paintSoon();
+  });
   svg.addEventListener("pointerdown", (event) => {
     down.set(event.pointerId, [event.clientX, event.clientY]);
     if (down.size === 1) moved = false;
@@ -147,12 +161,19 @@ function movable(figure) {
 
 function newFigure(content) {
   const figure = { ...content, marks: [], boxes: [] };
+  if (data.ground) {
+    const [l, b, r, t] = data.ground.view;
+    figure.extent = [...figure.points, [l, b], [r, t]];
+  }
   const holder = element("figure", {}, null, $("drawings"));
   element("figcaption", {}, content.caption, holder);
-  figure.svg = element("svg:svg", { role: "img", "aria-label": content.caption }, null, holder);
+  const said = `${content.caption}. Arrow keys move it, + and - zoom.`;
+  figure.svg = element("svg:svg", { role: "img", tabindex: 0, "aria-label": said }, null, holder);
+  figure.ground = element("svg:g", { class: "ground" }, null, figure.svg);
   figure.under = element("svg:g", {}, null, figure.svg);
   figure.base = element("svg:g", {}, null, figure.svg);
   figure.over = element("svg:g", {}, null, figure.svg);
   movable(figure);
+  if (data.ground) buildGround(figure);
   return figure;
 }

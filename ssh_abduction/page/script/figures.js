@@ -19,6 +19,7 @@ function overviewFigure() {
     ? nodes.map((node) => ({
         at: [node.x, node.y],
         kind: share(node.maps),
+        steps: node.steps,
         title: `place of ${stretches(node.steps)}: in ${node.maps} of ${all} maps`,
       }))
     : [];
@@ -46,6 +47,8 @@ function overviewFigure() {
     .map(([a, b, count, path]) => ({
       a: at[a],
       b: at[b],
+      from: a,
+      to: b,
       kind: share(count),
       count,
       inner: count === all && path < count ? share(path) : null,
@@ -55,6 +58,9 @@ function overviewFigure() {
     }))
     .sort((p, q) => p.count - q.count);
   figure.streets.unshift(...liftsOf(data.layouts[data.maps[0].layout]));
+  const nodeOf = [];
+  for (const [t, k] of together) nodeOf[t] = k;
+  if (data.ground) coursesOf(figure.streets, nodeOf);
   const known = new Map();
   for (const told of data.maps)
     for (const k of told.faults ?? []) known.set(k, (known.get(k) ?? 0) + 1);
@@ -64,7 +70,7 @@ function overviewFigure() {
     title: `${data.faults[k][1]}: in ${count} of ${all} maps`,
   }));
   figure.points = at;
-  figure.layout = data.layouts[data.maps[0].layout];
+  figure.layout = data.layouts[data.maps[0].layout] ?? groundLayout();
   figure.labels = labelsOf(0);
   return figure;
 }
@@ -92,6 +98,8 @@ function mapFigure(i, rival) {
     place: p,
     name: `${p}`,
     own: ssh.names[`place ${p}`],
+    steps: ssh.ofPlace.get(p) ?? [],
+    passed: ssh.passed.has(p),
     kind: kindOf(`p${ssh.ofPlace.get(p) ?? []}`),
     title: `${ssh.called("place", p)}: ${stretches(ssh.ofPlace.get(p) ?? [])}`,
   }));
@@ -115,6 +123,8 @@ function mapFigure(i, rival) {
     .map(({ path, from, to, key, travelled }) => ({
       a: ssh.places.get(from),
       b: ssh.places.get(to),
+      from,
+      to,
       kind: `${kindOf(key, path)}${travelled ? "" : " order"}`.trim(),
       colour: other || data.drives.length || path === null ? null : path % COLOURS,
       path: path ?? undefined,
@@ -143,10 +153,24 @@ function mapFigure(i, rival) {
     ...ssh.places.values(),
     ...ssh.dstates.filter((s) => s.place === null).map((s) => s.at),
   ];
+  if (data.ground) {
+    coursesOf(
+      figure.streets,
+      ssh.labels.map((s) => ssh.dstates[s].place),
+    );
+    figure.courses = new Map(
+      figure.streets.filter((s) => s.course).map((s) => [pairKey(s.from, s.to), s.course]),
+    );
+  }
   figure.bands = bandsOf(ssh);
-  figure.layout = ssh.layout;
+  figure.layout = ssh.layout ?? groundLayout();
   figure.labels = ssh.labels;
   return figure;
+}
+
+// The layout of all maps over the scans of a log: metres.
+function groundLayout() {
+  return data.ground ? { metric: true, unit: 1, ellipses: data.indoors.ellipses } : null;
 }
 
 // The lifts between places on two floors.

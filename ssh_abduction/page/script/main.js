@@ -11,6 +11,8 @@ function load(judging = true) {
   $("replay").hidden = data.replays.length < 2;
   tellDoubts();
   tellDrives();
+  tellReport();
+  listThings();
   $("choices").replaceChildren();
   for (const choice of data.choices.slice(0, 20)) {
     const item = element("li", {}, null, $("choices"));
@@ -121,6 +123,9 @@ $("why").addEventListener("click", why);
 $("same").addEventListener("click", () => assume("same"));
 $("different").addEventListener("click", () => assume("different"));
 $("forget").addEventListener("click", () => assume(null));
+$("accept").addEventListener("click", () => correct(true));
+$("reject").addEventListener("click", () => correct(false));
+$("find").addEventListener("change", () => find($("find").value));
 $("stop").addEventListener("click", () => {
   giveUp();
   $("answer").textContent = "Given up.";
@@ -153,12 +158,14 @@ document.addEventListener("keydown", (event) => {
     "=": () => zoom(1.3),
     "-": () => zoom(1 / 1.3),
     0: whole,
+    "/": () => $("find").focus(),
   };
   if (keys[event.key]) {
     event.preventDefault();
     keys[event.key]();
   }
 });
+showLayers();
 let resized = null;
 new ResizeObserver(() => {
   clearTimeout(resized);

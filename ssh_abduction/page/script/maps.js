@@ -93,6 +93,7 @@ function mapOf(i) {
     links,
     keys,
     layout,
+    passed: new Set(told.passed),
     faults: (told.faults ?? []).map((k) => data.faults[k]),
     chi2: told.chi2,
     called: (kind, number) => {

@@ -8,27 +8,35 @@ function paintFigure(figure) {
   Object.assign(figure, { width, height, home, k: home.k * camera.z, marks: [], boxes: [] });
   figure.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   figure.base.replaceChildren();
-  const apart = (figure.crowding ??= crowding(figure.points)) * figure.k;
-  const r = Math.min(12, Math.max(3, 0.17 * apart)); // the radius of a place that no other place is near
+  const usual = (figure.crowding ??= crowding(figure.points)) * figure.k;
+  const r = Math.min(12, Math.max(3, 0.17 * usual)); // the radius of a place that no other place is near
   figure.radius = r;
-  figure.nearest ??= nearestOf(figure.points);
+  // Over walls, places that the robot only passed are dots, and the others have room for numbers.
+  const apart = data.ground
+    ? figure.nodes.filter((node) => !node.passed).map((node) => node.at)
+    : figure.points;
+  figure.nearest ??= nearestOf(apart);
+  const [part, most] = data.ground ? [0.45, Math.max(r, 9)] : [0.36, r];
   const radii = new Map(
-      figure.points.map((at, k) => [
+      apart.map((at, k) => [
         `${at}`,
-        Math.min(r, Math.max(3, 0.36 * figure.nearest[k] * figure.k)),
+        Math.min(most, Math.max(3, part * figure.nearest[k] * figure.k)),
       ]),
     ),
     radiusAt = (at) => radii.get(`${at}`) ?? r;
   const see = (at) => onScreen(figure, at);
   const spots = figure.nodes.map((node) => see(node.at));
-  paintBands(figure, see, r);
+  for (const name of LAYERS) figure.svg.classList.toggle(`no-${name}`, !layers.has(name));
+  if (data.ground) paintGround(figure, see);
+  else paintBands(figure, see, r);
   for (const street of figure.streets)
-    paintStreet(figure, street, see(street.a), see(street.b), spots, r);
+    if (!street.course) paintStreet(figure, street, see(street.a), see(street.b), spots, r);
   paintTrails(figure, see);
   paintEllipses(figure, see);
   figure.nodes.forEach((node, k) => {
     const [x, y] = spots[k],
-      r = radiusAt(node.at);
+      r = node.passed ? Math.min(4, radiusAt(node.at)) : radiusAt(node.at);
+    if (data.ground && !node.passed) paintGateways(figure, spots[k], node, r);
     const circle = element(
       "svg:circle",
       { cx: x.toFixed(1), cy: y.toFixed(1), r: r.toFixed(1), class: classes("node", node.kind) },
@@ -50,7 +58,12 @@ function paintFigure(figure) {
         figure.base,
       );
   });
-  paintMarks(figure, see, radiusAt);
+  if (layers.has("arrows") || !figure.nodes.length) paintMarks(figure, see, radiusAt);
+  else
+    figure.nodes.forEach((node, k) => {
+      const [x, y] = spots[k];
+      figure.marks.push({ ...node, name: null, x, y, size: radiusAt(node.at), angle: null, dot: true });
+    });
   // Names that a person gave are drawn always, and first where they cover nothing.
   figure.nodes.forEach((node, k) => {
     const near = radiusAt(node.at) + 2,
@@ -62,13 +75,14 @@ function paintFigure(figure) {
       return label(figure, node.own, spots[k], far, directions, "own", always);
     }
   });
+  if (data.ground) nameGround(figure, see);
   paintFloors(figure, see, r);
   const named = new Set();
   for (const m of figure.marks)
-    if (m.name && apart > (figure.marks.length > 150 ? 70 : m.bare ? 24 : 40))
+    if (m.name && usual > (figure.marks.length > 150 ? 70 : m.bare ? 24 : 40))
       label(figure, m.name, [m.x, m.y], m.size + 2, around(m));
   for (const street of figure.streets)
-    if (street.names && apart > 60) {
+    if (street.names && usual > 60) {
       const [x, y, c, s] = street.middle;
       label(
         figure,
@@ -182,8 +196,8 @@ function paintStreet(figure, street, a, b, spots, r) {
 
 // Two standard deviations of the position of a place relative to the first dstate.
 function paintEllipses(figure, see) {
-  for (const [s, major, minor, angle] of figure.layout?.ellipses ?? []) {
-    const [x, y] = see(figure.layout.dstates[s]),
+  for (const [u, v, major, minor, angle] of figure.layout?.ellipses ?? []) {
+    const [x, y] = see([u, v]),
       [rx, ry] = [2 * major * figure.k, 2 * minor * figure.k];
     if (rx < figure.radius) continue;
     const drawn = element(
@@ -361,6 +375,8 @@ function paintOver(figure) {
   figure.under.replaceChildren();
   figure.over.replaceChildren();
   paintChosen(figure);
+  paintFound(figure);
+  if (data.ground) paintLaser(figure);
   const beliefs = replay().beliefs,
     labeling = figure.map === null ? Object.keys(beliefs ?? {})[0] : data.maps[figure.map].labeling,
     belief = beliefs?.[labeling]?.[state.step];
@@ -387,7 +403,8 @@ function paintOver(figure) {
   for (const m of figure.marks) {
     if (!replay().other && m.steps.includes(state.step)) {
       element("svg:circle", { class: "here", cx: m.x, cy: m.y, r: m.size + 4 }, null, figure.over);
-      element(
+      if (!data.ground) // else the robot is drawn where it was
+        element(
         m.dot ? "svg:circle" : "svg:path",
         m.dot
           ? { class: "herefill", cx: m.x, cy: m.y, r: m.size }

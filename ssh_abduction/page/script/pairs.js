@@ -17,7 +17,14 @@ function judge() {
   $("answer").textContent = "";
   $("costs").replaceChildren();
   $("ask").hidden = b === undefined && !theory();
-  for (const id of ["why", "same", "different"]) $(id).hidden = b === undefined;
+  for (const id of ["why", "same", "different", "accept", "reject"]) $(id).hidden = b === undefined;
+  $("scans").replaceChildren();
+  const { steps, images } = data.replays.at(-1); // the trace that was mapped
+  for (const t of b === undefined ? [] : [a, b]) {
+    const scan = element("figure", {}, null, $("scans"));
+    element("figcaption", {}, `step ${called(t)}`, scan);
+    drawImage(element("div", {}, null, scan), images, images?.images[t] ?? null, steps[t].star);
+  }
   if (b === undefined)
     $("verdict").textContent = a === undefined ? "" : `Step ${called(a)} is chosen; choose another one.`;
   else {
@@ -165,6 +172,30 @@ async function why() {
   if (!told) return;
   $("answer").textContent = told.text;
   tellCosts(told.assuming);
+}
+
+// The name of a step as `correct` reads it.
+function fullName(t) {
+  return data.drives.length || !data.name ? called(t) : `${data.name}:${t}`;
+}
+
+// Say that the two steps chosen are one, or are not: over a log one place, else one dstate.
+async function correct(accepted) {
+  const pair = state.picked.slice(),
+    kind = data.ground
+      ? accepted ? "same_place" : "elsewhere"
+      : accepted ? "same" : "different";
+  if (pair.length < 2) return;
+  if (!data.corrects) {
+    const option = `--${kind.replace("_", "-")} ${inShell(pair.map(fullName).join(","))}`;
+    $("answer").className = "command";
+    $("answer").textContent =
+      `ssh-abduction correct ${data.file} ${option}\n\n` +
+      `Or let this page write it:\nssh-abduction view ${data.file} ${data.trace} --serve`;
+    return;
+  }
+  const told = await ask("correct", { pair, kind });
+  if (told) $("answer").textContent = told.text;
 }
 
 async function assume(kind) {

@@ -8,11 +8,11 @@ function bandsOf(ssh) {
   const depth = (region) =>
     Math.max(-1, ...behind.filter((r) => contains(region.places, r.places)).map(depth)) + 1;
   return behind.map((region) => {
-    const ways = [...region.places].map((p) => [ssh.places.get(p), ssh.places.get(p)]);
+    const ways = [...region.places].map((p) => [ssh.places.get(p), ssh.places.get(p), p, p]);
     for (let t = 1; t < ssh.labels.length; t++) {
       const [p, q] = [t - 1, t].map((k) => ssh.dstates[ssh.labels[k]].place);
       if (p !== q && region.places.has(p) && region.places.has(q))
-        ways.push([ssh.places.get(p), ssh.places.get(q)]);
+        ways.push([ssh.places.get(p), ssh.places.get(q), p, q]);
     }
     return { ways, depth: depth(region), title: regionTold(ssh, region) };
   });

@@ -44,7 +44,7 @@ function setStep(t) {
     })
     .join("; ");
   $("wrong").hidden = !wrong.length;
-  drawImage(images, images?.images[t] ?? null, step.star);
+  drawImage($("image"), images, images?.images[t] ?? null, step.star);
   tellRivals(t);
   tellBelief();
   for (const figure of figures) paintOver(figure);
@@ -121,8 +121,8 @@ function tellBelief() {
 }
 
 // Draw ranges around the robot, which is in the middle and faces up.
-function drawImage(images, text, star) {
-  $("image").replaceChildren();
+function drawImage(holder, images, text, star) {
+  holder.replaceChildren();
   const value = (c) => ALPHABET.indexOf(c) / (ALPHABET.length - 1);
   const ranges = text !== null;
   if (!ranges && !star?.length) return;
@@ -151,7 +151,7 @@ function drawImage(images, text, star) {
       "aria-label": `${ranges ? "laser image" : "openings"}, ahead is up`,
     },
     null,
-    $("image"),
+    holder,
   );
   const ring = ranges
     ? ([0.25, 0.5, 1, 2, 5, 10, 20, 50, 100, 1000].find(
@@ -201,7 +201,7 @@ function drawImage(images, text, star) {
     const told = star.length
       ? `Openings, seen clockwise from ahead: ${openings.join(", ")}`
       : "No opening is seen.";
-    element("p", {}, told, $("image"));
+    element("p", {}, told, holder);
   }
 }
 

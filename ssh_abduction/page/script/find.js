@@ -1,0 +1,102 @@
+// Finding things by name or number, the layers of the drawing, and the report.
+
+const LAYERS = data.ground
+  ? ["walls", "courses", "rooms", "regions", "gateways", "names", "laser", "ellipses", "arrows"]
+  : ["courses", "regions", "names", "ellipses", "arrows"];
+const layers = new Set(LAYERS.filter((name) => name !== "ellipses" && (name !== "arrows" || !data.ground)));
+
+function showLayers() {
+  $("layers").replaceChildren();
+  for (const name of LAYERS) {
+    const row = element("label", {}, null, $("layers")),
+      box = element("input", { type: "checkbox", id: `layer-${name}` }, null, row);
+    box.checked = layers.has(name);
+    row.append(name);
+    box.addEventListener("change", () => {
+      layers[box.checked ? "add" : "delete"](name);
+      paint();
+    });
+  }
+}
+
+// All that has a name or a number in the first map, with its position and its steps.
+function things() {
+  const ssh = mapOf(0),
+    { corridors = [], rooms = [], doors = [] } = data.indoors;
+  const middleOf = (line) => line[Math.floor(line.length / 2)];
+  return [
+    ...[...ssh.places].map(([p, at]) => ({ text: ssh.called("place", p), at, steps: ssh.ofPlace.get(p) })),
+    ...[...ssh.ofPath].map(([h, steps]) => ({ text: ssh.called("path", h), at: middle(steps), steps })),
+    ...corridors.map(({ title, line }) => ({ text: title, at: middleOf(line) })),
+    ...rooms
+      .filter(({ places, line }) => line.length || places.length)
+      .map(({ title, places, line }) => ({
+        text: title,
+        at: line.length ? middle(places.flatMap((p) => ssh.ofPlace.get(p) ?? [])) : ssh.places.get(places[0]),
+      })),
+    ...doors.map(({ title, at }) => ({ text: title, at })),
+  ];
+}
+
+function listThings() {
+  $("things").replaceChildren();
+  for (const { text } of things()) element("option", { value: text }, null, $("things"));
+}
+
+// Show the thing that is called so: its name, its number, or the first one that begins so or has it.
+function find(text) {
+  const wanted = text.trim().toLowerCase(),
+    all = things(),
+    said = (one) => one.text.toLowerCase(),
+    one =
+      all.find((one) => said(one) === wanted) ??
+      all.find((one) => said(one) === `place ${wanted}` || said(one).startsWith(`place ${wanted} `)) ??
+      all.find((one) => said(one).includes(`(${wanted})`)) ??
+      all.find((one) => wanted && said(one).includes(wanted));
+  $("found").textContent = !wanted ? "" : one ? one.text : `nothing is called ${text.trim()}`;
+  state.found = wanted && one ? one.at : null;
+  if (state.found) {
+    if (one.steps && !replay().other) setStep(one.steps[0]);
+    const home = homes[0],
+      z = Math.max(camera.z, Math.min(3, 60 / home.k));
+    camera = { dx: -(one.at[0] - home.x) * home.k * z, dy: (one.at[1] - home.y) * home.k * z, z };
+    if (one.steps) {
+      state.picked = [one.steps[0]];
+      judge();
+    }
+  }
+  paintSoon();
+}
+
+function paintFound(figure) {
+  if (!state.found) return;
+  const [x, y] = onScreen(figure, state.found);
+  element("svg:circle", { class: "found", cx: x, cy: y, r: 24 }, null, figure.over);
+}
+
+// The sections of the report, folded.
+function tellReport() {
+  $("report").replaceChildren();
+  $("report").hidden = !data.report.length;
+  for (const { title, lines, table } of data.report) {
+    const part = element("details", {}, null, $("report"));
+    element("summary", {}, title, part);
+    for (const line of lines) element("p", {}, line, part);
+    if (!table.length) continue;
+    const body = element("table", {}, null, element("div", { class: "wide" }, null, part));
+    table.forEach((row, k) => {
+      const drawn = element("tr", {}, null, body);
+      for (const cell of row) element(k ? "td" : "th", {}, `${cell}`, drawn);
+    });
+  }
+}
+
+// Paper has no folds.
+let folded = [];
+addEventListener("beforeprint", () => {
+  folded = [...document.querySelectorAll("details:not([open])")];
+  for (const part of folded) part.open = true;
+});
+addEventListener("afterprint", () => {
+  for (const part of folded) part.open = false;
+});
