@@ -65,6 +65,7 @@ function tellDrives() {
 
 // Paint the way of each drive through the places, the ways of several drives side by side.
 function paintTrails(figure, see) {
+  if (data.ground) return; // the courses of the drives are on the ground
   const states = figure.map === null ? null : mapOf(figure.map).dstates;
   const leaps = new Set(data.maps[figure.map ?? 0].leaps);
   const at = (t) => see(states ? states[figure.labels[t]].at : data.spots[t]);

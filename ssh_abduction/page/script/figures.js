@@ -93,8 +93,15 @@ function mapFigure(i, rival) {
         : path !== null && path !== undefined && !other.keys.has(`h${ssh.ofPath.get(path)}`)
           ? "course"
           : "";
+  // The probability of the most doubtful join at each place. Joins are of the first map.
+  const doubts = new Map();
+  for (const [, b, probability] of i === 0 ? data.joins : []) {
+    const place = ssh.dstates[ssh.labels[b]].place;
+    if (probability !== null && !doubts.has(place)) doubts.set(place, probability);
+  }
   figure.nodes = [...ssh.places].map(([p, at]) => ({
     at,
+    doubt: doubts.get(p),
     place: p,
     name: `${p}`,
     own: ssh.names[`place ${p}`],

@@ -122,6 +122,10 @@ function buildGround(figure) {
       if (street.inner)
         add({ class: classes("street inner", street.inner), d, "stroke-width": 2 });
     }
+  for (const [k, { name, first, stop }] of data.drives.entries()) {
+    const way = data.ground.way.slice(data.ground.at[first], data.ground.at[stop - 1] + 1);
+    add({ class: classes("trail", colourOf(k)), d: pathOf(way) }, `the way of ${name}`);
+  }
   figure.laser = element("svg:path", { class: "laser" }, null, holder);
 }
 

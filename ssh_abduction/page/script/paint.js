@@ -43,7 +43,12 @@ function paintFigure(figure) {
       null,
       figure.base,
     );
-    element("svg:title", {}, node.title, circle);
+    if (node.doubt) {
+      circle.classList.add("doubtful");
+      label(figure, node.doubt, spots[k], r + 2, [[1, 0], [0, 1], [-1, 0], [0, -1]], "doubt", true);
+    }
+    const doubt = node.doubt ? `; a join here has probability ${node.doubt}` : "";
+    element("svg:title", {}, node.title + doubt, circle);
     keep(figure, x, y, r, r);
     if (node.name && r >= 6)
       element(
