@@ -30,7 +30,7 @@ settings.register_profile(
 settings.load_profile("the same everywhere")
 
 # Commands print no progress by default. Tests of progress set the interval.
-outcome.EVERY = math.inf
+outcome.FIRST = outcome.EVERY = math.inf
 
 # Background processes and their children ignore Ctrl-C. Restore the handler for tests.
 with contextlib.suppress(ValueError):

@@ -179,7 +179,12 @@ def test_run_that_cannot_be_written_is_not_done(
 
     Files of an earlier run do not remain beside new ones.
     """
-    files = [(RUN, b"new"), ("trace.jsonl", b"new"), ("maps.json", b"new"), ("page.html", b"new")]
+    files = [
+        (RUN, b"new"),
+        ("trace.jsonl", b"new"),
+        ("maps.json", b"new"),
+        ("recogniser.skops", b"new"),
+    ]
     write_run(tmp_path, [(name, b"old") for name in FILES])
     written: list[Path] = []
 
@@ -195,7 +200,7 @@ def test_run_that_cannot_be_written_is_not_done(
     assert str(error.value).startswith(f"{written[-1]}: cannot be written: ")
     assert not (tmp_path / RUN).exists()
     assert not (tmp_path / "page.html").exists()
-    assert written[-1].name == ["trace.jsonl", "maps.json", "page.html", RUN][at - 1]
+    assert written[-1].name == ["trace.jsonl", "maps.json", "recogniser.skops", RUN][at - 1]
 
 
 def test_run_that_cannot_be_written_does_not_stop_other_logs(

@@ -3,7 +3,7 @@ names, completions."""
 
 from __future__ import annotations
 
-import itertools
+import io
 import json
 import logging
 import re
@@ -19,6 +19,7 @@ from worlds import TOURS, drive, rectangle
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.cli import main, outcome, parser
 from ssh_abduction.cli.about import SHELLS
+from ssh_abduction.runtime.loggers import PROGRESS, begin_stage, log_progress, stages
 
 ACES = str(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
 VERBS = sorted(parser().verbs)
@@ -142,28 +143,76 @@ def test_progress_lines_come_at_intervals(
     tee: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert lines(capsys, "solve", tee)[1] == []
-    seconds = itertools.count()
-    # A second passes at each look.
-    monkeypatch.setattr(outcome._NowAndThen, "clock", lambda _: next(seconds))
-    monkeypatch.setattr(outcome, "EVERY", 4.0)
-    some = lines(capsys, "solve", tee)[1]
-    assert some
-    monkeypatch.setattr(outcome, "EVERY", 0.0)
+    monkeypatch.setattr(outcome, "FIRST", 0.0)
+    monkeypatch.setattr(outcome, "EVERY", 0.001)
     for verb in ("solve", "ladder"):
         _, told = lines(capsys, verb, tee)
-        assert len(told) > len(some)
-        assert all(
-            re.fullmatch(
-                r"ssh-abduction: clingo has \d+ of 12 steps; .*; \d+ maps? listed; \d+\.\d s", line
-            )
-            for line in told
-        )
+        assert told
+        stage = r"[12] of 2, (search|answer)(: )?" if verb == "solve" else ""
+        assert all(re.fullmatch(rf"ssh-abduction: {stage}.*\(\d+ s\)", line) for line in told)
+        numbers = [line.split()[1] for line in told if verb == "solve"]
+        assert numbers == sorted(numbers)  # no stage comes back
     assert lines(capsys, "solve", tee, "-q")[1] == []
     assert all(MESSAGE.fullmatch(line) for line in lines(capsys, "solve", tee, "-v")[1])
 
 
+def test_stages_never_go_back(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.DEBUG, PROGRESS.name), stages("log", "track", "search"):
+        begin_stage("track")
+        log_progress("scan 5 of 9")
+        begin_stage("log")
+        begin_stage("views")
+        begin_stage("search")
+        log_progress("12 of 73 units, best 50 places")
+    with caplog.at_level(logging.DEBUG, PROGRESS.name):
+        log_progress("alone")
+    assert caplog.messages == [
+        "1 of 3, log",
+        "2 of 3, track",
+        "2 of 3, track: scan 5 of 9",
+        "2 of 3, track: log",
+        "2 of 3, track: views",
+        "3 of 3, search",
+        "3 of 3, search: 12 of 73 units, best 50 places",
+        "alone",
+    ]
+
+
+def test_progress_of_a_search_counts_its_work(caplog: pytest.LogCaptureFixture) -> None:
+    trace = Trace.from_steps("abcbabcba" * 4, ["on"] * 35)
+    with caplog.at_level(logging.DEBUG, PROGRESS.name):
+        solve(trace, Theory.causal(), work_limit=20)
+    told = [re.match(r"(\d+) of 20 units, (no map yet|best \d+)", text) for text in caplog.messages]
+    assert told
+    done = [int(found[1]) for found in told if found]
+    assert len(done) == len(told)
+    assert done == sorted(done)
+
+
+def test_a_terminal_shows_one_line_that_other_output_wipes_away(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    line = outcome._ProgressLine()
+    with line.shown():
+        line.show()
+        assert terminal.getvalue() == ""
+        line.emit(logging.LogRecord("", 0, "", 0, "1 of 2, search", (), None))
+        line.show()
+        print("a warning", file=sys.stderr)
+        line.show()
+    wiped = "\r\x1b[2K"
+    shown = f"{wiped}ssh-abduction: 1 of 2, search (0 s)"
+    assert terminal.getvalue() == f"{shown}{wiped}a warning\n{shown}{wiped}"
+
+
 EAGER = (
-    "import sys; from ssh_abduction.cli import main, outcome; outcome.EVERY = 0.0; "
+    "import sys; from ssh_abduction.cli import main, outcome; "
+    "outcome.FIRST, outcome.EVERY = 0.0, 0.001; "
     "sys.exit(main(sys.argv[1:]))"
 )
 
@@ -174,7 +223,7 @@ def test_progress_is_not_mixed_into_json(words: tuple[str, ...], mixed: bool, te
     done = subprocess.run(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True
     )
-    assert ("ssh-abduction: clingo has" in done.stdout) == mixed
+    assert ("ssh-abduction: 1 of 2, search" in done.stdout) == mixed
     if not mixed:
         assert json.loads(done.stdout)["count"] == 1
 

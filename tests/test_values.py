@@ -170,7 +170,7 @@ def test_counts_of_one_are_singular() -> None:
     assert one.cost is not None
     run = {"log": {"scans": 1, "metres": 1.0}, "visits": 1, "steps": 1}
     for text, said in (
-        (Progress(1, 1, one.cost, one.bound, 1, 0.0).sentence, "1 of 1 step; best 1 dstate, 1 pl"),
+        (Progress(1, 1, one.cost, one.bound, 1, 0.0).sentence, "best 1 place, 1 dstate, "),
         (headline(one, None), "1 of 1 step given to clingo"),
         (log_report._summary(one, run), "1 scan along 1 m; 1 visit to distinctive places, 1 step."),
         (log_report._summary(one, run), " 1 place, 1 distinctive state."),

@@ -43,6 +43,7 @@ from perception.places.track import (
 )
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
+from ssh_abduction.runtime.loggers import log_progress
 
 # Longer beams are not matched, in metres, since neighbouring beams are too far apart to show a
 # wall.
@@ -80,6 +81,7 @@ POINTS = 150
 POOR, HEADINGS, MISSED = 0.5, 24, 8.0
 # Matching fails in at most 1.5 % of the scans of good logs.
 FAILING = 0.05
+TOLD = 100  # scans between two lines of progress
 # This many scans show whether a robot stood while its odometer stood still.
 IN_A_ROW = 3
 # Standard deviations of the motion without odometry, in metres and radians.
@@ -170,8 +172,10 @@ def _stands(log: RobotLog, track: Track, first: int, last: int) -> bool:
 def _track_of(log: RobotLog, doubts: Mapping[int, Doubt]) -> Track:
     """Make the track, which is broken before each scan to which the robot was carried."""
     done, follower = GrowingTrack(), Follower(lambda i, _: doubts.get(i, Doubt.NONE))
-    for scan in log.scans:
+    for k, scan in enumerate(log.scans):
         done.add(follower.add(scan))
+        if k % TOLD == 0:
+            log_progress(f"scan {k} of {len(log)}")
     return done.track
 
 

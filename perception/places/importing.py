@@ -40,7 +40,7 @@ from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.loggers import log_of
+from ssh_abduction.runtime.loggers import begin_stage, log_of
 
 _log = log_of("ssh_abduction.perception.places")
 
@@ -261,6 +261,7 @@ def with_views(trace: Trace) -> Trace:
 
 @contextmanager
 def _timed(seconds: Seconds, stage: str) -> Iterator[None]:
+    begin_stage(stage)
     begin = time.process_time()
     yield
     seconds[stage] = round(time.process_time() - begin, 3)

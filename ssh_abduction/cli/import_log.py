@@ -28,6 +28,7 @@ from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import write_file
 from ssh_abduction.runtime import program
+from ssh_abduction.runtime.loggers import stages
 
 if TYPE_CHECKING:
     from perception.places.distinctive import Visit
@@ -166,7 +167,8 @@ def run_import(options: argparse.Namespace) -> int:
     """
     check_output(options.output, "the trace")
     check_ending(options.output, ".jsonl")
-    log, done = (_live if options.log == "-" else _whole)(options, lambda note: warn([note]))
+    with stages("log", "track", "places", "trace", "views"):
+        log, done = (_live if options.log == "-" else _whole)(options, lambda note: warn([note]))
     said = (
         f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: "
         f"{counted(len(done.visits), 'visits')} to distinctive places; "

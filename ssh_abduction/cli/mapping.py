@@ -33,6 +33,7 @@ from ssh_abduction.data.errors import AbductionError, MapError, brief, named
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.runtime import workers
+from ssh_abduction.runtime.loggers import begin_stage, stages
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop, check_limit
 from ssh_abduction.theory.theory import Theory
@@ -169,11 +170,14 @@ class MapQuestion(jobs.FileQuestion):
 
         guard = Guard(interrupt, last_words, given_up=given_up, known=best, hand_over=hand_over)
         # A worker process does not handle Ctrl-C: its parent stops it.
-        with contextlib.nullcontext() if workers.serves() else on_ctrl_c(end), guard:
+        imports = ("track", "places", "trace", "views") if len(files) == 1 else ("imports",)
+        planned = stages("log", *imports, "search", "page")
+        with contextlib.nullcontext() if workers.serves() else on_ctrl_c(end), guard, planned:
             from perception.readers.logs import read_log
             from ssh_abduction.robot_logs.log_maps import INTERRUPTED, LogMapping, map_log
 
             logs = [read_log(file, **self.reading) for file in files]
+            begin_stage("imports")
             begun.append(LogMapping(self.known or ()))
             for log, name in zip(logs, names, strict=True):
                 for warning in log.warnings:

@@ -12,6 +12,7 @@ import contextlib
 import logging
 import math
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -24,7 +25,7 @@ from itertools import zip_longest
 from operator import is_not
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any, Literal, NoReturn, Self, TypeAlias
+from typing import Any, Literal, NoReturn, Self, TextIO, TypeAlias, cast
 
 from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.files import mend_of
@@ -245,8 +246,8 @@ def on_ctrl_c(action: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-# Seconds before the first line of progress, and between lines. Most commands end earlier.
-EVERY = 10.0
+# Seconds before the first line of progress, between lines, and between changes on a terminal.
+FIRST, EVERY, REWRITTEN = 1.0, 10.0, 0.2
 LEVELS = {1: logging.INFO, 2: logging.DEBUG}
 
 
@@ -274,10 +275,11 @@ def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
     elif verbose:
         with _handled(logging.getLogger(PACKAGE), _StderrHandler(), LEVELS[min(verbose, 2)]):
             yield
-    elif sys.stderr.isatty() or (for_programs and _is_one_file()):
+    elif for_programs and _is_one_file():
         yield
     else:
-        with _handled(PROGRESS, _NowAndThen(), logging.DEBUG):
+        line = _ProgressLine()
+        with _handled(PROGRESS, line, logging.DEBUG), line.shown():
             yield
 
 
@@ -330,20 +332,73 @@ class _StderrHandler(logging.Handler):
         _say(f"{seconds:.2f} s: {source}: {record.getMessage()}")
 
 
-class _NowAndThen(logging.Handler):
-    """A log handler that prints a record if it has printed none for EVERY seconds."""
+class _ProgressLine(logging.Handler):
+    """Shows the last record after a second, and then now and then, with the time since the start.
 
-    clock = staticmethod(time.monotonic)
+    On a terminal the line is rewritten, and wiped away before anything else is printed.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self._last = self.clock()
+        self._stream, self._began = sys.stderr, time.monotonic()
+        self.rewrites = self._stream.isatty()
+        self._record, self._is_shown, self._over = "", False, threading.Event()
 
     def emit(self, record: logging.LogRecord) -> None:
-        now = self.clock()
-        if now - self._last >= EVERY:
-            self._last = now
-            _say(record.getMessage())
+        self._record = record.getMessage()
+
+    @contextlib.contextmanager
+    def shown(self) -> Iterator[None]:
+        """Until the block ends, show the line, and wipe it away before other output."""
+        thread = threading.Thread(target=self._run, daemon=True)
+        thread.start()
+        try:
+            if self.rewrites:
+                out, err = (cast("TextIO", _Wiping(s, self.wipe)) for s in (sys.stdout, sys.stderr))
+                with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+                    yield
+            else:
+                yield
+        finally:
+            self._over.set()
+            thread.join()
+            self.wipe()
+
+    def _run(self) -> None:
+        wait = FIRST
+        while not self._over.wait(min(wait, threading.TIMEOUT_MAX)):
+            self.show()
+            wait = REWRITTEN if self.rewrites else EVERY
+
+    def show(self) -> None:
+        """Print the line, if there is a record."""
+        if not self._record:
+            return
+        seconds = time.monotonic() - self._began
+        text = printable(f"ssh-abduction: {self._record} ({seconds:.0f} s)")
+        with contextlib.suppress(OSError, ValueError):
+            if self.rewrites:
+                text = f"\r\x1b[2K{text[: shutil.get_terminal_size().columns - 1]}"
+            print(text, end="" if self.rewrites else "\n", file=self._stream, flush=True)
+            self._is_shown = self.rewrites
+
+    def wipe(self) -> None:
+        """Wipe the line away, if it is shown."""
+        if self._is_shown:
+            self._is_shown = False
+            with contextlib.suppress(OSError, ValueError):
+                print("\r\x1b[2K", end="", file=self._stream, flush=True)
+
+
+class _Wiping:
+    """A stream that wipes the line of progress away before each use."""
+
+    def __init__(self, stream: TextIO, wipe: Callable[[], None]) -> None:
+        self._stream, self._wipe = stream, wipe
+
+    def __getattr__(self, name: str) -> Any:
+        self._wipe()
+        return getattr(self._stream, name)
 
 
 def _say(text: str) -> None:

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import logging
-import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from ssh_abduction.cli import outcome, shared
 from ssh_abduction.cli.correct import (
@@ -34,7 +31,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.runtime.loggers import PROGRESS
+from ssh_abduction.runtime.loggers import begin_stage, stages
 from ssh_abduction.solver import (
     Search,
     Solution,
@@ -142,7 +139,7 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
     theory.check_steps(trace)
     obeying = Obeying.of(options, trace, theory)
     with contextlib.ExitStack() as until_printed:
-        with _progress(options.json) as on_progress:
+        with stages("search", "answer"):
             search = Search(
                 obeying.trace,
                 obeying.theory,
@@ -153,7 +150,6 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
                 _start=Start(reasons=True),
                 memory_limit=options.memory_limit,
                 speedups=Speedups.without(options.without_speedups),
-                on_progress=on_progress,
             )
             # Ctrl-C must not cut the output, as half of it would be useless.
             until_printed.enter_context(outcome.on_ctrl_c(search.interrupt))
@@ -175,6 +171,7 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
             )
             until_printed.enter_context(guard)
             explanation = printed.searched(guard.say)
+            begin_stage("answer")
         solution = obeying.finished(search.solution(tuple(printed.kept)))
 
         def save() -> None:
@@ -312,31 +309,6 @@ class _Json:
 
 def _text(lines: Iterable[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
-
-
-@contextlib.contextmanager
-def _progress(prints_meanwhile: bool) -> Iterator[Any]:
-    """Show a line of progress on stderr while the block runs, if stderr is a terminal.
-
-    Yield a function that shows a Progress. Yield None if no progress is shown, in these cases:
-    stderr is no terminal, progress is logged, or maps are printed to a terminal meanwhile.
-    """
-    if (
-        not sys.stderr.isatty()
-        or (prints_meanwhile and sys.stdout.isatty())
-        or PROGRESS.isEnabledFor(logging.INFO)
-    ):
-        yield None
-        return
-    from rich.console import Console
-    from rich.live import Live
-    from rich.spinner import Spinner
-
-    status = Spinner("dots", "solving")
-    # By default rich also redirects stdout to stderr and wraps it to the terminal's width.
-    as_is = {"redirect_stdout": False, "redirect_stderr": False}
-    with Live(status, console=Console(stderr=True), transient=True, **as_is):
-        yield lambda progress: status.update(text=progress.sentence)
 
 
 def _onto(options: argparse.Namespace) -> int:

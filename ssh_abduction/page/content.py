@@ -82,16 +82,17 @@ class Section:
     """A part of the page below the map, folded at first: sentences, and a table."""
 
     title: str
-    lines: Sequence[str] = ()
-    table: Sequence[Sequence[object]] = ()  # the rows, the head first
+    lines: Sequence[str] = field(default=(), repr=False)
+    table: Sequence[Sequence[object]] = field(default=(), repr=False)  # the rows, the head first
 
 
 @dataclass(frozen=True, slots=True)
 class Ground:
     """What is known of the log of a map: what the laser saw, and a report."""
 
-    seen: Mapping[str, Any] | None = None  # as `robot_logs.log_ground.ground_of` makes it
-    sections: Sequence[Section] = ()
+    # What `robot_logs.log_ground.ground_of` makes.
+    seen: Mapping[str, Any] | None = field(default=None, repr=False)
+    sections: Sequence[Section] = field(default=(), repr=False)
 
 
 def content_of(

@@ -39,7 +39,7 @@ from ssh_abduction.page.content import Ground
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_ground import ground_of
 from ssh_abduction.robot_logs.log_report import may_misread, report
-from ssh_abduction.runtime.loggers import log_of
+from ssh_abduction.runtime.loggers import begin_stage, log_of
 from ssh_abduction.solver import (
     Ranking,
     Solution,
@@ -164,6 +164,7 @@ class LogMap:
     def files(self) -> dict[str, bytes]:
         """Make the files of the run's folder: a dict from names to contents, run.json last."""
         trace, solution = self.imported.trace, self.solution
+        begin_stage("page")
         if not self.interrupted:
             shared = find_backbone(solution, trace, work_limit=self.limit)
             solution = replace(solution, shared=shared)
@@ -332,6 +333,7 @@ def map_log(
     mapping.latest = lambda: outcome(mapping.snapshot())
     begin = time.process_time()
     limits: dict[str, Any] = {"time_limit": time_limit, "max_maps": max_maps}
+    begin_stage("search")
     solution = mapping.solve(trace, chosen, work_limit=allowed, **limits)
     tries = 0 if given is not None else PATIENCE
     while solution.status is Status.UNKNOWN and tries and not mapping.interrupted:

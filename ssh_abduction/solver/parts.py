@@ -12,7 +12,7 @@ from ssh_abduction.data.checks import a_count_of_maps, a_flag
 from ssh_abduction.data.errors import SolverError, brief, is_whole
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
-from ssh_abduction.runtime.loggers import PROGRESS
+from ssh_abduction.runtime.loggers import PROGRESS, log_progress
 from ssh_abduction.solver.asp.limits import Stop, Watch, check_limit
 from ssh_abduction.solver.asp.own_rules import never_true
 from ssh_abduction.solver.board import Judging, Known
@@ -155,6 +155,8 @@ class Parts:
             around=start.around,
         )
         self._on_progress = on_progress
+        # The search around this one reports for both, so that no number goes back.
+        self._is_part = start.around is not None
         self._news: tuple[Cost | None, Bound] = (None, Bound())  # what the last report said
         self.watch.start(began)  # settling the theory compares pairs of steps, which may take long
         self.task = Task.of(problem, self.watch, speedups)
@@ -216,19 +218,21 @@ class Parts:
 
     def report(self) -> None:
         """Log how far the search is, and call the caller's `on_progress`."""
-        if self._on_progress is None and not PROGRESS.isEnabledFor(logging.INFO):
+        is_read = self._on_progress is not None or PROGRESS.isEnabledFor(logging.INFO)
+        if self._is_part or not is_read:
             return
-        known = self.known
+        known, watch = self.known, self.watch
         progress = Progress(
             self.engine.size,
             len(self.task.trace),
             known.best_cost,
             known.bound,
             known.count,
-            self.watch.seconds(),
+            watch.seconds(),
+            (watch.elapsed(), watch.left()) if watch.counts_work else None,
         )
         news = (progress.cost, progress.bound)
-        PROGRESS.log(logging.DEBUG if news == self._news else logging.INFO, "%s", progress.sentence)
+        log_progress(progress.sentence, logging.DEBUG if news == self._news else logging.INFO)
         self._news = news
         if self._on_progress is not None:
             self._on_progress(progress)

@@ -207,6 +207,7 @@ class Progress:
         bound: The proven lower bounds so far.
         maps: The number of maps given to the caller so far.
         seconds: The seconds since the search began.
+        work: The units of work done and left; None without a limit of work.
     """
 
     prefix: int
@@ -215,15 +216,16 @@ class Progress:
     bound: Bound
     maps: int
     seconds: float
+    work: tuple[float, float] | None = None
 
     @property
     def sentence(self) -> str:
         """The progress on one line, in words."""
-        counts = ((getattr(self.cost, k), k) for k in ("dstates", "places", "paths") if self.cost)
-        best = ", ".join(counted(number, k) for number, k in counts)
-        bound = ", ".join(f"{k} ≥ {v}" for k, v in self.bound.to_dict().items()) or "no bound yet"
-        return (
-            f"clingo has {self.prefix} of {counted(self.steps, 'steps')}; "
-            f"{f'best {best}' if best else 'no map yet'}; {bound}; "
-            f"{counted(self.maps, 'maps')} listed; {self.seconds:.1f} s"
-        )
+        far = ""
+        if self.work is not None:
+            far = f"{self.work[0]:.0f} of {counted(round(sum(self.work)), 'units')}, "
+        counts = ((getattr(self.cost, k), k) for k in ("places", "dstates", "paths") if self.cost)
+        best = ", ".join(counted(number, k) for number, k in counts if number)
+        bound = "".join(f", {k} ≥ {v}" for k, v in self.bound.to_dict().items())
+        listed = f", {counted(self.maps, 'maps')} listed" if self.maps else ""
+        return f"{far}{f'best {best}' if best else 'no map yet'}{bound}{listed}"
