@@ -26,7 +26,7 @@ from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning
 from perception.images import images_of
 from perception.quality import uncertainty_coefficient
-from perception.recognition import LearningCurve, learning_curve, recogniser
+from perception.recognition import recogniser
 from perception.views import ViewClusterer
 from simulator.driver import STILL
 from simulator.robot import Laser
@@ -44,6 +44,15 @@ WITH_STARS = Theory.topological().replace(displacement="none")
 SURE = 1 - 1e-9
 # How claims write the numbers of dstates, places and paths, and that errors do not grow.
 COUNTS, NONE = "{0.dstates}, {0.places}, {0.paths}", "no growth"
+
+
+class LearningCurve(NamedTuple):
+    """The recognition rate as a function of the number of images seen."""
+
+    sizes: Sequence[int]  # (s,) numbers of images to learn from
+    mean: NDArray[np.float64]  # (s,) mean share of recognised images over the folds, in [0, 1]
+    lowest: NDArray[np.float64]  # (s,) lowest share over the folds
+    highest: NDArray[np.float64]  # (s,) highest share over the folds
 
 
 @dataclass(frozen=True)
@@ -169,13 +178,50 @@ def measure(name: str, seed: int) -> SeedRun:
         labels_right=one_to_one(labels, truth),
         aliased=len(aliased),
         told_apart=len(aliased) - len({*aliased} & {*_aliased(labels, truth)}),
-        curve=learning_curve(ranges, labels, sizes, random_state=seed),
+        curve=learning_curve(ranges, labels, sizes, seed),
         rates={kind: rate(ranges, of, truth, seed) for kind, of in kinds.items()},
         alone_uncertainty=uncertainty_coefficient(alone, truth),
         alone_distinct=e.dstates - len(shared),
         even=(of_even.quality_[of_even.k_], even_u),
         spread=[part.max(axis=0).tolist() for part in np.array_split(offsets, e.tours)],
     )
+
+
+def learning_curve(
+    images: NDArray[np.float64],
+    labels: NDArray[Any],
+    sizes: Sequence[int],
+    seed: int,
+    folds: int = 10,
+) -> LearningCurve:
+    """Cross-validate the recognition rate for growing numbers of images.
+
+    The images are dealt into folds, one label after the other. For each size m and each fold, a
+    recogniser learns from the first m images without those of the fold, and is tested on the whole
+    fold. An image whose label was not learnt counts as an error. Labels with one image are not
+    tested.
+
+    Args:
+        images: (n, d) images in the order in which they were seen.
+        labels: (n,) label of each image.
+        sizes: Numbers of images to learn from, each from 1 to n.
+        seed: Seed of the division into folds.
+        folds: Number of folds, at least 2.
+    """
+    _, of, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    shuffled = np.random.RandomState(seed).permutation(len(labels))
+    cards = shuffled[np.argsort(of[shuffled], kind="stable")]
+    cards = cards[counts[of[cards]] > 1]
+    fold = np.full(len(labels), -1)
+    fold[cards] = np.arange(len(cards)) % folds
+    rates = np.zeros((len(sizes), folds))
+    for s, size in enumerate(sizes):
+        for f in range(folds):
+            test, train = fold == f, np.flatnonzero(fold[:size] != f)
+            if len(train):
+                known = recogniser().fit(images[train], labels[train])
+                rates[s, f] = np.mean(known.predict(images[test]) == labels[test])
+    return LearningCurve(sizes, rates.mean(axis=1), rates.min(axis=1), rates.max(axis=1))
 
 
 def true_dstates(trace: Trace) -> NDArray[Any]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from paper_experiments import NotchOutcome
+from paper_experiments import LearningCurve, NotchOutcome
 
 from simulator.robot import BEARINGS
 from simulator.world import World
@@ -17,7 +17,6 @@ from ssh_abduction.evaluation.figures import (
     BLUE,
     GREEN,
     ORANGE,
-    ends_of_beams,
     load_pyplot,
     right_axis,
     save_figure,
@@ -138,3 +137,20 @@ def draw_outcomes(
         )
     figure.tight_layout()
     save_figure(figure, path)
+
+
+def draw_learning(path: str | Path, curve: LearningCurve) -> None:
+    """Draw a learning curve: a line for the mean over the folds, and a band for their range."""
+    figure, axes = load_pyplot().subplots(figsize=(5.5, 3.2))
+    axes.fill_between(curve.sizes, curve.lowest, curve.highest, color=BLUE, alpha=0.2, linewidth=0)
+    axes.plot(curve.sizes, curve.mean, "o-", color=BLUE, label="labels from the map")
+    axes.set(xlabel="images seen", ylabel="recognition rate", ylim=(0, 1.03))
+    axes.legend(frameon=False, loc="lower right")
+    save_figure(figure, path)
+
+
+def ends_of_beams(
+    ranges: NDArray[np.float64], bearings: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """Compute where beams end on a page on which the robot faces up: x and y in metres."""
+    return [-ranges * np.sin(bearings), ranges * np.cos(bearings)]

@@ -116,7 +116,7 @@ def _draw(name: str, run: SeedRun, folder: Path) -> None:
         folder / "views.png", images_of(trace), learner.views_, true_dstates(trace)
     )
     figures.draw_quality(folder / "quality.png", run.quality, run.uncertainty, run.k)
-    figures.draw_learning(folder / "learning.png", {"labels from the map": run.curve})
+    paper_figures.draw_learning(folder / "learning.png", run.curve)
     paper_figures.draw_spread(folder / "spread.png", run.spread)
     # The map from the views alone, and with the openings seen.
     starred = BootstrapLearner(WITH_STARS).fit(trace)

@@ -26,31 +26,13 @@ its distances into densities, which say how probable an image is at each known p
   unknown place. An unknown place looks like one of the known places or like none of them, all with
   equal probability. So an image that is common at all places is no evidence for any of them.
   FAB-MAP (Cummins and Newman 2008) also compares with the average place, by sampling.
-
-`telling_features` finds the beams that distinguish two similar dstates:
-
->>> images = [[1.0, 2.0, 3.0], [1.1, 2.0, 3.0], [1.0, 2.1, 3.0]]
->>> images += [[1.0, 2.0, 5.0], [1.1, 2.0, 5.1], [1.0, 2.1, 5.0]]
->>> found = telling_features(images, [4, 4, 4, 7, 7, 7], 4, 7)
->>> {method: int(shares.argmax()) for method, shares in found.methods.items()}, found.recognised
-({'margin': 2, 'permutation': 2, 'linear': 2}, 1.0)
-
-A feature of an image is the value of one beam. Kuipers and Beeson (2002) hope that back-propagation
-could learn which features matter. Our recogniser is the nearest neighbour, which has no weights to
-learn. So three measures are compared. Each has its own weakness:
-
-- margin: by how much a feature makes the nearest image of the other dstate farther than the nearest
-  image of its own dstate (Relief: Kira and Rendell 1992);
-- permutation: how much of that margin is lost when the feature is shuffled among the images
-  (scikit-learn's permutation_importance);
-- linear: what a feature adds to the difference of the dstates in a logistic regression.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -62,7 +44,6 @@ from sklearn.base import BaseEstimator, ClassifierMixin, clone
 from sklearn.exceptions import NotFittedError
 from sklearn.neighbors import KNeighborsClassifier
 from sklearn.pipeline import Pipeline
-from sklearn.utils import check_array, check_random_state
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
@@ -181,111 +162,6 @@ def cloned(name: str, estimator: Any, *methods: str) -> Any:
             "give an estimator of scikit-learn"
         )
     return clone(estimator)
-
-
-@dataclass(frozen=True)
-class LearningCurve:
-    """The recognition rate as a function of the number of images seen."""
-
-    sizes: tuple[int, ...]  # (s,) numbers of images to learn from
-    mean: tuple[float, ...]  # (s,) mean share of recognised images over the folds, in [0, 1]
-    lowest: tuple[float, ...]  # (s,) lowest share over the folds
-    highest: tuple[float, ...]  # (s,) highest share over the folds
-    folds: int  # number of folds
-    # Labels with a single image. They are not tested, since no image to learn from is left if that
-    # image is tested.
-    untested: tuple[Any, ...] = ()
-
-
-def learning_curve(
-    X: ArrayLike,
-    y: ArrayLike,
-    sizes: Iterable[int],
-    folds: int = 10,
-    random_state: int | np.random.RandomState | None = None,
-    estimator: Any = None,
-) -> LearningCurve:
-    """Cross-validate the recognition rate for growing numbers of images.
-
-    The images are divided into folds, so that each label is spread evenly over them. For each size
-    m and each fold, a clone of the estimator learns from the first m images, without those of the
-    fold. It is tested on the whole fold, so all sizes are tested on the same images. An image with
-    a label that was not learnt counts as an error. A clone without images to learn from recognises
-    nothing.
-
-    Args:
-        X: (n, d) images in the order in which they were seen.
-        y: (n,) label of each image.
-        sizes: Numbers of images to learn from, each from 1 to n.
-        folds: Number of folds, at least 2.
-        random_state: Seed of the division into folds.
-        estimator: A scikit-learn classifier; None means `recogniser()`, for ranges in metres.
-
-    Returns:
-        The share of recognised images for each size.
-
-    Raises:
-        PerceptionError: A size or the number of folds is out of range, or there are fewer images to
-            test than folds.
-
-    Reference:
-        Kuipers and Beeson 2002, the learning curves.
-    """
-    estimator = recogniser() if estimator is None else estimator
-    images, labels = np.asarray(equal_length(X)), np.asarray(y)
-    # Fit once to all images, so that warnings and errors about the images appear once, and not for
-    # each fold.
-    clone(estimator).fit(images, labels)
-    wanted = tuple(int(size) for size in sizes)
-    for size in wanted:
-        if not 1 <= size <= len(images):
-            raise PerceptionError(
-                f"sizes: expected numbers from 1 to the {len(images)} images, got {size}; leave it "
-                "out"
-            )
-    fold, untested = _deal(labels, folds, random_state)
-    rates = np.zeros((len(wanted), folds))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ImageWarning)
-        for f in range(folds):
-            test = fold == f
-            for s, size in enumerate(wanted):
-                train = np.flatnonzero(~test[:size])
-                if len(train):
-                    rates[s, f] = np.mean(
-                        clone(estimator).fit(images[train], labels[train]).predict(images[test])
-                        == labels[test]
-                    )
-    mean, lowest, highest = (
-        tuple(part.tolist()) for part in (rates.mean(axis=1), rates.min(axis=1), rates.max(axis=1))
-    )
-    return LearningCurve(wanted, mean, lowest, highest, folds, untested)
-
-
-def _deal(
-    labels: NDArray[Any], folds: int, random_state: Any
-) -> tuple[NDArray[np.intp], tuple[Any, ...]]:
-    """Divide the images into folds, one class after the other, as cards are dealt.
-
-    The sizes of two folds differ by at most one image, in total and within each class. An image
-    that is never tested, as it is the only one of its class, has fold -1. These classes are
-    returned, too.
-    """
-    if folds < 2:
-        raise PerceptionError(f"folds: expected at least 2, got {folds}; take 2 or more")
-    classes, of, counts = np.unique(labels, return_inverse=True, return_counts=True)
-    shuffled = check_random_state(random_state).permutation(len(labels))
-    cards = shuffled[np.argsort(of[shuffled], kind="stable")]
-    cards = cards[counts[of[cards]] > 1]
-    if len(cards) < folds:
-        mend = f"take fewer (learning-curve --set folds={len(cards)})"
-        raise PerceptionError(
-            f"folds: expected at most {len(cards)}, the number of images of places that were seen "
-            f"more than once, got {folds}; {mend if len(cards) > 1 else 'record a longer drive'}"
-        )
-    fold = np.full(len(labels), -1, np.intp)
-    fold[cards] = np.arange(len(cards)) % folds
-    return fold, tuple(classes[counts == 1].tolist())
 
 
 @dataclass(frozen=True)
@@ -444,143 +320,3 @@ def _to_nearest_other(images: NDArray[np.float64]) -> NDArray[np.float64]:
     squares = cdist(images, images, "sqeuclidean")
     np.fill_diagonal(squares, np.inf)
     return np.asarray(squares.min(axis=1))
-
-
-Floats = NDArray[np.float64]
-# Number of times that each feature is shuffled.
-SHUFFLED = 10
-
-
-@dataclass(frozen=True, eq=False)
-class TellingFeatures:
-    """How much each feature helps to distinguish two dstates, by three methods.
-
-    A method gives each feature a share of at least 0. The shares of a method sum to 1, or are all 0
-    if no feature helps. The module describes the methods.
-    """
-
-    methods: dict[str, Floats]  # (d,) shares by method: margin, permutation, linear
-    # Share of images whose nearest other image is of their own dstate, from 0 to 1. At about 0.5
-    # the dstates look the same, and the shares above mean nothing.
-    recognised: float
-
-
-def telling_features(
-    X: ArrayLike, labels: ArrayLike, a: Any, b: Any, random_state: int = 0
-) -> TellingFeatures:
-    """Find the features that distinguish dstates `a` and `b`.
-
-    Args:
-        X: (n, d) images as the recogniser compares them, which are reciprocals of ranges.
-        labels: (n,) dstate of each image. Images of other dstates are ignored.
-        a: Label of one dstate.
-        b: Label of the other dstate.
-        random_state: Seed of the permutations of features.
-
-    Returns:
-        The share of each feature by three methods, and the share of images that are recognised.
-
-    Raises:
-        PerceptionError: a is b, or one of the two has fewer than two images.
-    """
-    images = check_array(equal_length(X), dtype=np.float64)
-    of = np.asarray(labels)
-    if of.shape != (len(images),):
-        raise PerceptionError(
-            f"labels: expected {len(images)}, one per image, got an array of shape {of.shape}; "
-            "give one label for each image"
-        )
-    if a == b:
-        raise PerceptionError(
-            f"dstates: expected two different ones, got {a!r} twice; name another one"
-        )
-    for name in (a, b):
-        if np.count_nonzero(of == name) < 2:
-            seen = np.count_nonzero(of == name)
-            raise PerceptionError(
-                f"dstates: expected at least two images of {name!r}, got {seen}; log more, or "
-                "name another one"
-            )
-    images, second = images[(of == a) | (of == b)], of[(of == a) | (of == b)] == b
-    # Compare each image with the nearest of its own dstate and the nearest of the other one.
-    hit, miss = _neighbours(images, second)
-    margin = (np.abs(images - images[miss]) - np.abs(images - images[hit])).mean(axis=0)
-    far = np.linalg.norm(images - images[miss], axis=1) - np.linalg.norm(
-        images - images[hit], axis=1
-    )
-    weights = {
-        "margin": margin,
-        "permutation": _permuted(images, second, random_state),
-        "linear": _linear(images, second),
-    }
-    shares = {method: _shares(found) for method, found in weights.items()}
-    return TellingFeatures(shares, float(np.mean(far > 0)))
-
-
-def strongest(shares: ArrayLike, most: float = 0.5) -> str:
-    """Name the fewest features whose shares, (d,), sum to the part `most` of the total, 0 to 1.
-
-    Their indices are written as ranges, such as "3–14, 80", or "–" if all shares are 0.
-    """
-    weights = np.asarray(shares)
-    order = np.argsort(-weights, kind="stable")
-    chosen = np.sort(
-        order[: int(np.searchsorted(np.cumsum(weights[order]), most * weights.sum())) + 1]
-    )
-    if not weights.any():
-        return "–"
-    parts = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
-    return ", ".join(str(part[0]) if len(part) == 1 else f"{part[0]}–{part[-1]}" for part in parts)
-
-
-def _neighbours(
-    images: Floats, second: NDArray[np.bool_]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each image, the nearest other image of its dstate, and of the other dstate."""
-    distances = cdist(images, images)
-    np.fill_diagonal(distances, np.inf)
-    same = second[:, None] == second
-    hits = np.where(same, distances, np.inf).argmin(axis=1)
-    misses = np.where(same, np.inf, distances).argmin(axis=1)
-    return hits.astype(np.intp), misses.astype(np.intp)
-
-
-def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
-    """Compute how much of the margin on one half of the images is lost if a feature is shuffled."""
-    from sklearn.inspection import permutation_importance  # it takes a while, and few need it
-
-    order = np.argsort(second, kind="stable")
-    known, asked = order[::2], order[1::2]
-    model = KNeighborsClassifier(1, algorithm="brute").fit(images[known], second[known])
-    found = permutation_importance(
-        model, images[asked], second[asked], scoring=_margin, n_repeats=SHUFFLED, random_state=seed
-    )
-    return np.asarray(found.importances_mean)
-
-
-def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
-    """Compute the margin: how much nearer images are to their own dstate than to the other one.
-
-    It is the mean over all images of the squared distance to the nearest image of the other dstate,
-    minus that to the nearest image of their own. A feature is important if shuffling its values
-    changes the margin. A useless feature adds the same to both distances, so the margin stays.
-    """
-    distances = cdist(images, model._fit_X, "sqeuclidean")
-    same = second[:, None] == model.classes_[model._y]
-    other = np.where(same, np.inf, distances).min(axis=1)
-    own = np.where(same, distances, np.inf).min(axis=1)
-    return float((other - own).mean())
-
-
-def _linear(images: Floats, second: NDArray[np.bool_]) -> Floats:
-    """Compute what each feature adds to how a logistic regression separates two dstates, (d,)."""
-    from sklearn.linear_model import LogisticRegression
-
-    model = LogisticRegression(max_iter=1000).fit(images - images.mean(axis=0), second)
-    return np.asarray(model.coef_[0] * (images[second].mean(axis=0) - images[~second].mean(axis=0)))
-
-
-def _shares(weights: Floats) -> Floats:
-    positive = np.maximum(weights, 0)
-    total = positive.sum()
-    return positive / total if total > 0 else positive

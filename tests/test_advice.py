@@ -65,7 +65,7 @@ SEVERAL = {
     "ssh_abduction/cli/compare.py": ("compare", "next", "evaluate", "ladder"),
     "ssh_abduction/cli/correct.py": ("correct", "name", "solve"),
     "ssh_abduction/cli/judge.py": ("check", "explain"),
-    "ssh_abduction/cli/learn.py": ("cluster", "train", "learning-curve", "tell-apart", "recognise"),
+    "ssh_abduction/cli/learn.py": ("cluster", "train", "recognise"),
     "ssh_abduction/cli/use.py": ("localise", "route", "show", "export", "view"),
     "ssh_abduction/cli/simulate.py": ("simulate", "examples"),
 }

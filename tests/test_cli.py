@@ -545,7 +545,7 @@ def test_machine_output_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
             "--seed: expected a whole number from 0 to",
         ),
         (
-            ["learning-curve", "y", "x", "--seed", "1e3"],
+            ["cluster", "x", "-o", "y", "--seed", "1e3"],
             "--seed: expected a whole number from 0 to",
         ),
         (

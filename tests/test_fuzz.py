@@ -37,7 +37,6 @@ ANSWER = {
     "theory",
     "cluster",
     "train",
-    "learning-curve",
     "evaluate",
     "recognise",
     "simulate",
@@ -77,7 +76,6 @@ COMMANDS: dict[str, list[str]] = {
         "cluster FILE -o out --k 2",
         "evaluate imaged-maps.json FILE",
         "train FILE imaged-maps.json -o out",
-        "learning-curve FILE imaged-maps.json --set folds=2",
         "recognise recogniser.skops FILE",
         "localise imaged-maps.json FILE --recogniser recogniser.skops",
     ],
@@ -106,7 +104,6 @@ COMMANDS: dict[str, list[str]] = {
     "imaged-maps.json": [
         "train imaged.jsonl FILE -o out",
         "evaluate FILE imaged.jsonl --json",
-        "learning-curve FILE imaged.jsonl --set folds=2 --json",
         "train imaged.jsonl FILE -o out --map 1",
     ],
     "world.json": ["simulate FILE -o out --set stars=false"],

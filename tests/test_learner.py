@@ -37,9 +37,7 @@ from sklearn.model_selection import cross_val_score
 from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning, PerceptionError
 from perception.images import images_of
-from perception.recognition import learning_curve, telling_features
 from perception.views import ViewClusterer
-from simulator.robot import BEARINGS, Laser
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Theory, Trace, solve
@@ -77,7 +75,7 @@ def measured() -> SeedRun:
     """The measurements of reproduce.py with seed 500 and, to be fast, few circuits."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
-        patch.setattr(experiments, "learning_curve", partial(learning_curve, folds=2))
+        patch.setattr(experiments, "learning_curve", partial(experiments.learning_curve, folds=2))
         return measure("notched-rectangle", 500)
 
 
@@ -259,58 +257,6 @@ def test_learner_ignores_images_that_are_noise(run: Trace) -> None:
     assert (learner.views_[-1], learner.confidence_[-1], learner.labels_[-1]) == (-1, 0, -1)
     assert (learner.labels_[:-1] >= 0).all()
     assert set(learner.recogniser_.classes_) == set(learner.labels_[:-1].tolist())
-
-
-# Which beams tell dstates apart
-
-
-def test_telling_features_are_the_beams_at_the_notch(run: Trace) -> None:
-    """Whether a beam hits the notch, or its edge within 15 cm.
-
-    Facing the notch, the robot stops at the same distance from it, and sees that the wall beside it
-    is nearer.
-    """
-    truth, images = true_dstates(run), ReciprocalTransformer().fit_transform(images_of(run))
-    poses = np.array([step.truth["pose"] for step in run.steps])
-    for i in range(4):
-        found = telling_features(images, truth, f"x{i}", f"x{i + 4}")
-        assert found.recognised == 1
-        here = truth == f"x{i}"
-        (ranges,), (x, y, heading) = (
-            Laser(noise=0).exact(World.named("notched-rectangle"), poses[here][:1]),
-            poses[here][0],
-        )
-        for method, shares in found.methods.items():
-            beam = int(shares.argmax())
-            at = (
-                x + ranges[beam] * np.cos(heading + BEARINGS[beam]),
-                y + ranges[beam] * np.sin(heading + BEARINGS[beam]),
-            )
-            assert 2.45 < at[0] < 3.95, (i, method, at)
-            assert at[1] < 0.01, (i, method, at)
-
-
-@pytest.mark.slow
-def test_tell_apart_prints_and_plots_telling_beams(
-    run: Trace, learnt: BootstrapLearner, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    views, maps = tmp_path / "views.jsonl", tmp_path / "maps.json"
-    learner = learnt
-    run.with_views(learner.views_.tolist()).save(views)
-    maps.write_text(json.dumps(learner.map_.to_dict()))
-    assert main(["tell-apart", str(maps), str(views), "--plot", str(tmp_path / "beams.png")]) == 0
-    out = capsys.readouterr().out.splitlines()
-    assert [line.split()[:3] for line in out[1:]] == [
-        [f"{i},", str(i + 4), "1.000"] for i in range(4)
-    ]
-    assert (tmp_path / "beams.png").read_bytes().startswith(b"\x89PNG")
-    assert main(["tell-apart", str(maps), str(views), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)[0]
-    assert (told["dstates"], len(told["margin"]), sum(told["linear"])) == (
-        [0, 4],
-        180,
-        pytest.approx(1),
-    )
 
 
 # Doubts about the number of views
@@ -601,23 +547,6 @@ def test_shell_goes_from_simulation_to_recognition(
         "1 map: map 1 is the true one\nthe truth, known at 48 of 48 steps: 8 dstates, 4 "
         "places, 4 paths; 14 % of"
     )
-    assert (
-        main(
-            (
-                f"learning-curve {path('maps.json')} {path('views.jsonl')} --set folds=2 "
-                f"--json --plot {path('curve.png')}"
-            ).split()
-        )
-        == 0
-    )
-    curve = json.loads(capsys.readouterr().out)
-    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
-    assert curve["sizes"][-1] == 48
-    assert curve["mean"][-1] > 0.8
-    folds = ["--set", "folds=2"]
-    assert main(["learning-curve", path("maps.json"), path("views.jsonl"), *folds]) == 0
-    columns = " ".join(capsys.readouterr().out.splitlines()[0].split())
-    assert columns == "images recognised worst fold best fold"
     assert (
         main(f"simulate notched-rectangle --tours 2 --seed 4 -o {path('other.jsonl')}".split()) == 0
     )

@@ -132,7 +132,7 @@ def test_closed_pipe_and_circular_link_are_errors(
         "simulate notched-rectangle",
         "cluster x",
         "train x y",
-        "learning-curve x y --plot",
+        "cluster x -o y --plot",
     ],
 )
 def test_empty_file_name_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -148,7 +148,7 @@ def test_empty_file_name_is_refused(words: str, capsys: pytest.CaptureFixture[st
     "words",
     [
         "train x y -o=--",
-        "learning-curve x y --set folds=--",
+        "cluster x -o y --set k_max=--",
         "show x --map=--",
         "solve x --set=rules=--",
         "check x y --set prefer=--",
@@ -175,7 +175,7 @@ def test_every_writing_verb_writes_into_a_pipe(
         ["simulate", "notched-rectangle", "--route", "around,around", "-o"],
         ["cluster", str(run), "--k", "4", "-o"],
         ["train", str(maps), str(views), "-o"],
-        ["learning-curve", str(maps), str(views), "--map", "1", "--set", "folds=2", "--plot"],
+        ["cluster", str(run), "--k", "4", "-o", str(tmp_path / "again.jsonl"), "--plot"],
     ):
         pipe, got = tmp_path / ("pipe.png" if "--plot" in words else "pipe"), []
         os.mkfifo(pipe)
@@ -190,8 +190,8 @@ def test_every_writing_verb_writes_into_a_pipe(
 
 
 @pytest.fixture
-def learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """The arguments of `learning-curve` for a small trace with images and its map."""
+def imaged(tmp_path: Path) -> str:
+    """The file of a small trace with images."""
     lines = [{"format": "ssh-trace", "version": 1}]
     lines += [
         {"view": "ab"[i % 2], "image": [1.0 + i % 2, 2.0 + i / 100], "action": "travel"}
@@ -199,20 +199,12 @@ def learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
     ]
     del lines[-1]["action"]
     (tmp_path / "t.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert main(["solve", str(tmp_path / "t.jsonl"), "--theory", "causal", "--json"]) == 0
-    (tmp_path / "m.json").write_text(capsys.readouterr().out)
-    return [
-        "learning-curve",
-        str(tmp_path / "m.json"),
-        str(tmp_path / "t.jsonl"),
-        "--set",
-        "folds=2",
-    ]
+    return str(tmp_path / "t.jsonl")
 
 
 def test_missing_matplotlib_is_an_error_before_the_work(
     tmp_path: Path,
-    learnt: list[str],
+    imaged: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -227,31 +219,24 @@ def test_missing_matplotlib_is_an_error_before_the_work(
     for name in [name for name in sys.modules if name.startswith("matplotlib")]:
         monkeypatch.setitem(sys.modules, name, None)
     never = tmp_path / "never"
-    for words in (
-        [*learnt, "--plot", str(never / "x.png")],
-        ["cluster", learnt[1], "-o", str(never), "--plot", str(never / "x.png")],
-    ):
-        assert main(words) == 1
-        captured = capsys.readouterr()
-        assert captured.out == ""
-        assert (
-            captured.err == "ssh-abduction: plot: expected the package matplotlib, got none; "
-            "pip install '.[plot]' in your clone\n"
-        )
-        assert not never.exists()
-    assert main(learnt) == 0
+    words = ["cluster", imaged, "--k", "2", "-o", str(never)]
+    assert main([*words, "--plot", str(never / "x.png")]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert (
+        captured.err == "ssh-abduction: plot: expected the package matplotlib, got none; "
+        "pip install '.[plot]' in your clone\n"
+    )
+    assert not never.exists()
+    assert main(words) == 0
 
 
 def test_failed_picture_loses_no_other_output(
-    tmp_path: Path, learnt: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, imaged: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*learnt, "--json", "--plot", str(tmp_path / "none" / "x.png")]) == 1
-    captured = capsys.readouterr()
-    assert json.loads(captured.out)["folds"] == 2
-    assert captured.err.count("\n") == 1
     clustered = tmp_path / "views.jsonl"
     plot = ["--plot", str(tmp_path / "none" / "x.png")]
-    assert main(["cluster", learnt[2], "--k", "2", "-o", str(clustered), *plot]) == 1
+    assert main(["cluster", imaged, "--k", "2", "-o", str(clustered), *plot]) == 1
     assert Trace.load(clustered)
     assert "chosen" in capsys.readouterr().out
 

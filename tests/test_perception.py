@@ -47,10 +47,7 @@ from perception.quality import (
 )
 from perception.recognition import (
     PlaceRecogniser,
-    learning_curve,
     recogniser,
-    strongest,
-    telling_features,
 )
 from perception.views import ViewClusterer, as_view_clusterer
 from ssh_abduction.data.errors import AbductionError
@@ -594,104 +591,6 @@ def test_recogniser_returns_the_place_of_the_nearest_image() -> None:
         match="n_neighbors: expected a whole number from 1 to 40, got 41",
     ):
         PlaceRecogniser(41).fit(images, places)
-
-
-def test_learning_curve_rises_to_one() -> None:
-    images, truth = blobs(4, 30, spread=0.05)
-    curve = learning_curve(
-        1 / (0.5 + np.abs(images)), truth, sizes=[1, 2, 4, 40, 120], random_state=0
-    )
-    assert (curve.sizes, curve.folds, curve.untested) == ((1, 2, 4, 40, 120), 10, ())
-    assert curve.mean[-1] == curve.lowest[-1] == 1
-    assert curve.mean[0] < 0.3
-    assert all(a <= b <= c for a, b, c in zip(curve.lowest, curve.mean, curve.highest, strict=True))
-    assert 0.2 < curve.mean[1] <= 0.5  # Two of four places were seen.
-
-
-def test_learning_curve_tests_on_held_out_images() -> None:
-    # Every image differs from all others, so only an image itself could tell its label.
-    rng = np.random.default_rng(0)
-    curve = learning_curve(
-        rng.uniform(1, 5, (400, 30)), rng.integers(20, size=400), sizes=[400], random_state=0
-    )
-    assert curve.mean[0] < 0.15
-
-
-def test_learning_curve_does_not_test_places_seen_once() -> None:
-    images, truth = blobs(3, 10)
-    labels = np.append(truth, 3)
-    curve = learning_curve(
-        np.abs(np.append(images, [[9.0] * 8], axis=0)) + 0.5,
-        labels,
-        sizes=[31],
-        folds=5,
-        random_state=0,
-    )
-    assert curve.untested == (3,)
-    assert curve.mean == (1.0,)
-
-
-def test_learning_curve_warns_once() -> None:
-    images, truth = blobs(2, 10)
-    images = np.abs(images) + 0.5
-    images[3, 3] = np.inf
-    with pytest.warns(ImageWarning) as caught:
-        learning_curve(images, truth, sizes=[10, 20], folds=2)
-    assert len(caught) == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"sizes": [0]}, "sizes: expected numbers from 1 to the 6 images, got 0"),
-        ({"sizes": [7]}, "sizes: expected numbers from 1"),
-        ({"sizes": [6], "folds": 1}, "folds: expected at least 2"),
-        ({"sizes": [6], "folds": 7}, r"folds: expected at most 6.*--set folds=6\)"),
-    ],
-)
-def test_learning_curve_refuses_wrong_arguments(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(PerceptionError, match=message):
-        learning_curve(np.ones((6, 2)), [0, 0, 0, 1, 1, 1], **arguments)
-
-
-# what distinguishes two dstates
-
-
-def test_telling_features_find_the_feature_that_differs() -> None:
-    rng = np.random.default_rng(0)
-    labels = np.repeat([3, 8, 5], 20)
-    images = rng.normal(
-        0, [0.1, 0.1, 2.0, 0.1], (60, 4)
-    )  # The third is noisy and distinguishes nothing.
-    images[labels == 8, 1] += 1
-    found = telling_features(images, labels, 3, 8)
-    for method, shares in found.methods.items():
-        assert (shares.argmax(), shares.sum()) == (1, pytest.approx(1)), method
-        assert (shares >= 0).all()
-    assert telling_features(images[:, [0, 1, 3]], labels, 3, 8).recognised == 1
-    assert telling_features(images, labels, 3, 5).recognised < 0.8
-    assert strongest(found.methods["permutation"]) == "1"
-    assert (strongest([0.2, 0.2, 0.0, 0.15, 0.2, 0.25], 0.8), strongest([0.0, 0.0])) == (
-        "0–1, 4–5",
-        "–",
-    )
-    same = telling_features(np.ones((4, 3)), [0, 0, 1, 1], 0, 1)
-    assert [shares.tolist() for shares in same.methods.values()] == [[0, 0, 0]] * 3
-
-
-@pytest.mark.parametrize(
-    ("labels", "pair", "message"),
-    [
-        ([0, 0, 1, 1], (0, 0), "dstates: expected two different ones, got 0 twice"),
-        ([0, 0, 1, 2], (0, 1), "dstates: expected at least two images of 1, got 1"),
-        ([0, 1], (0, 1), "labels: expected 4, one per image"),
-    ],
-)
-def test_telling_features_refuse_wrong_pairs(
-    labels: list[int], pair: tuple[int, int], message: str
-) -> None:
-    with pytest.raises(PerceptionError, match=message):
-        telling_features(np.eye(4), labels, *pair)
 
 
 # files

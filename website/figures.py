@@ -22,12 +22,11 @@ import numpy as np
 from paper_figures import draw_views, draw_world
 
 from perception.images import images_of
-from perception.recognition import telling_features
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.evaluation.figures import draw_quality, draw_telling
+from ssh_abduction.evaluation.figures import draw_quality
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output import to_svg
 
@@ -89,7 +88,7 @@ DRAWN: dict[str, Callable[[], str]] = {
 
 
 def draw_learning() -> None:
-    """The world, the views, their number, and what the recogniser looks at, of five tours."""
+    """The world, the views and their number, of five tours."""
     matplotlib.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "how"})
     world = World.named("notched-rectangle")
     trace = simulate(world, tours=5, seed=3)
@@ -99,12 +98,6 @@ def draw_learning() -> None:
     draw_world(FIGURES / "world.svg", world, [step.truth["pose"] for step in trace.steps])
     draw_views(FIGURES / "views.svg", images, learner.views_, truth)
     draw_quality(FIGURES / "quality.svg", learner.clusterer_.quality_, {}, learner.clusterer_.k_)
-    draw_telling(
-        FIGURES / "telling.png",
-        images,
-        learner.labels_,
-        {(0, 4): telling_features(images, learner.labels_, 0, 4)},
-    )
 
 
 def main() -> int:

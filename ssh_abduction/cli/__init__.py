@@ -84,8 +84,6 @@ VERBS: Mapping[str, tuple[Verb, ...]] = {
     ),
     "learn: recognise places from images": (
         learn.run_train,
-        learn.run_learning_curve,
-        learn.run_tell_apart,
         learn.run_recognise,
     ),
     "make: simulated robots and the paper's experiments": (

@@ -1,4 +1,4 @@
-"""ssh-abduction cluster, train, learning-curve, tell-apart and recognise: learn from images."""
+"""ssh-abduction cluster, train and recognise: learn from images."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from ssh_abduction.cli.import_log import check_folder
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import Rows, verb
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.data.errors import AbductionError, MapError, named, said_of
+from ssh_abduction.data.errors import AbductionError, named, said_of
 from ssh_abduction.data.maps import SSHMap, check_labels
-from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.learning.runner_up import SECONDS, runner_up, second_map
 from ssh_abduction.solver import solve
@@ -232,40 +231,6 @@ def run_train(options: argparse.Namespace) -> int:
 
 @verb(
     {
-        **LABELLED,
-        "--set folds N=10": "number of folds of the cross-validation",
-        "--seed SEED=0": "random seed of the division into training and test images",
-        "--plot PNG": "draw the learning curve into this file",
-        "--json": "print the learning curve as JSON",
-    }
-)
-def run_learning_curve(options: argparse.Namespace) -> int:
-    """Measure a recogniser with few and with many images.
-
-    Compute the share of images that are recognised, for growing numbers of training images, by
-    cross-validation. The label of an image is its dstate in a map.
-    """
-    from perception.recognition import learning_curve, recogniser
-
-    shared.check_picture(options.plot)
-    images, labels, _, features = _mapped(options)
-    sizes = sorted({len(images) * tenth // 10 for tenth in range(1, 11)} - {0})
-    how: dict[str, Any] = {"folds": options.folds, "random_state": options.seed}
-    curve = learning_curve(images, labels, sizes, estimator=recogniser(features=features), **how)
-    if options.json:
-        print(json.dumps(attributes_of(curve, "sizes", "mean", "lowest", "highest", "folds")))
-    else:
-        rows = [
-            [s, f"{m:.3f}", f"{a:.3f}", f"{b:.3f}"]
-            for s, m, a, b in zip(curve.sizes, curve.mean, curve.lowest, curve.highest, strict=True)
-        ]
-        print(table(["images", "recognised", "worst fold", "best fold"], rows))
-    shared.draw_plot(options, "draw_learning", {"map": curve})
-    return 0
-
-
-@verb(
-    {
         "recogniser": "file that train wrote",
         "trace": "trace file with images",
         "--json": "print the dstates as a JSON list, null for nowhere",
@@ -291,53 +256,4 @@ def run_recognise(options: argparse.Namespace) -> int:
     else:
         shown = ["nowhere" if label is None else label for label in labels]
         print(table(["step", "dstate"], [*enumerate(shown)]))
-    return 0
-
-
-@verb(
-    {
-        **LABELLED,
-        "--plot PNG": "draw the beams over the scans, into this file",
-        "--json": "print how much each beam helps, by each method, as JSON",
-    }
-)
-def run_tell_apart(options: argparse.Namespace) -> int:
-    """Find the laser beams that distinguish dstates with the same view.
-
-    Compare each pair of dstates that have the same view, and two images each.
-    """
-    from perception.appearance import ReciprocalTransformer
-    from perception.recognition import strongest, telling_features
-
-    shared.check_picture(options.plot)
-    ranges, labels, ssh_map, features = _mapped(options)
-    if not isinstance(features, ReciprocalTransformer):
-        raise MapError(
-            f"{options.trace}: expected a trace with ranges, as the result names laser beams, got "
-            "panoramas; take a trace of a laser"
-        )
-    images = ReciprocalTransformer().fit_transform(ranges)
-    views = {s.id: s.view for s in ssh_map.dstates if s.view is not None}
-    alike = [(a, b) for a in views for b in views if a < b and views[a] == views[b]]
-    seen = {label for label in set(labels.tolist()) if (labels == label).sum() > 1}
-    found = {p: telling_features(images, labels, *p) for p in alike if seen.issuperset(p)}
-    if not found:
-        raise MapError(
-            f"{options.maps}: expected dstates that share a view, with two images each, got none; "
-            "log a longer drive"
-        )
-    if options.json:
-        records = []
-        for p, f in found.items():
-            methods = {method: shares.tolist() for method, shares in f.methods.items()}
-            records.append({"dstates": p, "recognised": f.recognised, **methods})
-        print(json.dumps(records))
-    else:
-        rows = [
-            [f"{a}, {b}", f"{f.recognised:.3f}", *map(strongest, f.methods.values())]
-            for (a, b), f in found.items()
-        ]
-        beams = [f"beams by {method}" for method in next(iter(found.values())).methods]
-        print(table(["dstates", "recognised", *beams], rows))
-    shared.draw_plot(options, "draw_telling", ranges, labels, found)
     return 0

@@ -96,7 +96,7 @@ class Verb:
 
     @property
     def name(self) -> str:
-        """The name of the verb, such as "tell-apart"."""
+        """The name of the verb, such as "export"."""
         return self.run.__name__.removeprefix("run_").replace("_", "-")
 
     @property

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from perception.recognition import LearningCurve, TellingFeatures
 from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
@@ -79,22 +77,6 @@ def right_axis(axes: Any, x: Sequence[float], y: Sequence[float], label: str) ->
     return right
 
 
-def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None:
-    """Draw at most three learning curves: recognition rates by the number of images.
-
-    A line is the mean over the folds, and a band the range.
-    """
-    figure, axes = load_pyplot().subplots(figsize=(5.5, 3.2))
-    for (name, curve), colour in zip(curves.items(), (BLUE, ORANGE, GREEN), strict=False):
-        axes.fill_between(
-            curve.sizes, curve.lowest, curve.highest, color=colour, alpha=0.2, linewidth=0
-        )
-        axes.plot(curve.sizes, curve.mean, "o-", color=colour, label=name)
-    axes.set(xlabel="images seen", ylabel="recognition rate", ylim=(0, 1.03))
-    axes.legend(frameon=False, loc="lower right")
-    save_figure(figure, path)
-
-
 def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None:
     """Draw the entropy of each belief, and the probability that the robot is nowhere on the map.
 
@@ -125,51 +107,3 @@ def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None
     lower.plot(steps, [belief["nowhere"] for belief in beliefs], color=BLUE)
     lower.set(xlabel="step", ylabel="p(nowhere)", ylim=(0, 1.03), xlim=(-0.5, len(steps) - 0.5))
     save_figure(figure, path)
-
-
-def draw_telling(
-    path: str | Path,
-    ranges: NDArray[np.float64],
-    labels: NDArray[Any],
-    found: Mapping[tuple[int, int], TellingFeatures],
-) -> None:
-    """Draw which beams of the laser distinguish pairs of dstates.
-
-    Each panel shows the median scans of the two dstates. Each pair has a row, and each method a
-    column.
-
-    Args:
-        path: The file to write.
-        ranges: Ranges in metres, of shape (n, d), over the half circle ahead, the first at the
-            right.
-        labels: The dstate of each scan, of shape (n,).
-        found: For each pair of dstates, how much each beam helps to distinguish them.
-    """
-    methods = list(next(iter(found.values())).methods)
-    figure, grid = load_pyplot().subplots(
-        len(found), len(methods), figsize=(3.2 * len(methods), 2.3 * len(found)), squeeze=False
-    )
-    # A beam that distinguishes the two has a dot, larger if it distinguishes them better.
-    bearings = np.radians((np.arange(ranges.shape[1]) + 0.5) * 180 / ranges.shape[1] - 90)
-    for row, ((a, b), telling) in zip(grid, found.items(), strict=True):
-        scans = [np.median(ranges[labels == name], axis=0) for name in (a, b)]
-        far = 1.05 * min(8.0, max(float(np.max(scan)) for scan in scans))
-        for axes, (method, shares) in zip(row, telling.methods.items(), strict=True):
-            for scan, colour, dashes in zip(scans, (BLUE, GREEN), ("-", "--"), strict=True):
-                axes.plot(*ends_of_beams(scan, bearings), dashes, color=colour, linewidth=0.8)
-            at = np.flatnonzero(shares > 0)
-            sizes = 300 * shares[at] / max(shares.max(), 0.01) * 0.5
-            dots = ends_of_beams(scans[0][at], bearings[at])
-            axes.scatter(*dots, s=sizes, color=ORANGE, alpha=0.6, linewidths=0)
-            axes.plot(0, 0, "^", color="black", markersize=5)
-            axes.set(aspect="equal", xlim=(-far, far), ylim=(-0.08 * far, far))
-            axes.set_title(f"{a} or {b}: {method}", fontsize=8)
-            axes.axis("off")
-    save_figure(figure, path)
-
-
-def ends_of_beams(
-    ranges: NDArray[np.float64], bearings: NDArray[np.float64]
-) -> list[NDArray[np.float64]]:
-    """Compute where beams end on a page on which the robot faces up: x and y in metres."""
-    return [-ranges * np.sin(bearings), ranges * np.cos(bearings)]
