@@ -62,7 +62,7 @@ SEVERAL = {
     "ssh_abduction/cli/__init__.py": ("solve", "map", "next"),
     "ssh_abduction/cli/shared.py": SAID_BY["ssh_abduction/cli/shared.py"],
     "ssh_abduction/cli/about.py": ("theory", "facts", "completion"),
-    "ssh_abduction/cli/compare.py": ("compare", "next", "evaluate", "ladder"),
+    "ssh_abduction/cli/compare.py": ("compare", "next", "evaluate"),
     "ssh_abduction/cli/correct.py": ("correct", "name", "solve"),
     "ssh_abduction/cli/judge.py": ("check", "explain"),
     "ssh_abduction/cli/learn.py": ("cluster", "train", "recognise"),

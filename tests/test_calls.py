@@ -53,7 +53,6 @@ from ssh_abduction.data import (
     save_corrections,
 )
 from ssh_abduction.evaluation import evaluate_visits
-from ssh_abduction.evaluation.rungs import ladder
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.online import Chances
 from ssh_abduction.rivals import Listing, difference
@@ -304,7 +303,6 @@ def known() -> dict[str, Any]:
         "mapper": OnlineMapper("end", Theory.causal()),
         "search": ended(Search(trace)),
         "experiment": next_experiment(solution, trace),
-        "rung": next(iter(ladder(trace))),
         "listing": Listing.of(solution),
         "comparison": compare(solution),
         "plain": Trace.from_steps(["a", "b", "a", "c"], ["travel"] * 3),
@@ -351,7 +349,6 @@ def receiver(name: str) -> Any:
         "Paint": Paint,
         "Plan": lambda: made["plan"],
         "Route": lambda: route(solution, 0, 1),
-        "Rung": lambda: made["rung"],
         "SSHMap": lambda: ssh_map,
         "Search": lambda: made["search"],
         "Solution": lambda: solution,

@@ -466,7 +466,7 @@ def test_rules_with_characters_that_abort_clingo_are_refused(
     Trace.from_steps("aa", ["travel"]).save(trace)
     solve(Trace.from_steps("aa", ["travel"])).maps[0].save(tmp_path / "map.json")
     known = str(tmp_path / "map.json")
-    for verb, *maps in (["solve"], ["explain"], ["ladder"], ["next", known], ["check", known]):
+    for verb, *maps in (["solve"], ["explain"], ["next", known], ["check", known]):
         assert main([verb, *maps, str(trace), "--set", f"rules={path}"]) == 1
         assert re.search(message, capsys.readouterr().err)
     with pytest.raises(TheoryError, match=message):

@@ -18,9 +18,8 @@ from in_processes import from_here, from_there, until
 from worlds import TOURS, drive
 
 from perception.readers.writers import write_carmen
-from ssh_abduction import Solution, Theory, Trace
+from ssh_abduction import Solution
 from ssh_abduction.cli import main
-from ssh_abduction.evaluation.rungs import UnderWay
 from ssh_abduction.robot_logs.log_maps import LogMapping
 from ssh_abduction.runtime import program, workers
 from ssh_abduction.solver import in_process
@@ -133,29 +132,6 @@ def forgotten_signals(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forget the signals that other tests sent, and those of this test."""
     for name in ("heard", "raised"):
         monkeypatch.setattr(program, name, [])
-
-
-@POSIX
-def test_ladder_prints_the_rungs_so_far(
-    forgotten_signals: None,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    solve, asked = UnderWay.solve, []
-
-    def solve_until_the_second(
-        under_way: UnderWay, trace: Trace, theory: Theory, **limits: Any
-    ) -> Solution:
-        asked.append(theory)
-        if len(asked) == 2:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return solve(under_way, trace, theory, **limits)
-
-    monkeypatch.setattr(UnderWay, "solve", solve_until_the_second)
-    assert main(["ladder", ACES, "--maps", "1", "--json"]) == 143
-    rungs = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [rung["name"] for rung in rungs] == ["views", "+ star"]
-    assert [rung["status"] == "optimal" for rung in rungs] == [True, False]
 
 
 @pytest.mark.slow

@@ -81,8 +81,6 @@ THEMES: dict[str, tuple[str, ...]] = {
         "evaluation.MapEvaluation",
         "evaluation.evaluate_visits",
         "evaluation.VisitsEvaluation",
-        "evaluation.rungs.ladder",
-        "evaluation.rungs.Rung",
         "online.Route",
         "online.Move",
         "online.Belief",

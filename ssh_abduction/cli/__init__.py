@@ -69,7 +69,6 @@ VERBS: Mapping[str, tuple[Verb, ...]] = {
         compare.run_compare,
         judge.run_explain,
         compare.run_evaluate,
-        compare.run_ladder,
         compare.run_next,
         repair.run_repair,
     ),

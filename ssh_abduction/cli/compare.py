@@ -1,7 +1,4 @@
-"""ssh-abduction compare, next, evaluate and ladder: compare maps.
-
-Compare them with each other, with the truth, and by the kinds of evidence that were used.
-"""
+"""ssh-abduction compare, next and evaluate: compare maps with each other and with the truth."""
 
 from __future__ import annotations
 
@@ -22,19 +19,18 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.rivals.listing import DrivePair, Listing, joins_of_drives
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solver import Stop, Watch, check_limit, stretches
+from ssh_abduction.solver import Watch, check_limit, stretches
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, MapPairs, VisitsEvaluation
-    from ssh_abduction.evaluation.rungs import Rung
     from ssh_abduction.rivals.comparison import Comparison
     from ssh_abduction.rivals.differences import SharedSides
     from ssh_abduction.rivals.explore import Experiment, ExperimentPlan
 
 
 # Values in run.json that differ between runs even if all settings and results are the same.
-UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
+UNSTEADY = ("seconds", "limit", "drove", "log.source")
 
 
 @verb(
@@ -448,66 +444,3 @@ def _word(value: bool | None, yes: str, no: str) -> str:
 
 def _share(share: float | None) -> str:
     return UNKNOWN if share is None else f"{share:.3f}"
-
-
-RUNG_HEAD = ("", "minimal maps", *THINGS, "the true one", "accuracy", "seconds")
-
-
-@verb(
-    {
-        "trace": shared.TRACE_SAID,
-        **shared.max_maps("maps on each rung"),
-        "--time-limit S": "stop each search after S seconds",
-        "--json": "print one JSON object for each rung",
-        **shared.theory_rows(),
-    }
-)
-def run_ladder(options: argparse.Namespace) -> int:
-    """Show how much each kind of evidence helps.
-
-    Solve a trace several times. Begin with views alone, then add one kind at a time: stars
-    (openings seen), pairs of steps that displacements distinguish, pairs of returns (two steps at
-    one place or dstate) that displacements exclude together, planarity (paths cross only at
-    places). Each time (a rung of the ladder), report the number and the size of the minimal maps;
-    and, if the trace has truth, which map is true.
-    """
-    from ssh_abduction.evaluation.rungs import UnderWay, ladder  # loads scipy
-
-    trace, theory = Trace.load(options.trace), shared.theory_of(options)
-    rungs: list[Rung] = []
-    under_way = UnderWay()
-
-    def written() -> str:
-        """The table of all rungs; empty with --json, as each rung was printed when it was found."""
-        return "" if options.json else f"{table(RUNG_HEAD, list(map(_rung_row, rungs)))}\n"
-
-    def last_words(_: Stop) -> tuple[str, int]:
-        return written(), interrupted_code()
-
-    interrupt = under_way.interrupt
-    with on_ctrl_c(interrupt), Guard(interrupt, last_words) as guard:
-        for rung in ladder(
-            trace,
-            theory,
-            time_limit=options.time_limit,
-            max_maps=options.maps or None,
-            under_way=under_way,
-        ):
-            rungs.append(rung)
-            if options.json:
-                guard.say(lambda: f"{json_line(rungs[-1].to_dict())}\n")
-        code = interrupted_code() if under_way.interrupted else 0
-        guard.finish(code, written)
-    return code
-
-
-def _rung_row(rung: Rung) -> list[object]:
-    """Make the row of a rung in the table."""
-    data, cost = rung.to_dict(), rung.solution.cost
-    counts = [getattr(cost, name) if cost else UNKNOWN for name in THINGS]
-    more = "" if rung.solution.complete else "+"
-    listed = f"{data['count']}{more}" if data["status"] == "optimal" else f"{data['status']}"
-    truth = (
-        UNKNOWN if rung.evaluation is None else "none" if rung.rank is None else f"map {rung.rank}"
-    )
-    return [rung.name, listed, *counts, truth, _share(data["accuracy"]), f"{data['seconds']:.2f}"]

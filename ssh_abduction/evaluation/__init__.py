@@ -1,4 +1,4 @@
-"""Compare maps with the truth, measure how evidence helps, and repeat the paper's experiments."""
+"""Compare maps with the truth, and draw figures."""
 
 from ssh_abduction.runtime.lazy import lazy_names
 

@@ -35,10 +35,9 @@ from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import json_line, mend_of, parse_json, read_file, write_file
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.words import counted
-from ssh_abduction.evaluation.rungs import UnderWay
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_maps import BARE
-from ssh_abduction.solver import LimitError, Watch, in_process
+from ssh_abduction.solver import LimitError, Watch, in_process, solve
 
 NAMES = "drive.names"
 FORMAT, VERSION, MOST = "ssh-live-names", 1, 2**26
@@ -141,7 +140,7 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
         )
     except LogError:  # the robot hardly moved
         return None
-    solution = UnderWay().solve(done.trace, BARE, time_limit=None, max_maps=1, work_limit=task.work)
+    solution = solve(done.trace, BARE, max_maps=1, work_limit=task.work)
     if not solution.maps:
         return None
     ssh_map = solution.maps[0]

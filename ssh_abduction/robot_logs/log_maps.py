@@ -34,7 +34,6 @@ from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.evaluation.rungs import UnderWay
 from ssh_abduction.page.content import Ground
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_ground import ground_of
@@ -42,7 +41,9 @@ from ssh_abduction.robot_logs.log_report import may_misread, report
 from ssh_abduction.runtime.loggers import begin_stage, log_of
 from ssh_abduction.solver import (
     Ranking,
+    Search,
     Solution,
+    Start,
     Status,
     find_backbone,
     obeyed,
@@ -241,15 +242,53 @@ def how_it_ended(solution: Solution, allowed: float) -> str | None:
     )
 
 
-class LogMapping(UnderWay):
+class LogMapping:
     """The mapping of a log while it runs. Another thread or a signal handler may interrupt it.
 
     Each search begins with the `known` maps that the checker accepts.
     """
 
     def __init__(self, known: tuple[SSHMap, ...] = ()) -> None:
-        super().__init__(known)
+        self._start = Start(known=known)
+        self.search: Search | None = None  # the current or last search; None before the first one
+        self.interrupted = False  # whether `interrupt` was called, or Ctrl-C ended a search
         self.latest: Callable[[], LogMap] | None = None  # what `known` returns
+
+    def interrupt(self) -> None:
+        """End the current search soon, with its best answer so far. End later searches, too."""
+        self.interrupted = True
+        if self.search is not None:
+            self.search.interrupt()
+
+    def snapshot(self) -> Solution:
+        """Return what the current search knows so far. The search cannot be used afterwards."""
+        assert self.search
+        return self.search.snapshot("interrupted")
+
+    def solve(
+        self,
+        trace: Trace,
+        theory: Theory,
+        *,
+        time_limit: float | None,
+        max_maps: int | None,
+        work_limit: float | None = None,
+    ) -> Solution:
+        """Solve a trace as `ssh_abduction.solve` does. Ctrl-C ends this and all later searches."""
+        theory.check_steps(trace)
+        self.search = Search(
+            trace,
+            theory,
+            time_limit=time_limit,
+            work_limit=work_limit,
+            max_maps=max_maps,
+            _start=self._start,
+        )
+        if self.interrupted:  # perhaps before there was a search
+            self.search.interrupt()
+        solution = self.search.solution(tuple(self.search))
+        self.interrupted |= solution.stopped == "interrupted"
+        return solution
 
     def known(self) -> LogMap:
         """The result so far, for a program that has to end before the mapping does.
