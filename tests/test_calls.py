@@ -437,9 +437,6 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "explain_place.place": 0,
         # Without displacements, each search takes a quarter of the time.
         **{f"{call}.trace": made["plain"] for call in SEARCHES},
-        "fault_front.most": 1,
-        "fault_front.theory": Theory.causal(),
-        "fault_front.trace": made["plain"],
         "together.traces": [trace],
         "tour.steps": 2,
         "compare.maps": solution,

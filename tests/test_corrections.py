@@ -893,7 +893,7 @@ def test_solve_warns_of_names_that_the_map_does_not_have(
         assert "to place 1 (kitchen): " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("options", [["tuesday"], ["--jobs", "1"], ["--front", "1"]])
+@pytest.mark.parametrize("options", [["tuesday"], ["--jobs", "1"]])
 def test_corrections_of_traces_solved_alone_are_refused(
     options: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,10 +4,7 @@ machines with known faults."""
 from __future__ import annotations
 
 import json
-import random
-import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable
 from dataclasses import replace
 from itertools import accumulate, pairwise, product
 from pathlib import Path
@@ -26,7 +23,6 @@ from ssh_abduction.data import Step
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.solver import Status
-from ssh_abduction.solver.entry import fault_front
 from ssh_abduction.solver.sources.exact import choosing, faulty
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.theory import Speedups
@@ -359,130 +355,6 @@ def test_confidence_of_a_view_scales_the_cost_of_a_fault() -> None:
     assert [(fault.step, fault.cost) for fault in solution.maps[0].faults] == [(9, 0.9)]
     assert solution.cost is not None
     assert solution.cost.faults == 0.9
-
-
-def test_front_equals_the_brute_force() -> None:
-    trace = Trace.from_steps("abababba", ["right", "travel"] * 3 + ["right"])
-    for kinds in ({"slipped": 1.5}, {"misread": 1.5, "slipped": 1.5}):
-        front = fault_front(trace, Theory.causal().replace(**kinds), most=3)
-        assert [point.proven for point in front.points] == [True] * 4
-        assert [point.dstates for point in front.points] == [
-            fewest(trace, faults, set(kinds)) for faults in range(4)
-        ]
-        for point in front.points:
-            assert point.map is not None
-            assert len(point.map.faults) <= point.faults
-            assert check(trace, point.map, Theory.causal().replace(**kinds)) == ()
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_front_with_assertions_equals_the_brute_force(seed: int) -> None:
-    rng = random.Random(seed)
-    steps = rng.randint(3, 5)
-    trace = Trace.from_steps(
-        [rng.choice("abc") for _ in range(steps)],
-        [rng.choice(["right", "travel"]) for _ in range(steps - 1)],
-    )
-    same, different = (tuple(sorted(rng.sample(range(steps), 2))) for _ in range(2))
-    theory = Theory.causal().replace(
-        same=[same], different=[different] if rng.random() < 0.6 else []
-    )
-    expected = [
-        fewest(trace, faults, {"misread", "slipped"}, theory.same, theory.different)
-        for faults in range(4)
-    ]
-    front = fault_front(trace, theory, most=3)
-    assert {point.faults: point.dstates for point in front.points} == {
-        k: count for k, count in enumerate(expected) if count is not None
-    }
-    assert not front.stopped
-    for point in front.points:
-        assert point.map is not None
-        assert check(trace, point.map, theory.replace(misread=1.5, slipped=1.5)) == ()
-
-
-def test_front_accepts_a_dstate_whose_views_are_all_misread() -> None:
-    trace = Trace.from_steps(
-        [3, 0, 0, 0, 0],
-        ["travel", "right", "travel", "right"],
-        displacements=[(7.9, -0.8, 0.0), (-0.0, 0.0, -1.6), (17.4, 0.6, -0.2), (0.0, -0.0, -0.8)],
-    )
-    front = fault_front(trace, most=2)
-    assert [point.dstates for point in front.points] == [5, 5, 5]
-    assert all(set(point.map.labels) == set(range(5)) for point in front.points if point.map)
-
-
-@pytest.mark.parametrize(
-    ("options", "code", "said"),
-    [
-        (["--same", "0,9"], 1, r"same \(--same\): expected steps from 0 to 3, got 0,9"),
-        (["--different", "0,9"], 1, "different"),
-        (["--same", "0,1"], 20, "no map has at most 0 faults: the asserted pairs .* contradict"),
-        (["--same", "0,1", "--json"], 20, r'"front": \[\]'),
-    ],
-)
-def test_front_without_points_names_its_cause(
-    options: list[str], code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = str(tmp_path / "trace.jsonl")
-    Trace.from_steps("abca", ["right", "travel", "left"]).save(path)
-    assert main(["solve", path, "--front", "0", *options]) == code
-    assert re.search(said, "".join(capsys.readouterr()))
-    if code == 20 and "--json" not in options:  # a view that is misread mends it
-        assert main(["solve", path, "--front", "1", *options]) == 0
-        shown = capsys.readouterr().out
-        assert "no map with the asserted pairs of steps has fewer than 1 fault" in shown
-
-
-def fewest(
-    trace: Trace,
-    faults: int,
-    kinds: set[str],
-    same: Iterable[tuple[int, int]] = (),
-    different: Iterable[tuple[int, int]] = (),
-) -> int | None:
-    """The fewest dstates with this many faults, by trying all labels; None if there is no map."""
-    counts = []
-    for labels in partitions(len(trace)):
-        if any(labels[i] != labels[j] for i, j in same) or any(
-            labels[i] == labels[j] for i, j in different
-        ):
-            continue
-        views, ends = votes(trace, labels)
-        wrong, slips = (
-            sum(sum(c.values()) - max(c.values()) for c in found.values())
-            for found in (views, ends)
-        )
-        if (
-            (not wrong or "misread" in kinds)
-            and (not slips or "slipped" in kinds)
-            and wrong + slips <= faults
-        ):
-            counts.append(len(views))
-    return min(counts, default=None)
-
-
-def test_solve_prints_the_front(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    RECTANGLE.save("trace.jsonl")
-    command = ["solve", "trace.jsonl", "--theory", "causal", "--set", "misread=1.5"]
-    assert main([*command, "--front", "2"]) == 0
-    said = capsys.readouterr().out
-    assert re.search(
-        r"^  1 +4 +knee +the view at step 9 is misread: v0, expected v1$", said, re.MULTILINE
-    )
-    assert "if a fault costs more than 0 and less than 9 dstates" in said
-    assert main(["solve", "trace.jsonl", "--front", "1", "--json"]) == 0
-    assert [point["dstates"] for point in json.loads(capsys.readouterr().out)["front"]] == [13, 4]
-    RECTANGLE[:9].save("right.jsonl")
-    assert main(["solve", "right.jsonl", "--front", "1"]) == 0
-    assert capsys.readouterr().out.endswith("\nno fault saves a dstate\n")
-    assert main(["solve", "trace.jsonl", "--front", "2", "--theory", "topological"]) == 1
-    assert "expected the causal axioms alone" in capsys.readouterr().err
-    assert main([*command, "--set", "within=1"]) == 1
-    assert "within: expected 0 where faults are allowed" in capsys.readouterr().err
 
 
 def test_solve_with_faults_at_a_time_limit_gives_map_and_bound() -> None:

@@ -24,7 +24,6 @@ from ssh_abduction.data.odometry import in_words
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.solver import Misfit, Search
 from ssh_abduction.solver.costs import weighing
-from ssh_abduction.solver.entry import fault_front
 from ssh_abduction.solver.sources.metric.wrong_displacements import (
     search_jumps,
     wrong_displacements,
@@ -213,7 +212,6 @@ def test_jumps_are_refused_where_unsupported() -> None:
     theory = Theory(jumped=2)
     for ask in (
         lambda: OnlineMapper("a", theory),
-        lambda: fault_front(circuit(4), theory),
         lambda: explain(circuit(4), theory),
     ):
         with pytest.raises(TheoryError, match="jumped"):

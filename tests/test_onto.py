@@ -194,8 +194,6 @@ def test_solve_onto_adds_a_drive_in_the_shell(
     told = capsys.readouterr()
     assert "have the same steps (tuesday, tuesday); give each drive once" in told.err
     assert "joins all 3 drives: monday, tuesday, tuesday-2" in told.out
-    assert main(["solve", tuesday, "--onto", maps, "--front", "1"]) == 1
-    assert "--front: expected no such option with --onto" in capsys.readouterr().err
 
 
 def test_onto_obeys_corrections_beside_the_map_and_keeps_its_names(

@@ -280,8 +280,6 @@ def test_solve_together_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "--jobs: expected no such option with --together" in capsys.readouterr().err
     assert main(["solve", *files, "-o", maps]) == 1
     assert "--output: expected no such option with several traces" in capsys.readouterr().err
-    assert main(["solve", *files, "--together", "--front", "2"]) == 1
-    assert "--front: expected no such option with --together" in capsys.readouterr().err
 
 
 def test_fault_at_the_start_of_a_drive_is_refused() -> None:

@@ -91,11 +91,6 @@ def test_command_prints_one_answer_for_one_work_limit(
     assert untimed == [alone, alone]
 
 
-def test_work_limit_of_a_front_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["solve", str(ROUTE), "--front", "1", "--work-limit", "1"]) == 1
-    assert "--work-limit: expected no such option with --front" in capsys.readouterr().err
-
-
 def test_work_is_counted_inside_counting_only() -> None:
     with counting(is_on=True):
         begun = now()

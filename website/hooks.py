@@ -63,7 +63,6 @@ THEMES: dict[str, tuple[str, ...]] = {
             "find_backbone",
             "find_regions",
             "with_regions",
-            "fault_front",
         )
     ),
     "Other packages": (

@@ -1,7 +1,6 @@
 """ssh-abduction solve TRACE: find the minimal maps of a trace. batch.py solves many traces.
 
-With --onto, add a drive to an existing map, which keeps its places. With --front, find the fewest
-dstates for 0, 1, … K faults. A fault is an observation or action that the map treats as wrong.
+With --onto, add a drive to an existing map, which keeps its places.
 """
 
 from __future__ import annotations
@@ -24,11 +23,10 @@ from ssh_abduction.cli.correct import (
 )
 from ssh_abduction.cli.outcome import Guard
 from ssh_abduction.cli.parsing import verb
-from ssh_abduction.cli.text import answer_lines, front_as_text
+from ssh_abduction.cli.text import answer_lines
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.loggers import begin_stage, stages
@@ -38,13 +36,11 @@ from ssh_abduction.solver import (
     Start,
     Status,
     Stop,
-    fault_front,
     opening,
     solve,
     written_map,
 )
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
-from ssh_abduction.theory.theory import Theory
 
 # At most this many maps are kept in memory, to compare them on the terminal or to sort them for
 # JSON. If there are more, only the first ones are compared, and JSON has all in the order found.
@@ -68,12 +64,6 @@ HELD_DSTATES = 500_000
             "obey the names and corrections in this file, or in corrections.yaml of this folder "
             "(default: corrections.yaml in the folder of the file of --output or, if there is "
             "none, of --onto)"
-        ),
-        "--front K": (
-            "report the fewest dstates of a map with at most 0, 1, … K faults (steps that are "
-            "treated as wrong), by the causal theory. If misread or slipped is set, only faults of "
-            "the kinds that are set count. The report also names the knee: the number of faults "
-            "beyond which further faults save few dstates"
         ),
         **shared.limits("the best answer so far", work=True),
         **shared.STRICT,
@@ -108,19 +98,16 @@ def run_solve(options: argparse.Namespace) -> int:
         shared.check_output(options.output, "the solution")
         shared.check_ending(options.output, ".json")
     if options.onto is not None:
-        shared.refuse(options, "--onto", "front", "jobs", "scheduler", "joint_trace")
+        shared.refuse(options, "--onto", "jobs", "scheduler", "joint_trace")
         return _onto(options)
     many = options.jobs is not None or options.scheduler is not None or len(options.traces) > 1
     if options.together:
-        shared.refuse(options, "--together", "jobs", "scheduler", "front")
+        shared.refuse(options, "--together", "jobs", "scheduler")
     elif many:
         several = "several traces, --jobs or --scheduler"
-        shared.refuse(options, several, "front", "corrections", "output", "joint_trace")
+        shared.refuse(options, several, "corrections", "output", "joint_trace")
     else:
         shared.refuse(options, "one trace", "joint_trace")
-    if options.front is not None:
-        shared.refuse(options, "--front", "corrections", "work_limit")
-        return _front(options)
     if many and not options.together:
         from ssh_abduction.cli import batch
 
@@ -342,23 +329,3 @@ def _onto(options: argparse.Namespace) -> int:
         else "\n".join(answer_lines(added, None, existing.maps[0]))
     )
     return outcome.exit_code(solution)
-
-
-def _front(options: argparse.Namespace) -> int:
-    """Print the front: the fewest dstates for each number of faults.
-
-    The exit code is 0 if the search was completed, 20 if no map has so few faults, and
-    EXIT_UNPROVEN if the search was stopped.
-    """
-    front = fault_front(
-        Trace.load(options.traces[0]),
-        shared.theory_of(options, Theory.causal()),
-        options.front,
-        options.time_limit,
-    )
-    if options.json:
-        points = [attributes_of(p, "faults", "dstates", "proven", "map") for p in front.points]
-        print(json_line(attributes_of(front, "knee", "prices") | {"front": points}))
-    else:
-        print(front_as_text(front, options.front))
-    return outcome.EXIT_UNPROVEN if front.stopped else 0 if front.points else 20

@@ -20,8 +20,7 @@ from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.output.cards import table_of_dstates
 from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.runtime import program
-from ssh_abduction.solver import Backbone, Front, Solution, Status, stretches, summary_of
+from ssh_abduction.solver import Backbone, Solution, Status, stretches, summary_of
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Choice, Comparison
@@ -88,39 +87,6 @@ def answer_lines(
         some = "" if count == held else f" (of the first {held} found)"
         yield f"\nwhat tells the maps apart{some}"
         yield from compared(compare(Listing(solution.maps, drives=solution.drives)))
-
-
-def front_as_text(front: Front, most: int) -> str:
-    """Write a front of at most `most` faults as a table, with sentences below it."""
-    if not front.points:
-        return (
-            f"no map has at most {counted(most, 'faults')}: the asserted pairs of steps (--same, "
-            "--different, --elsewhere) contradict what was seen and done; "
-            "allow more faults (--front), or assert less"
-        )
-    rows = []
-    for point in front.points:
-        faults = "; ".join(map(str, point.map.faults)) if point.map else "–"
-        shown = str(point.dstates) if point.proven else f"at least {point.dstates}"
-        knee = "knee" if point.faults == front.knee else ""
-        rows.append([point.faults, shown, knee, faults or "none"])
-    lines = [table(["faults", "dstates", "", "of the map found"], rows)]
-    if front.prices:
-        lines.append(
-            f"if a fault costs more than {front.prices[0]:g} and less than {front.prices[1]:g} "
-            "dstates, the map at the knee costs least of these"
-        )
-    elif not front.stopped and len({point.dstates for point in front.points}) == 1:
-        lines.append("no fault saves a dstate")
-    elif not front.stopped:
-        lines.append("no knee: each further fault saves about as many dstates")
-    if front.stopped:
-        why = "interrupted" if program.raised else "stopped by the time limit"
-        lines.append(f"{why} at {counted(front.points[-1].faults, 'faults')}")
-    if first := front.points[0].faults:
-        fewest = counted(first, "faults")
-        lines.append(f"no map with the asserted pairs of steps has fewer than {fewest}")
-    return "\n".join(lines)
 
 
 def headline(solution: Solution, explanation: Explanation | None) -> str:

@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.derived_paths import sides_of as sides_of
     from ssh_abduction.solver.derived_regions import find_regions as find_regions
     from ssh_abduction.solver.derived_regions import with_regions as with_regions
-    from ssh_abduction.solver.entry import Front as Front
-    from ssh_abduction.solver.entry import Point as Point
-    from ssh_abduction.solver.entry import fault_front as fault_front
     from ssh_abduction.solver.entry import find_backbone as find_backbone
     from ssh_abduction.solver.entry import obeyed as obeyed
     from ssh_abduction.solver.entry import solve as solve

@@ -131,8 +131,7 @@ class Search:
             self._asked_weigh = theory.weigh if theory else "auto"
             if within and self.theory.has_faults:
                 raise TheoryError(
-                    f"within: expected 0 where faults are allowed, got {within}; leave within "
-                    "out, or compare the numbers of faults (--front)"
+                    f"within: expected 0 where faults are allowed, got {within}; leave within out"
                 )
             check_rules(self.theory)
             self.trace = trace

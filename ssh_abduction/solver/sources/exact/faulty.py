@@ -66,10 +66,8 @@ MORE_NAMES = 2  # names added to a view whose rest is used
 class FaultyEngine:
     """The engine for the causal theory with faults. It minimises dstates and faults together."""
 
-    def __init__(self, task: Task, most_faults: int | None = None) -> None:
-        """Begin without steps. If given, up to `most_faults` faults cost nothing."""
+    def __init__(self, task: Task) -> None:
         self.asker = Asker(task.watch)
-        self._most_faults = most_faults
         self.size = 0
         self.bound: int | None = None
         self._task = task
@@ -83,7 +81,7 @@ class FaultyEngine:
         self._best: int | None = None  # cost of the incumbent, in tenths of dstates
         self._known: SSHMap | None = None  # the incumbent
         self._explainer = Explainer(self._seen, self._actions, self._price)
-        self._control = FaultyControl(task, self.asker, self._price, most_faults, self._raise_bound)
+        self._control = FaultyControl(task, self.asker, self._price, self._raise_bound)
 
     def next_size(self, failed: int) -> int:
         return len(self._task.trace)
@@ -110,7 +108,7 @@ class FaultyEngine:
                     yield explained
             # 2. An answer for all steps is a minimal map.
             if self._control.is_done:
-                self._raise_bound([self._best or 0 if answer is None else answer.cost], free=True)
+                self._raise_bound([self._best or 0 if answer is None else answer.cost])
                 if answer is None:
                     return
                 if self._control.has_all and not answer.is_open:
@@ -130,7 +128,7 @@ class FaultyEngine:
 
     def _is_better(self, found: Found) -> bool:
         """Make a map the incumbent if it costs less. Return whether it does."""
-        cost = self._cost_of(found)
+        cost = found.cost[0]
         if self._best is not None and cost >= self._best:
             return False
         self._best, self._known = cost, found.map
@@ -138,13 +136,9 @@ class FaultyEngine:
 
     def _bound_by_blocks(self) -> None:
         """Raise the bound by blocks of a long trace, up to the cost of the incumbent."""
-        if self.size >= LONG and self._best is not None and self._most_faults is None:
+        if self.size >= LONG and self._best is not None:
             blocks = Blocks(self._seen, self._actions, self._price, self.asker.watch)
             self._raise_bound([blocks.bound(self._best)])
-
-    def _cost_of(self, found: Found) -> int:
-        """Return the cost of a map as clingo counts it, in tenths of dstates."""
-        return found.cost[0] if self._most_faults is None else 10 * len(found.map.dstates)
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         given = set()
@@ -170,12 +164,9 @@ class FaultyEngine:
         )
         return True
 
-    def _raise_bound(self, bound: Sequence[int], *, free: bool = False) -> None:
-        """Take over a bound that clingo proved. A bound for the given steps holds for all steps.
-
-        If some faults cost nothing, bounds count only at the end of a question (`free`).
-        """
-        if bound and (free or self._most_faults is None):
+    def _raise_bound(self, bound: Sequence[int]) -> None:
+        """Take over a bound that clingo proved. A bound for the given steps holds for all steps."""
+        if bound:
             self.bound = max(self.bound or 0, bound[0])
 
     def _machine(self, answer: FaultyAnswer) -> tuple[dict[int, int], PartialMachine]:
@@ -218,7 +209,6 @@ class FaultyEngine:
         shown = {s for t, s in enumerate(labels) if shows[s] == self._seen[t]}
         if (
             any(steps and kind not in self._price for kind, steps in kinds.items())
-            or (self._most_faults is not None and len(explained.faults) > self._most_faults)
             or set(labels) - shown
             or any(
                 all(labels[one.first] == labels[one.second] for one in together)
@@ -290,23 +280,19 @@ class FaultyControl:
         task: Task,
         asker: Asker,
         price: Mapping[str, Sequence[int]],
-        most_faults: int | None,
         on_bound: Callable[[Sequence[int]], None],
     ) -> None:
         """Begin without any given step.
 
-        `price` has, for each kind of fault, its cost at each step in tenths of dstates. If
-        `most_faults` is given, a map may have up to this many faults, and they cost nothing.
-        `on_bound` is called with each bound that clingo proves.
+        `price` has, for each kind of fault, its cost at each step in tenths of dstates. `on_bound`
+        is called with each bound that clingo proves.
         """
         self.names = dict.fromkeys(range(max(task.log.seen) + 1), NAMES)
         self.given: set[int] = set()
         self.full: set[int] = set()
         self.forbidden: list[Collection[Equality]] = []
         self._asker, self._log = asker, task.log
-        self._most_faults, self._on_bound = most_faults, on_bound
-        free = most_faults is not None
-        self._price = {kind: [0] * len(some) if free else some for kind, some in price.items()}
+        self._price, self._on_bound = price, on_bound
         # What the present control was given: names and full steps, steps in their order, batches,
         # and the number of forbidden sets.
         self._began: tuple[dict[int, int], set[int]] = {}, set()
@@ -392,9 +378,6 @@ class FaultyControl:
             ]
         control.add(f"batch_{batch}", [], "\n".join(found))
         control.ground([(f"batch_{batch}", []), ("more", number_symbols(batch))])
-        if self._most_faults is not None:
-            faults = "T,misread : misreads(T); T,slipped : slips(T)"
-            control.tell(f":- #count {{ {faults} }} > {self._most_faults}.")
         self._steps += new
         self._batches += 1
 
