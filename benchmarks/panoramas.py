@@ -28,6 +28,7 @@ import numpy as np
 import streets
 from arguments import seeds_from
 from numpy.typing import NDArray
+from panorama_camera import Camera, Paint
 from paper_experiments import VIEWS_ALONE, one_to_one, true_dstates
 from scipy.optimize import linear_sum_assignment
 from sklearn.base import BaseEstimator, TransformerMixin
@@ -42,7 +43,6 @@ from perception.images import images_of
 from perception.quality import uncertainty_coefficient
 from perception.recognition import PlaceRecogniser
 from perception.views import ViewClusterer
-from simulator.panorama import Camera, Paint
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from simulator.cruise import FreeSpace, drive_along
 from simulator.driver import STILL, TURNS, Corridors, Driver, Tolerance
 from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.junctions import ACTIONS, Pilot
-from simulator.panorama import Camera
 from simulator.robot import (
     DIGITS,
     EVERY,
@@ -53,6 +52,21 @@ STRAIGHT = 0.2
 # With larger errors, the control laws may fail: relative errors of motions and odometry, and errors
 # of ranges in metres.
 NOISY, BLURRED = 0.1, 0.03
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """A camera whose images are logged instead of ranges; benchmarks/panorama_camera.py has one."""
+
+    shape: tuple[int, ...]  # rows, columns and colours of an image
+
+    def hour(self, share: float) -> float:
+        """Return the hour of the day when a share of the drive, from 0 to 1, is over."""
+
+    def shot(
+        self, world: World, pose: Pose, rng: np.random.Generator, hour: float, walls: int | None
+    ) -> Array:
+        """Take an image in a world whose first `walls` segments are no clutter."""
 
 
 def simulate(

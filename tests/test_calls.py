@@ -23,7 +23,6 @@ import numpy as np
 import pytest
 
 from perception.views import ViewClusterer
-from simulator.panorama import Camera, Light, Paint
 from simulator.plans import Door, Plan, Room
 from simulator.robot import Laser
 from simulator.tours import simulate
@@ -129,13 +128,6 @@ RIGHT: dict[str, set[str]] = {
     "MapPath.left_of.place": {"huge"},
     "MapPath.right_of.place": {"huge"},
     "Belief.found_again.sure": {"3.5", "huge"},
-    "Camera.hours": {"[1, 2]"},
-    "Camera.noise": {"3.5"},
-    "Camera.scene.pose": {"array"},
-    "Camera.shot.pose": {"array"},
-    "Camera.scene.walls": {"huge"},
-    "Camera.shot.walls": {"huge"},
-    "Camera.shot.hour": {"3.5"},
     "Certificate.to_dict.trace": {"None"},
     "Closure.last": {"huge"},
     "Corrections.known_in.drives": EMPTY,
@@ -147,7 +139,6 @@ RIGHT: dict[str, set[str]] = {
     "Cost.preferred_by.theory": {"None"},
     "Explorer.explore.steps": {"huge"},
     "Odometry.of.value": {"dict"},
-    "Paint.keys.walls": {"huge"},
     "Plan.rooms": EMPTY,
     "Plan.doors": EMPTY,
     "SSHMap.right_of.direction": {"-1"},
@@ -325,7 +316,6 @@ def receiver(name: str) -> Any:
         "Belief": lambda: made["localiser"].prior,
         "BootstrapLearner": lambda: made["learner"],
         "Bound": lambda: solution.bound,
-        "Camera": Camera,
         "Certificate": lambda: solution.certificate,
         "Chances": Chances,
         "Comparison": lambda: made["comparison"],
@@ -346,7 +336,6 @@ def receiver(name: str) -> Any:
         "Odometry": Odometry,
         "OnlineMapper": lambda: made["mapper"],
         "Page": lambda: view_page(solution),
-        "Paint": Paint,
         "Plan": lambda: made["plan"],
         "Route": lambda: route(solution, 0, 1),
         "SSHMap": lambda: ssh_map,
@@ -462,7 +451,6 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "drives": drives_of(trace),
         "length": 2,
         "listing": made["listing"],
-        "light": Light.at(12.0),
         "name": "name",
         "path": "written",
         "place": 0,

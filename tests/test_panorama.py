@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from panorama_camera import CEILING, EYE, STEEPEST, Camera, Light, Paint
 from paper_experiments import VIEWS_ALONE, one_to_one, true_dstates
 from sklearn.cluster import AgglomerativeClustering
 from sklearn.preprocessing import FunctionTransformer
@@ -21,11 +22,9 @@ from perception.recognition import recogniser
 from perception.store import load, save
 from perception.views import ViewClusterer
 from simulator.errors import SimulatorError
-from simulator.panorama import CEILING, EYE, STEEPEST, Camera, Light, Paint
 from simulator.robot import BEARINGS, Laser
 from simulator.tours import simulate
 from simulator.world import World
-from ssh_abduction.cli import main
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.learner import BootstrapLearner
 
@@ -42,7 +41,7 @@ def test_wall_heights_in_a_panorama_fit_laser_ranges(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(Paint, "texture", lambda self, key: np.array([0.9] * 13 + [0.0] * 36))
-    monkeypatch.setattr("simulator.panorama.ACROSS", 1)
+    monkeypatch.setattr("panorama_camera.ACROSS", 1)
     world, pose = World.named("taylor-hall"), (13.0, 0.2, 0.3)
     camera = Camera(rows=2000 // 4, columns=360, noise=0, exposure=0)
     bright = camera.scene(world, pose, Light(np.ones(3)))[..., 0] > 0.7
@@ -246,57 +245,3 @@ def test_recogniser_of_panoramas_survives_a_round_trip(run: Trace, tmp_path: Pat
     images, labels = images_of(run), np.arange(len(run)) % 8
     save(recogniser(features=features_of(run)).fit(images, labels), tmp_path / "r.skops")
     assert load(tmp_path / "r.skops").predict(images).tolist() == labels.tolist()
-
-
-@pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
-def test_shell_simulates_and_clusters_panoramas(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    drive = (
-        "simulate notched-rectangle --tours 1 --set images=panoramas --set textures=repeated --set "
-        "hours=8,18 --set stars=false"
-    )
-    assert main([*drive.split(), "-o", "run.jsonl"]) == 0
-    trace = Trace.load("run.jsonl")
-    assert (trace.images, trace.extra["panorama"], trace.steps[3].image) == (
-        "run.npz",
-        [24, 180, 3],
-        3,
-    )
-    camera = Camera(paint=Paint(repeated=True), hours=(8.0, 18.0))
-    inline = simulate(ROOM, 1, stars=False, camera=camera)
-    assert np.array_equal(images_of(trace), images_of(inline))
-    assert main(["cluster", "run.jsonl", "--set", "k_max=5", "-o", "views.jsonl"]) == 0
-    assert main(["solve", "views.jsonl", "--json"]) == 0
-    out = capsys.readouterr().out
-    (tmp_path / "maps.json").write_text(out[out.index("{") :])
-    assert main(["train", "maps.json", "views.jsonl", "-o", "r.skops"]) == 0
-    assert main(["recognise", "r.skops", "run.jsonl", "--json"]) == 0
-    assert len(set(capsys.readouterr().out.split("[")[1].strip("]\n ").split(", "))) == 8
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--set hours=7,19", "hours: expected --set images=panoramas beside it"),
-        ("--set textures=unique", "textures: expected --set images=panoramas beside it"),
-        (
-            "--set images=panoramas --set hours=noon",
-            "hours: expected two hours with a comma between them, such as 7,19, got 'noon'",
-        ),
-        (
-            "--set images=panoramas --set hours=7,nan",
-            "camera.hours: expected a number from 0 to 24, got nan",
-        ),
-    ],
-)
-def test_simulate_refuses_wrong_camera_options(
-    options: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert (
-        main(["simulate", "notched-rectangle", *options.split(), "-o", str(tmp_path / "x.jsonl")])
-        == 1
-    )
-    assert message in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())

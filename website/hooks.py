@@ -94,8 +94,6 @@ THEMES: dict[str, tuple[str, ...]] = {
         "robot_logs.log_mapper.solved",
         "simulator.tours.simulate",
         "simulator.world.World",
-        "simulator.panorama.Camera",
-        "simulator.panorama.Paint",
         "simulator.plans.Plan",
         "perception.errors.PerceptionError",
         "simulator.errors.SimulatorError",

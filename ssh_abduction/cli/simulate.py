@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +16,9 @@ from ssh_abduction.cli.shared import OUTPUT_TRACE, check_ending, write_trace
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named, printable
 from ssh_abduction.data.files import save_file, shipped, write_file
-from ssh_abduction.data.trace import Trace
 
 if TYPE_CHECKING:
     from perception.readers.scans import Scan
-    from simulator.panorama import Camera
     from simulator.robot import RecordedDrive
 
 # The formats of logs, by the ending of a file.
@@ -43,10 +41,6 @@ SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").
         "--route ACTIONS": (
             "drive this route instead of the world's own: actions (travel, right, left, around, or "
             "the name of a lift) or, with --format, names of places, separated by commas"
-        ),
-        "--set images {ranges,panoramas}=ranges": (
-            "log laser ranges, or panoramas of a 360-degree camera, which are written to an .npz "
-            "file beside the trace"
         ),
         "--set stars true|false=true": "whether to log the openings seen at each place",
         "--set every METRES": (
@@ -71,14 +65,6 @@ SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").
         ),
         "--set bend_error DEGREES=0": (
             "drift of the reported heading to the left, in degrees per metre"
-        ),
-        "--set textures {unique,repeated}": (
-            "whether each wall has its own texture in panoramas, or parallel walls share one "
-            "(default: unique)"
-        ),
-        "--set hours FROM,TO": (
-            "hours of the day at which the drive begins and ends, which decide the light in "
-            "panoramas (default: 12,12)"
         ),
         **OUTPUT_TRACE,
     }
@@ -108,11 +94,8 @@ def run_simulate(options: argparse.Namespace) -> int:
     noise = Body.odometry if options.odometry_noise is None else options.odometry_noise
     body = Body(odometry=noise, scale=options.scale_error, bend=math.radians(options.bend_error))
     world = World.named(options.world).with_choices(options.start, options.route, options.reach)
-    camera = _camera(options)
-    how: dict[str, Any] = {"stars": options.stars, "every": options.every, "camera": camera}
+    how: dict[str, Any] = {"stars": options.stars, "every": options.every}
     trace = simulate(world, options.tours, options.seed, body=body, **how)
-    if camera and options.output != "-":
-        trace = _with_table(trace, options.output)
     write_trace(
         trace, options.output, f"{counted(len(trace), 'images')} of {printable(world.name)}"
     )
@@ -128,9 +111,6 @@ def _drive(options: argparse.Namespace) -> RecordedDrive:
     from simulator.world import World
 
     for name, given in (
-        ("images=panoramas", options.images != "ranges"),
-        ("textures", options.textures is not None),
-        ("hours", options.hours is not None),
         ("stars=false", not options.stars),
         ("-o -", options.output == "-"),
     ):
@@ -188,41 +168,6 @@ def scans_of(drive: RecordedDrive) -> Iterator[Scan]:
     rows = zip(drive.ranges, *told, strict=True)
     for line, (ranges, odometry, pose, time) in enumerate(rows, 1):
         yield Scan(ranges, laser, tuple(odometry), tuple(pose), time, line)
-
-
-def _camera(options: argparse.Namespace) -> Camera | None:
-    """Make the camera that the options ask for; None for laser ranges. Raises AbductionError."""
-    from simulator.panorama import Camera, Paint
-
-    if options.images == "ranges":
-        for name in ("textures", "hours"):
-            if getattr(options, name) is not None:
-                raise AbductionError(
-                    f"--{name}: expected --set images=panoramas beside it, as "
-                    "ranges show no light; add that"
-                )
-        return None
-    paint = Paint(repeated=options.textures == "repeated")
-    if options.hours is None:
-        return Camera(paint=paint)
-    try:
-        begin, end = (float(hour) for hour in options.hours.split(","))
-    except ValueError:
-        raise AbductionError(
-            "hours: expected two hours with a comma between them, such as 7,19, got "
-            f"{options.hours!r}; write two"
-        ) from None
-    return Camera(paint=paint, hours=(begin, end))
-
-
-def _with_table(trace: Trace, target: str) -> Trace:
-    """Move the panoramas of a trace to an .npz file beside it. Images are then indices into it."""
-    from perception.images import images_of, save_images
-
-    path = Path(target).with_suffix(".npz")
-    save_images(path, images_of(trace))
-    steps = tuple(replace(step, image=i) for i, step in enumerate(trace.steps))
-    return replace(trace, steps=steps, images=path.name)
 
 
 @verb({"-o --output FOLDER=examples": "folder to write"})
