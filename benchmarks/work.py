@@ -4,7 +4,7 @@
 
 Prints a table in Markdown with a row for each family of mazes and machines, and for each trace that
 is given, which is solved by the theory of `map`. At 1, a unit is a second of this processor. The
-weights in `ssh_abduction/solver/work.py` were chosen by this table.
+weights in `ssh_abduction/runtime/clock.py` were chosen by this table.
 """
 
 from __future__ import annotations

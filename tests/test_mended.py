@@ -20,7 +20,7 @@ from ssh_abduction.explain.no_map import explain
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.mending import Mending
 from ssh_abduction.solver.search import clash_in, late_clash
-from ssh_abduction.solver.sources.symbolic.sketched import mended_sketch
+from ssh_abduction.solver.sources.symbolic.sketch import mended_sketch
 from ssh_abduction.theory.settle import settle
 
 NOISE = Odometry(along=0.05, across=0.02, heading=0.01)

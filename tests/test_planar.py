@@ -23,8 +23,7 @@ from ssh_abduction.checker.evidence import Edges
 from ssh_abduction.data.maps import DState
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.sources.exact import choosing, prefixes
-from ssh_abduction.solver.sources.symbolic.sketch import sketches_of
-from ssh_abduction.solver.sources.symbolic.sketched import first_contradiction
+from ssh_abduction.solver.sources.symbolic.sketch import first_contradiction, sketches_of
 from ssh_abduction.theory.evidence import Equality, Planar
 from ssh_abduction.theory.planarity import can_be_drawn, is_planar
 from ssh_abduction.theory.settle import settle

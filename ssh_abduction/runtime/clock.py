@@ -32,6 +32,15 @@ Item = TypeVar("Item")
 # The work of a turn of a loop that looks at the clock, in microunits, if it names no other number;
 # of a turn of a short loop over steps; and of a turn that compares all pairs of many steps.
 TURN, SHORT_TURN, LONG_TURN = 800, 80, 8000
+# What else weighs as work, fitted to the processor time of mazes, offices and logs of robots
+# (`benchmarks/work.py` measures it again): a conflict of clasp in a small program, what the square
+# of the number of atoms adds to each conflict, and an answer of clasp, in units.
+CONFLICT, CONFLICT_OF_SQUARE, ANSWER = 3e-5, 6.5e-13, 2e-3
+# An iteration of a least-squares fit of poses, and what each displacement adds, in microunits.
+FIT, FIT_OF_ONE = 900, 8
+# An atom that clingo grounds, and a call of `@go_on` by which it asks whether to go on, in
+# microunits.
+ATOM, ASKED = 18, 2
 MICRO = 1_000_000  # microunits in a unit; whole numbers add up to the same sum in each order
 
 # Seconds between two checks of the clock and of Ctrl-C while clingo is busy. Limits may be exceeded

@@ -23,10 +23,12 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch, processor_clock
 from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.schedule import turn
 from ssh_abduction.solver.sources.exact.engine import Task
-from ssh_abduction.solver.sources.symbolic.sketch import Sketch, sketch_beyond, sketches_of
-from ssh_abduction.solver.sources.symbolic.sketched import (
+from ssh_abduction.solver.sources.symbolic.sketch import (
+    Sketch,
     first_contradiction,
     mended_sketch,
+    sketch_beyond,
+    sketches_of,
 )
 from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
 from ssh_abduction.solver.values import Found

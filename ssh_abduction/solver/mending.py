@@ -35,7 +35,7 @@ from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.faulty import FaultyEngine
 from ssh_abduction.solver.sources.metric.wrong_displacements import wrong_displacements
 from ssh_abduction.solver.sources.symbolic.merging import Merging
-from ssh_abduction.solver.sources.symbolic.sketched import mended_sketch
+from ssh_abduction.solver.sources.symbolic.sketch import mended_sketch
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.settle import Problem

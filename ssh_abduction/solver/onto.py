@@ -50,8 +50,7 @@ from ssh_abduction.solver.solution.result import Solution
 from ssh_abduction.solver.solution.weighed import IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE
 from ssh_abduction.solver.sources.metric.completing import completed
-from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond
-from ssh_abduction.solver.sources.symbolic.sketched import first_contradiction
+from ssh_abduction.solver.sources.symbolic.sketch import first_contradiction, sketch_beyond
 from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups

@@ -13,11 +13,21 @@ from typing import Any, TypeVar
 import clingo
 
 from ssh_abduction.runtime import program
-from ssh_abduction.runtime.clock import MICRO, POLL, count_work, counts_work, now
+from ssh_abduction.runtime.clock import (
+    ANSWER,
+    ASKED,
+    ATOM,
+    CONFLICT,
+    CONFLICT_OF_SQUARE,
+    MICRO,
+    POLL,
+    count_work,
+    counts_work,
+    now,
+)
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.solver.values import Grounding
-from ssh_abduction.solver.work import ANSWER, ASKED, ATOM, CONFLICT, CONFLICT_OF_SQUARE
 from ssh_abduction.theory import encodings
 
 # After grounding, clasp prepares the program and cannot be stopped. This takes about these

@@ -30,9 +30,8 @@ from scipy.special import gammaincc
 from ssh_abduction.data.groups import first_index_of
 from ssh_abduction.data.maps import Fit, Pose
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.clock import FIT, FIT_OF_ONE, look_at_clock
 from ssh_abduction.solver.geometry.equations import Equations
-from ssh_abduction.solver.work import FIT, FIT_OF_ONE
 from ssh_abduction.theory.evidence.loops import vectors_turned
 
 Array: TypeAlias = NDArray[np.float64]
