@@ -22,7 +22,6 @@ from ssh_abduction.solver.geometry import ranking
 from ssh_abduction.solver.geometry.fit import fit
 from ssh_abduction.solver.sources.symbolic.merging import Merging
 from ssh_abduction.solver.sources.symbolic.sketch import Sketch, sketches_of
-from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.theory.evidence import Planar
 from ssh_abduction.theory.settle import Problem, settle
 
@@ -167,16 +166,3 @@ def test_each_sketch_gets_a_share_of_the_time() -> None:
     ):
         assert solve(trace, time_limit=1e-6).status is Status.UNKNOWN
     assert len(tried) == len(sketches_of(trace.steps[0], settle(trace).theory))
-
-
-def test_certificate_is_written_without_comparing_each_pair() -> None:
-    """The trace has 3,000 steps with different views. No pair of these needs a word."""
-    trace = Trace.from_steps([*range(3000), 0, 1], ["travel"] * 3000 + ["right"])
-    asked = []
-    with patch(
-        "ssh_abduction.solver.steps.certificate._word",
-        side_effect=lambda *pair: asked.append(pair) or ("travel",),
-    ):
-        written = Certificate((*range(3000), 3001)).to_dict(trace)
-    assert [pair[1:] for pair in asked] == [(1, 3001)]
-    assert written["words"] == [[1, 3001, ["travel"]]]

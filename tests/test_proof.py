@@ -38,7 +38,7 @@ def test_checker_accepts_the_certificates_of_solve(trace: Trace) -> None:
     ):
         solution = solve(trace, theory, max_maps=1)
         assert solution.certificate is not None
-        bound = check_bound(trace, solution.certificate.to_dict(trace))
+        bound = check_bound(trace, solution.certificate.to_dict())
         assert bound.faults == ()
         if solution.cost is not None:  # boundary axioms leave some random traces without any map
             proven = bound.dstates + len(bound.refuted)
@@ -123,22 +123,7 @@ def certified() -> tuple[Trace, dict[str, Any]]:
     trace = wandering(1, rooms=12, length=300, views=3)
     certificate = solve(trace, Theory.causal(), max_maps=1).certificate
     assert certificate is not None
-    return trace, certificate.to_dict(trace)
-
-
-def test_check_bound_refuses_a_changed_word() -> None:
-    trace, data = certified()
-    assert len(data["words"]) > 5
-    for entry in data["words"]:
-        word = entry[2]
-        entry[2] = word[:-1]
-        assert check_bound(trace, data).faults == (
-            f"steps {entry[0]} and {entry[1]}: {' '.join(word[:-1]) or 'nothing done'} leads to "
-            "the same view from both",
-        )
-        entry[2] = [*word[:-1], "fly"]
-        assert "'fly' is not what was done at step" in check_bound(trace, data).faults[0]
-        entry[2] = word
+    return trace, certificate.to_dict()
 
 
 def test_check_bound_refuses_a_clique_with_one_more_step() -> None:
@@ -158,8 +143,6 @@ def test_check_bound_refuses_a_clique_with_one_more_step() -> None:
         ({"clique": "all"}, "different steps"),
         ({"clique": None}, "different steps"),
         ({"refuted": [3]}, "without a gap"),
-        ({"words": [[0, 1]]}, "expected \\[step, step"),
-        ({"words": 7}, "expected \\[step, step"),
     ],
 )
 def test_malformed_certificates_are_errors(change: dict[str, Any], word: str) -> None:

@@ -205,8 +205,8 @@ def test_unknown_views_do_not_separate_rivals() -> None:
 def test_certificate_does_not_use_unknown_views() -> None:
     trace = Trace.from_steps(["a", None, "b"], ["go", "go"])
     assert solve(trace, Theory.causal()).certificate is None
-    assert check_bound(trace, {"clique": [0, 1], "words": [], "refuted": []}).faults
-    assert not check_bound(trace, {"clique": [0, 2], "words": [], "refuted": []}).faults
+    assert check_bound(trace, {"clique": [0, 1], "refuted": []}).faults
+    assert not check_bound(trace, {"clique": [0, 2], "refuted": []}).faults
 
 
 def test_compare_accepts_different_views_at_unknown_steps() -> None:

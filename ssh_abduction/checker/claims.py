@@ -361,10 +361,9 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
 
     A certificate has a clique: steps that are pairwise at different dstates. Two steps are at
     different dstates if the same actions lead from them to different views, because a dstate has
-    one view and actions are deterministic. So for each pair of the clique, the check follows a word
-    (a list of actions) from both steps along the trace and compares the views at the end. The
-    certificate lists the words of pairs. If it has no words at all, the word of a pair is the
-    actions that the trace has after both steps. Raises MapError if the certificate is malformed.
+    one view and actions are deterministic. So for each pair of the clique, the check follows the
+    actions that the trace has after both steps, and compares the views at the end. Raises MapError
+    if the certificate is malformed.
     """
     an_object("certificate", certificate, MapError, mend="write it with solve --json")
     if "clique" not in certificate:
@@ -386,34 +385,8 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
             f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got "
             f"{brief(refuted)}; write it with solve --json"
         )
-    words = _words_of(certificate) if "words" in certificate else None
-
-    def word(i: int, j: int) -> Sequence[str]:
-        """Return the word that should show that two steps are at different dstates."""
-        return _common_actions(trace, i, j) if words is None else words.get(frozenset((i, j)), [])
-
-    pairs = combinations(steps, 2)
-    faults = [fault for i, j in pairs if (fault := _not_apart(trace, i, j, word(i, j)))]
+    faults = [fault for pair in combinations(steps, 2) if (fault := _not_apart(trace, *pair))]
     return ProvenBound(len(steps), tuple(refuted), tuple(faults))
-
-
-def _words_of(certificate: Mapping[str, Any]) -> dict[frozenset[int], list[str]]:
-    """Return the word of each pair of steps for which a certificate has one."""
-    words = certificate["words"]
-    found: dict[frozenset[int], list[str]] = {}
-    for entry in words if isinstance(words, list) else [words]:
-        if (
-            not isinstance(entry, list)
-            or len(entry) != 3
-            or not _integers(entry[:2])
-            or not isinstance(entry[2], list)
-        ):
-            raise MapError(
-                f"certificate: words: expected [step, step, [action, …]], got {brief(entry)}; "
-                "write it with solve --json"
-            )
-        found[frozenset(entry[:2])] = entry[2]
-    return found
 
 
 def _integers(values: Any) -> bool:
@@ -443,13 +416,9 @@ def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
     return word[: len(trace) - 1 - max(i, j)]
 
 
-def _not_apart(trace: Trace, i: int, j: int, word: Sequence[str]) -> str | None:
-    """Say why a word does not show that two steps are at different dstates; None if it does."""
-    for k, name in enumerate(word):
-        for step in (i + k, j + k):
-            action = trace.steps[step].action if step < len(trace) else None
-            if action is None or action.name != name:
-                return f"steps {i} and {j}: {brief(name)} is not what was done at step {step}"
+def _not_apart(trace: Trace, i: int, j: int) -> str | None:
+    """Say why the trace does not show that two steps are at different dstates; None if it does."""
+    word = _common_actions(trace, i, j)
     if not _look_different(trace.steps[i + len(word)], trace.steps[j + len(word)]):
         led = (
             "the same view"

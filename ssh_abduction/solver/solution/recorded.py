@@ -39,8 +39,7 @@ class Support:
         joins: The joins (pairs of steps at one place or dstate) of the first map that rest on
             minimality alone, as in the file; None if the solution was not read from one.
         drives: The drives of the trace, as in the file.
-        written: The fields "certificate", with the actions that distinguish its steps, and
-            "explanation", which says why there is no map, as far as they are in the file.
+        explanation: Why there is no map, as in the file; None if it does not say so.
     """
 
     basis: Basis | None = None
@@ -50,18 +49,16 @@ class Support:
     proof: Certificate | None = None
     joins: tuple[Join, ...] | None = None
     drives: tuple[Drive, ...] = ()
-    written: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    explanation: Mapping[str, Any] | None = field(default=None, hash=False)
 
     @classmethod
     def of_file(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Support:
         """Read these data from the record of a solution. Raises MapError if a field is wrong."""
         drives, weighed = drives_in(read, record, steps), record.get("weighed")
-        written = {
-            name: read.mapping(record[name], name)
+        proof, why = (
+            None if record.get(name) is None else read.mapping(record[name], name)
             for name in ("certificate", "explanation")
-            if record.get(name) is not None
-        }
-        proof = written.get("certificate")
+        )
         return cls(
             warnings=read.each(record, "warnings", read.text_called("a sentence"), True),
             weighed=Weighed.from_dict(read, weighed, steps, drives) if weighed else None,
@@ -69,7 +66,7 @@ class Support:
             proof=None if proof is None else _certificate(read, proof, steps),
             joins=_joins(read, record, steps, drives),
             drives=drives,
-            written=written,
+            explanation=why,
         )
 
     @property

@@ -577,10 +577,9 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
     `count` maps were written. The solution need not hold them.
     """
     support, effort, trace = solution.support, solution.effort, solution.trace
-    drives, certificate = support.drives, dict[str, Any](support.written.get("certificate", {}))
+    drives = support.drives
     if support.joins is None:  # not from a file
         drives = () if trace is None else with_fingerprints(trace)
-        certificate = solution.certificate.to_dict(trace) if solution.certificate else {}
     listed = solution.minimal_listed
     end: dict[str, Any] = {
         "status": solution.status.value,
@@ -601,14 +600,14 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         "backbone": None if listed and count == 1 else backbone,
         "levels": solution.within and [*solution.levels],
         "minimal_listed": bool(solution.within) and listed and not solution.complete,
-        "certificate": certificate,
+        "certificate": solution.certificate,
         "weighed": solution.weighed,
         "by_minimality": solution.by_minimality,
         "stopped": solution.stopped,
         "partial": solution.partial,
         "evidence": effort.evidence,
         "warnings": solution.warnings,
-        "explanation": support.written.get("explanation"),
+        "explanation": support.explanation,
     }
     # The levels of an answer without maps are an empty list.
     said = {name: value for name, value in more.items() if value or value == []}

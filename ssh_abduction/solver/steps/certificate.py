@@ -6,32 +6,23 @@
 >>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
 >>> solve(trace).certificate.clique
 (0, 1, 2, 3)
->>> solve(trace).certificate.words(trace)[0, 2]
-('travel',)
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Sequence
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from typing import Any
 
-from ssh_abduction.data.errors import SolverError
-from ssh_abduction.data.groups import gathered
-from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.theory.speedups import CAUSAL
 
 # Steps that are apart (the same actions lead from them to different views) are different dstates
 # by these axioms.
 RESTS_ON = CAUSAL
-# Write a certificate with its words only if they have at most this many actions together, which are
-# some megabytes. The number of actions may grow with the cube of the number of steps. A checker can
-# compute the words again.
-WRITTEN = 500_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,48 +50,9 @@ class Certificate:
         """The proven lower bound on the number of dstates of a map."""
         return len(self.clique) + len(self.refuted)
 
-    def words(self, trace: Trace) -> dict[tuple[int, int], tuple[str, ...]]:
-        """Return the words that distinguish the steps of the clique.
-
-        The word of two steps is the sequence of actions that leads from both to different views. It
-        is empty if their own views differ.
-
-        Returns:
-            For each pair of steps (the earlier one first) the names of the actions.
-
-        Raises:
-            SolverError: Two steps of the clique are not distinguished in this trace.
-        """
-        checked_trace(trace)
-        return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
-
-    def to_dict(self, trace: Trace | None) -> dict[str, Any]:
-        """Return the certificate as plain data: "clique", "refuted", and perhaps "words".
-
-        Pairs of steps with different views need no word, so they are left out.
-
-        Args:
-            trace: The trace, for the words. If it is None, or the words have more than WRITTEN
-                actions together, there are no words.
-        """
-        written: dict[str, Any] = {"clique": list(self.clique), "refuted": list(self.refuted)}
-        if trace is None:
-            return written
-        checked_trace(trace)
-        words, actions = list[list[Any]](), 0
-        for i, j in self._pairs_alike(trace):
-            words.append([i, j, list(_word(trace, i, j))])
-            actions += len(words[-1][2])
-            if actions > WRITTEN:
-                return written
-        return {**written, "words": words}
-
-    def _pairs_alike(self, trace: Trace) -> Iterator[tuple[int, int]]:
-        """Yield only the pairs of steps of the clique that show the same view, in order."""
-        alike = gathered((trace.steps[step].view, step) for step in self.clique)
-        for i in self.clique:
-            same = alike[trace.steps[i].view]
-            yield from ((i, j) for j in same[bisect_right(same, i) :])
+    def to_dict(self) -> dict[str, Any]:
+        """Return the certificate as plain data."""
+        return {"clique": list(self.clique), "refuted": list(self.refuted)}
 
 
 @dataclass(frozen=True)
@@ -132,21 +84,6 @@ class Basis:
     def noise(self) -> Noise | None:
         """The step that looks like noise; None if there is none."""
         return noise_in(self.views, self.actions)
-
-
-def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
-    """Return actions that lead from both steps to different views; SolverError if none do."""
-    word: list[str] = []
-    while True:
-        here, there = trace.steps[i + len(word)], trace.steps[j + len(word)]
-        if here.view != there.view:
-            return tuple(word)
-        if here.action is None or there.action is None or here.action.name != there.action.name:
-            raise SolverError(
-                f"clique: expected steps that are apart, got {i} and {j}, which may be one "
-                "dstate; leave out one of them"
-            )
-        word.append(here.action.name)
 
 
 # None of this many first steps is called noise, as a robot may begin with new dstates only.
