@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.questions import Matter, Question
 
 # The largest number of pairs of steps, questions of a choice, and options of a choice to print.
-SHOWN_PAIRS = SHOWN_QUESTIONS = SHOWN_OPTIONS = SHOWN_WEIGHTS = 12
+SHOWN_PAIRS = SHOWN_QUESTIONS = SHOWN_OPTIONS = 12
 # Words for what two maps differ in, in singular and plural.
 NOUNS: dict[Matter, tuple[str, str]] = {
     "faults": ("fault", "faults"),
@@ -134,11 +134,6 @@ def by_displacements(solution: Solution) -> Iterator[str]:
                 f"{math.degrees(best.bend):+z.3f} degrees per metre"
             )
     yield text
-    weights = solution.weights
-    if len(weights) > 1:
-        few = [f"{weight:.2g}" for weight in weights[:SHOWN_WEIGHTS]]
-        more = [f"and {len(weights) - SHOWN_WEIGHTS} more"] if len(weights) > SHOWN_WEIGHTS else []
-        yield f"weights of the maps by displacements alone: {', '.join(few + more)}"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -113,18 +113,6 @@ def _order(ssh_map: SSHMap) -> tuple[object, ...]:
     )
 
 
-def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
-    """Return the probability of each map by displacements alone.
-
-    It is proportional to exp(-chi2/2), and the sum is 1. Empty unless all maps have a fit.
-    """
-    squares = [ssh_map.fit.chi2 for ssh_map in maps if ssh_map.fit]
-    if not squares or len(squares) < len(maps):
-        return ()
-    likely = [math.exp((min(squares) - square) / 2) for square in squares]
-    return tuple(weight / sum(likely) for weight in likely)
-
-
 def noise_warning(ssh_map: SSHMap, trace: Trace) -> str | None:
     """Return a warning if the best map contradicts the noise model of the odometry; else None."""
     fit = ssh_map.fit

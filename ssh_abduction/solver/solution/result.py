@@ -35,7 +35,6 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.output import cards
 from ssh_abduction.solver.asp.limits import Stop
-from ssh_abduction.solver.geometry.ranking import weights
 from ssh_abduction.solver.solution.recorded import (
     Support,
     bound_in,
@@ -297,14 +296,6 @@ class Solution(MapSequence):
     def summary(self) -> str:
         """A sentence that says how many minimal maps there are, and in which steps they differ."""
         return summary_of(self, self.count, self.backbone)
-
-    @property
-    def weights(self) -> tuple[float, ...]:
-        """The probability of each map by displacements alone.
-
-        The probabilities add up to 1. Empty if displacements are not used.
-        """
-        return weights(self.maps)
 
     @property
     def certificate(self) -> Certificate | None:
