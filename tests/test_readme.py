@@ -276,6 +276,23 @@ def test_figures_equal_the_output_of_the_program(name: str) -> None:
     assert (figures.FIGURES / f"{name}.svg").read_text() == figures.DRAWN[name]() + "\n"
 
 
+def test_figures_of_how_good_stand_on_the_linked_pages() -> None:
+    text = (ROOT / "docs" / "how-good.md").read_text()
+    assert len(text.split()) <= 800
+    rows = re.findall(r"^\| (.*) \|$", text, re.MULTILINE)[1:]
+    assert len(rows) > 25
+    page = ""  # a row without a link is about the page of the row above
+    for row in rows:
+        for name in re.findall(r"\.\./benchmarks/(\w+\.md)", row):
+            page = (ROOT / "benchmarks" / name).read_text()
+        assert not numbers(row) - numbers(page), row
+
+
+def numbers(text: str) -> set[str]:
+    """The numbers of a text, without those in the targets of links."""
+    return set(re.findall(r"\d[\d.,]*\d|\d", re.sub(r"\]\([^)]*\)", "]", text)))
+
+
 def test_readme_is_short_and_its_links_work_in_a_clone() -> None:
     text = README.read_text()
     assert len(text.encode()) <= 8192
