@@ -14,6 +14,7 @@ import pytest
 from perception.places.passages import STEP, doors_in, openings_in, resampled
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.building.derive import with_building
+from ssh_abduction.building.derived_paths import PRICE, best_pairings, chains_of, sides_of
 from ssh_abduction.building.directions import directions_to
 from ssh_abduction.building.telling import told
 from ssh_abduction.checker.buildings import faults_of_corridors, faults_of_paths
@@ -22,7 +23,6 @@ from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import DState, Fit, MapPath, Name, Pose, Region
 from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.robot_logs.log_maps import BARE
-from ssh_abduction.solver.derived_paths import PRICE, best_pairings, chains_of, sides_of
 
 Point = tuple[float, float]
 TRAVEL = Action.of("travel")

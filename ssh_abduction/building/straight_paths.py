@@ -15,11 +15,11 @@ from itertools import combinations
 import numpy as np
 
 from perception.places.track import wrapped
+from ssh_abduction.building.derived_paths import best_pairings, chains_of, sides_of
 from ssh_abduction.building.edges import FloorPlan, Gap, PlanEdge
 from ssh_abduction.building.travels import Array
 from ssh_abduction.data.map_parts import MapPath
 from ssh_abduction.data.odometry import radians_between
-from ssh_abduction.solver import best_pairings, chains_of, sides_of
 
 # Standard deviations of a straight joint: its bend in radians, its shift to the side in metres, and
 # the logarithm of the ratio of the widths.

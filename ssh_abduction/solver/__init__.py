@@ -12,6 +12,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ssh_abduction.solver.asp import facts as facts
     from ssh_abduction.solver.asp.control import Control as Control
+    from ssh_abduction.solver.asp.control import new_control as new_control
     from ssh_abduction.solver.asp.limits import WAITING as WAITING
     from ssh_abduction.solver.asp.limits import LimitError as LimitError
     from ssh_abduction.solver.asp.limits import Stop as Stop
@@ -25,9 +26,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.board import Judging as Judging
     from ssh_abduction.solver.costs.estimating import maps_apart as maps_apart
     from ssh_abduction.solver.costs.misfit import Misfit as Misfit
-    from ssh_abduction.solver.derived_paths import best_pairings as best_pairings
-    from ssh_abduction.solver.derived_paths import chains_of as chains_of
-    from ssh_abduction.solver.derived_paths import sides_of as sides_of
     from ssh_abduction.solver.derived_regions import find_regions as find_regions
     from ssh_abduction.solver.derived_regions import with_regions as with_regions
     from ssh_abduction.solver.entry import find_backbone as find_backbone

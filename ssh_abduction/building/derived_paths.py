@@ -17,7 +17,7 @@ from typing import Any
 
 from clingo import Function, Number
 
-from ssh_abduction.solver.asp.control import Control, new_control
+from ssh_abduction.solver import Control, new_control
 
 # The price of an end of a path, in nats. Costs of joints are rounded to 1 / UNIT nats.
 PRICE, UNIT = 4.0, 100
