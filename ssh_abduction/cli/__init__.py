@@ -27,6 +27,7 @@ from typing import Any
 
 from ssh_abduction.cli import (
     about,
+    agents,
     compare,
     correct,
     demo,
@@ -80,6 +81,7 @@ VERBS: Mapping[str, tuple[Verb, ...]] = {
         use.run_view,
         correct.run_name,
         correct.run_correct,
+        agents.run_mcp,
     ),
     "learn: recognise places from images": (
         learn.run_train,

@@ -398,14 +398,18 @@ def run_name(options: argparse.Namespace) -> int:
     The name is written to corrections.yaml beside the map, for a step at this place. Solving again
     may renumber the places, but the name stays with the place of that step.
     """
-    saved = SavedMap.load(options.maps, options.map)
-    kind, step = saved.thing_to_name(options.what)
-    file = saved.save(saved.corrections.with_name(options.name, kind, step))
-    keep_folder_whole(saved.file, "names")
-    number, name = saved.number_at(kind, step), options.name.strip()
-    where = "" if number is None else f"{named_by_number(kind, number)}, "
-    print(printable(f"{where}the {kind} of {step}, is {name!r}, in {named(file)}"))
+    print(give_name(SavedMap.load(options.maps, options.map), options.what, options.name))
     return 0
+
+
+def give_name(saved: SavedMap, what: str, name: str) -> str:
+    """Name a thing in the corrections beside its map. Returns a sentence. Raises MapError."""
+    kind, step = saved.thing_to_name(what)
+    file = saved.save(saved.corrections.with_name(name, kind, step))
+    keep_folder_whole(saved.file, "names")
+    number = saved.number_at(kind, step)
+    where = "" if number is None else f"{named_by_number(kind, number)}, "
+    return printable(f"{where}the {kind} of {step}, is {name.strip()!r}, in {named(file)}")
 
 
 # Directions on the map as it is drawn, in degrees counterclockwise from east.
@@ -492,7 +496,7 @@ class SavedMap:
         The text is a place, path or region by its number, such as "p4" or "path 2", or by its name,
         such as "kitchen"; or a step such as "monday:12", for the place where the robot was.
         """
-        if found := self._numbered_or_named(text):
+        if found := self.numbered_or_named(text):
             return found
         try:
             return "place", self.step(text)
@@ -506,7 +510,7 @@ class SavedMap:
         """The names that a person gave in the drives of this map."""
         return self.corrections.known_in(self.drives).names
 
-    def _numbered_or_named(self, text: str) -> tuple[str, str] | None:
+    def numbered_or_named(self, text: str) -> tuple[str, str] | None:
         """Find a place, path or region by its number or name, as `thing`; None for a step."""
         # A place may have two names, each of a step. So return the step of this name.
         for naming in self._names:
@@ -574,7 +578,7 @@ class SavedMap:
                 "gateway: expected a place and a direction such as 'p4 north' or 'monday:12 left', "
                 f"got {brief(text)}; write both"
             )
-        if way not in COMPASS and self._numbered_or_named(where.strip()):
+        if way not in COMPASS and self.numbered_or_named(where.strip()):
             raise MapError(
                 f"gateway: expected {', '.join(COMPASS)} after a place, got {brief(way)}; take one "
                 f"of them, or name a step, such as '{step} left'"

@@ -7,8 +7,10 @@ help text.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import inspect
+import math
 import re
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
@@ -51,6 +53,17 @@ def seed(text: str) -> int:
             f"expected a whole number from 0 to {2**32 - 1}, got {text!r}; give one"
         )
     return int(text)
+
+
+def pose(text: str) -> tuple[float, float, float]:
+    """Convert "X,Y,DEGREES" to numbers. Raise ArgumentTypeError for anything else."""
+    with contextlib.suppress(ValueError):
+        x, y, degrees = map(float, text.split(","))
+        if all(map(math.isfinite, (x, y, degrees))):
+            return x, y, degrees
+    raise argparse.ArgumentTypeError(
+        f"expected X,Y,DEGREES, three numbers such as 1.5,-2,90, got {text!r}; write them"
+    )
 
 
 def picture_file(text: str) -> str:

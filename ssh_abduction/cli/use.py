@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import signal
+import sys
 import tempfile
 import webbrowser
 from collections.abc import Collection, Mapping, Sequence
@@ -19,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 from ssh_abduction.cli import shared
 from ssh_abduction.cli.correct import as_corrected, correct_pair
 from ssh_abduction.cli.outcome import warn
-from ssh_abduction.cli.parsing import trace_path, verb
+from ssh_abduction.cli.parsing import pose, trace_path, verb
 from ssh_abduction.cli.text import describe, steps_in_words, table
 from ssh_abduction.data.corrections import beside
+from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.errors import (
     AbductionError,
     LocaliserError,
@@ -254,9 +256,6 @@ def run_route(options: argparse.Namespace) -> int:
 
 def _tell_way(options: argparse.Namespace, listing: Listing) -> int:
     """Print a route in words."""
-    from ssh_abduction.building.directions import directions_to
-    from ssh_abduction.online.routes import MoveGraph
-
     if options.avoid or options.by:
         flag = "--avoid" if options.avoid else "--by"
         raise MapError(f"{flag}: expected none with --words, which tells the shortest way; drop it")
@@ -268,18 +267,34 @@ def _tell_way(options: argparse.Namespace, listing: Listing) -> int:
             "with --trace"
         )
     with said_of(listing.source, MapError):
-        graph = MoveGraph(ssh_map, "actions", listing.drives)
-        last = f"d{ssh_map.dstate_at[-1]}"
-        ends = graph.nodes(options.start or last, "from"), graph.nodes(options.goal, "to")
-        here, there = (
-            [p for node in nodes if (p := graph.course(node)[0]) is not None] for nodes, _ in ends
+        start, goal, told = way_in_words(
+            ssh_map, trace, listing.drives, options.start, options.goal
         )
-        told = directions_to(ssh_map, trace, here, there)
     if options.json:
-        print(json_line({"from": ends[0][1], "to": ends[1][1], "words": list(told)}))
+        print(json_line({"from": start, "to": goal, "words": list(told)}))
     else:
         print(printable("; ".join(told)))
     return 0
+
+
+def way_in_words(
+    ssh_map: SSHMap, trace: Trace, drives: Sequence[Drive], start: str | None, goal: str
+) -> tuple[str, str, tuple[str, ...]]:
+    """Tell the shortest way: words for its start and for its goal, and its sentences.
+
+    `start` and `goal` are as for the verb route; None for the last dstate of the robot. Raises
+    MapError.
+    """
+    from ssh_abduction.building.directions import directions_to
+    from ssh_abduction.online.routes import MoveGraph
+
+    graph = MoveGraph(ssh_map, "actions", drives)
+    last = f"d{ssh_map.dstate_at[-1]}"
+    ends = graph.nodes(start or last, "from"), graph.nodes(goal, "to")
+    here, there = (
+        [p for node in nodes if (p := graph.course(node)[0]) is not None] for nodes, _ in ends
+    )
+    return ends[0][1], ends[1][1], directions_to(ssh_map, trace, here, there)
 
 
 def _names(words: list[str] | None, given: Collection[str]) -> list[str]:
@@ -383,6 +398,14 @@ FORMATS = {
         ),
         "--set name TEXT=ssh-abduction": "the name of the map in nav2 and tmap2 files",
         "--set frame TEXT=map": "the name of the coordinate frame in nav2 and tmap2 files",
+        "--frame-of CSV": (
+            "put the map into the frame of the poses in this file: lines place,x,y or step,x,y or "
+            "time,x,y, each perhaps with yaw in radians. How far the points are off is printed"
+        ),
+        "--origin X,Y,DEGREES": (
+            "put the map into another frame, in which its first dstate has this pose",
+            {"type": pose},
+        ),
     }
 )
 def run_export(options: argparse.Namespace) -> int:
@@ -402,6 +425,8 @@ def run_export(options: argparse.Namespace) -> int:
     chosen = listing.maps[listing.number(options.map)]
     if options.to == "osm":
         chosen = _built(options, listing, chosen)
+    if options.frame_of is not None or options.origin is not None:
+        chosen = _framed(options, listing, chosen)
     how: dict[str, Any] = {"level": options.level, "hide_undecided": options.hide_undecided}
     how["turns"] = None if options.trace is None else Trace.load(options.trace)
     with said_of(listing.source, MapError):
@@ -412,6 +437,21 @@ def run_export(options: argparse.Namespace) -> int:
         write_map(options.output, text.removesuffix("\n"))
     warn(export_doubts(chosen, options.to, **how))
     return 0
+
+
+def _framed(options: argparse.Namespace, listing: Listing, ssh_map: SSHMap) -> SSHMap:
+    """Move a map into the frame that the options name, and print the residuals."""
+    from ssh_abduction.output.map_frames import MapFrame, frame_of_file
+
+    if options.frame_of is None:
+        return MapFrame.of_origin(*options.origin).moved(ssh_map)
+    if options.origin is not None:
+        raise AbductionError("--origin: expected none with --frame-of; leave out one of the two")
+    trace = shared.mapped_trace(options.maps, options.trace)
+    drives = listing.drives or (drives_of(trace) if trace else ())
+    frame = frame_of_file(options.frame_of, ssh_map, trace, drives)
+    print(printable(f"{named(options.frame_of)}: {frame.sentence}"), file=sys.stderr)
+    return frame.moved(ssh_map)
 
 
 @verb(

@@ -183,11 +183,11 @@ def _on_each_other(ssh_map: SSHMap, poses: Sequence[Pose]) -> tuple[Pose, ...]:
         }
         turn, shift = fitted_motion([*lifts], [*lifts.values()])
         for s in members:
-            found[s] = _turned(poses[s], turn, turn * at[s] + shift)
+            found[s] = turned_pose(poses[s], turn, turn * at[s] + shift)
     return tuple(found)
 
 
-def _turned(pose: Pose, turn: complex, at: complex) -> Pose:
+def turned_pose(pose: Pose, turn: complex, at: complex) -> Pose:
     """Turn a pose by the direction of a number, and put it at a position."""
     xx, xy, yy = pose.spread
     mean, off = (xx + yy) / 2, complex((xx - yy) / 2, xy) * turn * turn
