@@ -85,20 +85,20 @@ def walkers(poses: Array, times: Array, chance: np.random.Generator) -> Array:
     return np.stack(found, axis=1)
 
 
-def walls_seen(segments: Array, pose: Array, reach: float) -> Array:
-    """The distances in metres to walls along the beams."""
+def walls_seen(segments: Array, pose: Array, reach: float, bearings: Array = BEARINGS) -> Array:
+    """The distances in metres to walls along beams, which are at `bearings` radians."""
     low, high = (np.minimum, np.maximum)
     ends, others = segments[:, :2], segments[:, 2:]
     near = (low(ends, others) <= pose[:2] + reach) & (high(ends, others) >= pose[:2] - reach)
-    found = meetings(segments[near.all(axis=1)], pose[None], BEARINGS)
+    found = meetings(segments[near.all(axis=1)], pose[None], bearings)
     return np.asarray(found.min(axis=2, initial=np.inf)[0])
 
 
-def circles(people: Array, pose: Array) -> Array:
-    """The distances in metres to people along the beams. They step aside for the robot."""
+def circles(people: Array, pose: Array, bearings: Array = BEARINGS) -> Array:
+    """The distances in metres to people along beams. They step aside for the robot."""
     off = people - pose[:2]
     off *= np.maximum(1.0, NEAR / np.maximum(np.hypot(*off.T), 1e-9))[:, None]
-    beams = np.stack([np.cos(BEARINGS + pose[2]), np.sin(BEARINGS + pose[2])])
+    beams = np.stack([np.cos(bearings + pose[2]), np.sin(bearings + pose[2])])
     along = off @ beams
     square = RADIUS**2 - (off**2).sum(axis=1)[:, None] + along**2
     hit = (square > 0) & (along > 0)

@@ -13,7 +13,7 @@ from test_distinctive import log_of
 from perception.places import closures, local_map
 from perception.places.closures import VisitMatch, find_closures, uncertainty
 from perception.places.distinctive import WINDOW, Visit, Way, find_visits
-from perception.places.following import ScanMotion, Surfaces
+from perception.places.following import Followed, ScanMotion, Surfaces
 from perception.places.local_map import CELL, LocalScene, Match, PackedPatch, Patch, Turned, match
 from perception.places.tracing import closure_of, to_trace
 from perception.places.track import Track, odometer_covariance, points_turned
@@ -228,9 +228,16 @@ def test_visit_is_matched_with_a_limited_number_of_earlier_ones(
     assert {closing.last for closing in found} == {closing.last for closing in every}
 
 
-@pytest.mark.parametrize(("points", "turned"), [(20, 0.0), (300, -45.0)])
-def test_few_points_do_not_outweigh_the_odometer(points: int, turned: float) -> None:
-    """The scan shows a wall 45 degrees to the left of one that looks the same."""
+@pytest.mark.parametrize(
+    ("points", "free", "turned"), [(20, 3.0, 0.0), (300, 3.0, -45.0), (300, 8.0, 0.0)]
+)
+def test_neither_few_points_nor_points_in_free_space_outweigh_the_odometer(
+    points: int, free: float, turned: float
+) -> None:
+    """The scan shows a wall 45 degrees to the left of one that looks the same.
+
+    The last keyframe saw `free` metres of free space.
+    """
 
     def wall(bearing: float) -> Surfaces:
         ahead = Surfaces(
@@ -240,7 +247,9 @@ def test_few_points_do_not_outweigh_the_odometer(points: int, turned: float) -> 
         return ahead.moved((0.0, 0.0, bearing))
 
     onward = (0.2, 0.0, 0.0)
-    scan = Scan(np.ones(1), LaserScanner(0.0, 0.1, 1, 10.0), onward)
-    motion = ScanMotion(scan, wall(math.pi / 4), [wall(0.0)], (0.0, 0.0, 0.0), onward, onward)
+    begin, laser = (0.0, 0.0, 0.0), LaserScanner(-math.pi, math.radians(2), 180, 10.0)
+    scan, last = Scan(np.full(180, 3.0), laser, onward), Scan(np.full(180, free), laser, begin)
+    keys = [Followed(last, begin)]
+    motion = ScanMotion(scan, wall(math.pi / 4), [wall(0.0)], begin, onward, onward, keys)
     pose, _, _ = motion.matched(onward, odometer_covariance(onward))
     assert math.degrees(pose[2]) == pytest.approx(turned, abs=6)
