@@ -15,6 +15,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from coarse import every_second_beam
+from scipy.spatial import cKDTree
 
 from perception.places.passages import resampled
 from perception.readers.scans import RobotLog
@@ -215,3 +216,20 @@ def test_report_calls_no_join_sure_if_the_search_ended_early(house: LogMap) -> N
             "Doubtful joins"
         ].lines
         assert line.startswith(said)
+
+
+def test_walls_of_a_live_map_are_those_of_its_local_maps(house: LogMap) -> None:
+    """A live mapper keeps no ranges. Its walls are near those that the scans show."""
+    best = house.solution.maps[0]
+    with patch("ssh_abduction.robot_logs.log_ground._walls", lambda *_: np.zeros((0, 2))):
+        live = ground_of(house.log, house.imported, best)
+    whole = ground_of(house.log, house.imported, best)
+
+    def points(found: dict[str, Any]) -> np.ndarray[Any, np.dtype[np.float64]]:
+        rows, columns = np.nonzero(pixels(found["walls"]))
+        left, top, *_ = found["box"]
+        return np.stack([left + columns * GRAIN, top - rows * GRAIN], axis=1)
+
+    apart = cKDTree(points(whole)).query(points(live))[0]
+    assert len(apart) > 300
+    assert np.mean(apart < 0.25) > 0.9

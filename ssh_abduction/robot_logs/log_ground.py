@@ -13,6 +13,7 @@ right at its first step, and is beside the one before.
 from __future__ import annotations
 
 import base64
+import math
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
@@ -23,10 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.places.importing import Imported
+from perception.places.local_map import CELL
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.odometry import Pose, moved
+from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.output.layout import drawable_poses
 
 Array = NDArray[np.float64]
@@ -58,11 +60,12 @@ def ground_of(log: RobotLog, imported: Imported, ssh_map: SSHMap | None) -> dict
     """
     poses = laid_over(imported, ssh_map)
     walls = _walls(log, poses)
+    if not len(walls):  # a live mapper keeps no ranges
+        walls = np.array([poses[0][:2], *_patched(imported, poses)])
     scans = [visit.scan for visit in imported.visits]
     passed = np.floor(imported.track.way / APART).astype(int)
     kept = sorted({*scans, *imported.starts, *np.flatnonzero(np.diff(passed, prepend=-1)).tolist()})
     way = np.array([poses[scan][:2] for scan in kept])
-    walls = walls if len(walls) else way[:1]  # a live mapper keeps no scans
     corner, last = walls.min(axis=0), walls.max(axis=0)
     cells = np.rint((walls - corner) / GRAIN).astype(int)
     seen = np.zeros((cells.max(axis=0) + 1)[::-1], bool)
@@ -114,6 +117,17 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
         squares, numbers = np.unique(every, axis=0, return_inverse=True)
         counts = np.bincount(numbers.ravel(), weights).astype(float)
     return np.asarray(squares[counts > (1 if len(log) > 100 else 0)] * GRAIN)
+
+
+def _patched(imported: Imported, poses: Sequence[Pose]) -> Iterator[Array]:
+    """Yield the points, (2,) metres, at which the local maps of the visits show walls."""
+    for visit in imported.visits:
+        if visit.patch is not None:
+            before = displacement_between(tuple(imported.track.poses[visit.scan]), (0.0, 0.0, 0.0))
+            x, y, turn = moved(poses[visit.scan], before)
+            cos, sin = math.cos(turn), math.sin(turn)
+            points = np.argwhere(visit.patch.occupied) * CELL + visit.patch.corner
+            yield from points @ np.array([(cos, sin), (-sin, cos)]) + (x, y)
 
 
 def _ends(scan: Scan, pose: Pose) -> Array:

@@ -35,7 +35,9 @@ from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import json_line, mend_of, parse_json, read_file, write_file
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.words import counted
+from ssh_abduction.page.content import Ground
 from ssh_abduction.page.html import view_page
+from ssh_abduction.robot_logs.log_ground import ground_of
 from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solver import LimitError, Watch, in_process, solve
 
@@ -146,10 +148,11 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
     ssh_map = solution.maps[0]
     first = {int(step.extra["visit"]): t for t, step in reversed([*enumerate(done.trace.steps)])}
     places = (ssh_map.dstates[ssh_map.dstate_at[first[k]]].place for k in range(len(done.visits)))
+    ground = Ground(ground_of(task.log, done, ssh_map))
     files = {
         "trace.jsonl": "".join(f"{line}\n" for line in done.trace.to_lines()).encode(),
         "maps.json": f"{json_line(solution.to_dict())}\n".encode(),
-        "page.html": view_page(solution, done.trace).html.encode(),
+        "page.html": view_page(solution, done.trace, ground=ground).html.encode(),
     }
     return FoundMap(
         tuple(visit.scan for visit in done.visits),
