@@ -319,7 +319,7 @@ def test_mazes_with_stars_have_true_maps(seed: int, counts: tuple[int, int, int]
     assert solution.bound.dstates == counts[0] <= len(set(walk.truth))
     assert solution.certificate
     proven = check_bound(
-        walk.trace, solution.certificate.to_dict(walk.trace)
+        walk.trace, solution.certificate.to_dict()
     )  # by actions and views alone, of steps rather than nodes
     assert not proven.faults
     assert proven.dstates + len(proven.refuted) == counts[0]

@@ -176,7 +176,7 @@ def test_maze_without_stars_has_the_known_maps(off: str) -> None:
     assert set(found.maps) == maps_of_a_maze()
     assert found.complete
     assert found.certificate
-    bound = check_bound(trace, found.certificate.to_dict(trace))
+    bound = check_bound(trace, found.certificate.to_dict())
     assert bound.faults == ()
     assert found.cost
     assert bound.dstates + len(bound.refuted) == found.cost.dstates

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from ssh_abduction.cli import shared
 from ssh_abduction.cli.import_log import check_folder
 from ssh_abduction.cli.outcome import warn
-from ssh_abduction.cli.parsing import Rows, verb
+from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import AbductionError, named, said_of
-from ssh_abduction.data.maps import SSHMap, check_labels
+from ssh_abduction.data.maps import check_labels
 from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.learning.runner_up import SECONDS, runner_up, second_map
 from ssh_abduction.solver import solve
@@ -182,20 +182,26 @@ def true_dstate_names(traces: Sequence[Trace]) -> list[str] | None:
     return [str(name) for name in found] if all(name is not None for name in found) else None
 
 
-# A map and a trace whose images get the dstates of the map as labels.
-LABELLED: Rows = {
-    **shared.maps_and_trace(" with images"),
-    "--map I": (
-        "the number of the map that gives the labels, from 1, or its id (default: use only labels "
-        "on which all maps agree)"
-    ),
-}
+@verb(
+    {
+        **shared.maps_and_trace(" with images"),
+        "--map I": (
+            "the number of the map that gives the labels, from 1, or its id (default: use only "
+            "labels on which all maps agree)"
+        ),
+        "-o --output FILE.skops!": "file for the trained recogniser",
+    }
+)
+def run_train(options: argparse.Namespace) -> int:
+    """Train a recogniser on the labels of a map.
 
-
-def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
-    """Return the images of labelled steps, their dstates, the map, and a transformer of images."""
+    Train a nearest-neighbour recogniser on the images of a trace. The label of an image is its
+    dstate in a map.
+    """
     from perception.appearance import features_of
     from perception.images import images_of
+    from perception.recognition import recogniser
+    from perception.store import save
     from ssh_abduction.learning.learner import labels_of
 
     options.trace = shared.trace_of(options)
@@ -204,26 +210,12 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
     number = None if options.map is None else listing.number(options.map)
     is_proven = listing.minimal is not None or listing.complete is None
     labels = labels_of(listing.maps, number, listing.complete is not False, is_proven)
-    chosen = listing.maps[number or 0]
-    check_labels(chosen, trace, named(options.maps))
+    check_labels(listing.maps[number or 0], trace, named(options.maps))
     sure = labels >= 0
-    return images_of(trace)[sure], labels[sure], chosen, features_of(trace)
-
-
-@verb({**LABELLED, "-o --output FILE.skops!": "file for the trained recogniser"})
-def run_train(options: argparse.Namespace) -> int:
-    """Train a recogniser on the labels of a map.
-
-    Train a nearest-neighbour recogniser on the images of a trace. The label of an image is its
-    dstate in a map.
-    """
-    from perception.recognition import recogniser
-    from perception.store import save
-
-    images, labels, _, features = _mapped(options)
-    save(recogniser(features=features).fit(images, labels), options.output)
+    images = images_of(trace)[sure]
+    save(recogniser(features=features_of(trace)).fit(images, labels[sure]), options.output)
     print(
-        f"{counted(len(set(labels.tolist())), 'dstates')} learnt from "
+        f"{counted(len(set(labels[sure].tolist())), 'dstates')} learnt from "
         f"{counted(len(images), 'images')} in {named(options.output)}"
     )
     return 0

@@ -186,17 +186,12 @@ class VisitLabels:
 
     def improving(self) -> Iterator[list[int]]:
         """Yield the dstates of all nodes, as few as possible; nothing if the rules allow none."""
-        if (labels := self.fewest()) is not None:
-            yield labels
-
-    def fewest(self) -> list[int] | None:
-        """Find the dstates of all nodes, as few as possible; None if the rules allow none."""
         if not self._found:
             labels = self._first_labels(self._best_answer)
             if labels is None:
-                return None
+                return
             self._found.append(labels)
-        return list(self._found[0])
+        yield list(self._found[0])
 
     def _first_labels(self, ask: Callable[[], list[Pair] | None]) -> tuple[int, ...] | None:
         """Return the labels of all nodes from the first answer that is a map of the chart.
@@ -239,7 +234,7 @@ class VisitLabels:
         fewest dstates. So it soon proves that there are no others.
         """
         program = self.program
-        if self.fewest() is None or (self.bound or 0) > dstates:
+        if not any(self.improving()) or (self.bound or 0) > dstates:
             return
         yield from map(list, self._found)
         while True:
