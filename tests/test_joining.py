@@ -155,7 +155,7 @@ def test_sights_compare_gateways_by_bearing(
     stars = [Star(tuple(Gateway(b, 0.75) for b in seen)) for seen in ((0.0, 5.0, 90.0), bearings)]
     trace = together([Trace((Step("a", star=star.gateways),)) for star in stars])
     settled = settle(trace, Theory(changed=changed, star="gateways", boundary="none")).theory
-    sights = Sights(trace, settled, misreads=False)
+    sights = Sights(trace, settled)
     assert sights.are_alike(*sights.shown) == is_one
 
 
@@ -214,7 +214,7 @@ def test_causal_drives_that_cannot_share_a_dstate_stay_apart_for_sure() -> None:
         rivals = [rival_of(ssh_map, 0.0) for ssh_map in joined(problem)]
         assert len({*groups_of_drives(rivals[-1].dstates, [0] * 4 + [1] * 4)}) == 2
         assert may_join_more(problem, rivals[-1:]) == may_join
-        sights = Sights(problem.trace, problem.theory, misreads=False)
+        sights = Sights(problem.trace, problem.theory)
         assert sights.are_alike(sights.shown[0], sights.shown[4]) == may_join
 
 
@@ -335,7 +335,7 @@ def test_search_joins_drives_even_if_some_views_are_unknown(
 
 def test_unknown_view_does_not_join_two_known_ones() -> None:
     trace = Trace.from_steps(["a", None, "b"], ["travel", "travel"])
-    sights = Sights(trace, settle(trace, Theory(star="none")).theory, misreads=False)
+    sights = Sights(trace, settle(trace, Theory(star="none")).theory)
     a, unknown, b = (dict.fromkeys([number], math.inf) for number in sights.seen)
     assert sights.may_be_one(a, unknown)
     assert sights.may_be_one(a | unknown, a)

@@ -281,6 +281,22 @@ def test_onto_without_time_keeps_the_existing_map() -> None:
     assert solution[0].dstate_at[: len(around)] == standing[0].dstate_at
 
 
+def test_onto_corrects_misread_views_of_the_map() -> None:
+    moved = [(10.0, 0.0, 0.0), (0.0, 0.0, 1.5708)] * 8
+    rounds = Trace.from_steps(
+        [*"abcdefgh", *"abXdefgh", "a"], ["travel", "left"] * 8, displacements=moved, name="monday"
+    )
+    bare = Theory(star="none", boundary="none")
+    standing = solve(rounds, bare.replace(misread=0.9), work_limit=2)
+    assert [(fault.kind, fault.step) for fault in standing[0].faults] == [("misread", 10)]
+    tuesday = Trace.from_steps("cde", ["travel", "left"], displacements=moved[:2], name="tuesday")
+    joint = solve(tuesday, onto=standing, work_limit=2)
+    assert joint.trace is not None
+    assert joint.trace.steps[10].view == "c"
+    assert joint[0].faults == ()
+    assert len(joint[0].dstates) == 8
+
+
 def test_onto_refuses_a_solution_without_map_or_trace() -> None:
     standing = solve(MONDAY)
     for bad in (replace(standing, trace=None), replace(standing, maps=())):
@@ -288,7 +304,7 @@ def test_onto_refuses_a_solution_without_map_or_trace() -> None:
             solve(TUESDAY, onto=bad)
     with pytest.raises(SolverError, match="onto: expected a Solution, got"):
         solve(TUESDAY, onto=standing[0])  # type: ignore[arg-type]
-    faulty = solve(MONDAY, Theory.causal().replace(misread=1.0))
+    faulty = solve(MONDAY, Theory.causal().replace(slipped=1.0))
     with pytest.raises(SolverError, match="expected a map without faults"):
         solve(TUESDAY, onto=faulty)
     with pytest.raises(SolverError, match="expected a map without faults"):

@@ -155,6 +155,21 @@ def test_dstates_at_one_place_are_merged_only_if_that_lowers_the_cost() -> None:
     assert min(saved) >= 0 < max(saved)
 
 
+def test_smoothing_treats_a_view_of_a_log_as_misread() -> None:
+    """One view of the second round is wrong. A view of little confidence costs little."""
+    trace, places = rounds(6, 4, 0)
+    steps, wrong = list(trace.steps), len(trace) - 8
+    steps[wrong] = replace(steps[wrong], view="w", confidence=0.9)
+    trace = replace(trace, steps=tuple(steps))
+    problem = settle(trace, log_maps.BARE)
+    ssh_map = smoothed_map(problem, Log(trace, problem.theory, problem.pairs))
+    assert ssh_map is not None
+    assert is_true(ssh_map, places)
+    assert [(fault.kind, fault.step, fault.cost) for fault in ssh_map.faults] == [
+        ("misread", wrong, 0.4)
+    ]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_each_part_of_a_trace_is_smoothed(seed: int) -> None:
     """No displacement or closure leads to the last five steps, but a known link does."""

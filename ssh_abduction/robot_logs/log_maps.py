@@ -2,8 +2,8 @@
 
 The default theory uses neither stars (a star is the set of ways out that are seen at a place) nor
 sides of paths. In real buildings a way out is too often misread, and paths that bend have no
-defined sides. Displacements distinguish places. A place may have two distinctive states in one
-direction, because the view is sometimes misread, too.
+defined sides. Displacements distinguish places. Views come from clustering, so each may be misread,
+at a price that grows with its confidence.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from ssh_abduction.building.derive import with_building
 from ssh_abduction.data.checks import all_instances
 from ssh_abduction.data.corrections import Corrections
 from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -50,7 +51,7 @@ from ssh_abduction.solver import (
     with_correction_warnings,
     with_names,
 )
-from ssh_abduction.theory.fields import PATHS
+from ssh_abduction.theory.fields import FAULT, PATHS
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
@@ -84,7 +85,11 @@ BACK = 0.01
 # Nothing tells which travels go straight on, so the maps have edges and no paths.
 # The errors of odometry and of matches have heavy tails: two true returns can fit badly together.
 # Their misfit has a price, and does not forbid them (joint=1).
-BARE = Theory.topological().replace(star="none", boundary="none", without=PATHS, joint=1)
+# Views come from clustering. So each may be misread, at the log odds of its confidence in nats.
+# Their clusters still differ sometimes, so a place may have two dstates in one direction.
+BARE = Theory.topological().replace(
+    star="none", boundary="none", without=PATHS, joint=1, misread=round(math.log(99) / FAULT, 2)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +226,20 @@ def work_for(log: RobotLog, imported: Imported) -> float:
     return SHARE * drove
 
 
+def _chosen(theory: Theory | None, choices: Mapping[str, Any]) -> Theory:
+    """Return a theory with some fields chosen; None stands for BARE.
+
+    Where the choices do not go with misread views, views are right. So they are with stars.
+    """
+    if theory is not None:
+        return theory.replace(**choices)
+    trusting = {"misread": 0.0, **choices}
+    try:
+        return BARE.replace(**choices if choices.get("star", "none") == "none" else trusting)
+    except TheoryError:
+        return BARE.replace(**trusting)
+
+
 def how_it_ended(solution: Solution, allowed: float) -> str | None:
     """Say why a search found no map or proved none minimal; None if there is nothing to say."""
     if solution.status is Status.UNSATISFIABLE:
@@ -348,7 +367,7 @@ def map_log(
     # 1. Trace and theory: import the logs, and obey the corrections.
     log, imported = _imported(log, name, width, tell)
     seconds, notes = dict(imported.seconds), imported.notes
-    trace, chosen = imported.trace, (theory or BARE).replace(**choices or {})
+    trace, chosen = imported.trace, _chosen(theory, choices or {})
     if corrections is not None:
         trace, chosen = obeyed(corrections, trace, chosen)
         imported = replace(imported, trace=trace)

@@ -155,9 +155,10 @@ class Candidates:
         return found if found is not None and self._judging.accepts(found) else None
 
     def _trusts_drives(self) -> bool:
-        """Whether beams suit the trace, and no lifts or faults within a drive are allowed."""
+        """Whether beams suit the trace, without lifts or faults of a drive but misread views."""
         theory = self._task.theory
-        allows = theory.lifts or theory.replace(changed=0.0).has_faults
+        misread = 0.0 if theory.star == "none" else theory.misread
+        allows = theory.lifts or theory.replace(changed=0.0, misread=misread).has_faults
         return not allows and self.beam(1) is not None
 
     def go_on(self, beam: Beam) -> None:

@@ -85,9 +85,9 @@ def joint_with(
 ) -> tuple[Trace, Theory, SSHMap]:
     """Return the joint trace of old and new drives, its theory, and the map to keep.
 
-    The existing solution has the trace of the old drives, and its first map is the one to keep. Its
-    theory is the default. Raises SolverError without a map or trace, or if the theory allows
-    faults.
+    The existing solution has the trace of the old drives, and its first map is the one to keep.
+    Misread views of this map are corrected. Its theory, without faults, is the default. Raises
+    SolverError without a map or trace, or with other faults.
     """
     mend = "take what solve returned, or Solution.load"
     solution = an_instance("onto", existing, Solution, SolverError, mend=mend)
@@ -96,8 +96,10 @@ def joint_with(
             "onto: expected a solution with a map and its trace, got one without; read a file that "
             "solve -o wrote"
         )
-    theory = checked_theory(theory or solution.theory.replace(returns=0))
-    if theory.has_faults or solution.theory.has_faults or solution.maps[0].faults:
+    theory = checked_theory(theory or solution.theory.replace(returns=0, misread=0.0))
+    ssh_map, known = solution.maps[0], solution.trace
+    faults = theory.has_faults or solution.theory.replace(misread=0.0).has_faults
+    if faults or any(fault.kind != "misread" for fault in ssh_map.faults):
         raise SolverError(
             "onto: expected a map without faults, got a theory that allows them; solve all drives "
             "together"
@@ -107,7 +109,11 @@ def joint_with(
             "onto: expected a topological theory, as the existing map has places, got "
             "level=causal; take Theory.topological() (solve --theory topological)"
         )
-    return together([solution.trace, trace]), theory, solution.maps[0]
+    steps = list(known.steps)
+    for fault in ssh_map.faults:
+        steps[fault.step] = replace(steps[fault.step], view=fault.expected)
+    known = replace(known, steps=tuple(steps))
+    return together([known, trace]), theory, replace(ssh_map, faults=())
 
 
 def solve_onto(

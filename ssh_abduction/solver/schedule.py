@@ -90,7 +90,7 @@ WEIGHED = (
     ),
     SourceTurn(
         "smoothing",
-        "displacements, no lifts or faults within a drive",
+        "displacements, no lifts, no faults within a drive but misread views without stars",
         "After a long way, poses that fit all closures are better than a beam.",
         until=0.3,
     ),
@@ -139,7 +139,7 @@ WEIGHED = (
     ),
     SourceTurn(
         "local changes",
-        "displacements, no faults",
+        "displacements, no faults but misread views without stars",
         "A map that a beam has missed mostly differs from the best one in one visit.",
         share=0.3,
     ),

@@ -26,6 +26,11 @@ WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
 # A fault that costs as much as one dstate has the probability exp(-FAULT), if maps are compared by
 # cost in nats.
 FAULT = 5.0
+# A view that the theory trusts is misread with the probability exp(-MISREAD): one in 33. As often,
+# a part of the building that repeats another part shows something else.
+MISREAD = 3.5
+# Two dstates of a place face one way if their headings differ by less than this many radians.
+ONE_WAY = 0.4
 # The axioms that a fault of each kind may break. Speed-ups cannot rely on them.
 EXCUSED = {
     "misread": {"functional_view", "star_pattern", "star_frame"},

@@ -18,9 +18,11 @@ import numpy as np
 from ssh_abduction.data.groups import NodeClasses, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.costs.estimating import ONE_WAY, Course
+from ssh_abduction.solver.costs.estimating import Course
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.sources.metric.completing import completed
+from ssh_abduction.solver.steps.faults import with_faults
+from ssh_abduction.theory.fields import ONE_WAY
 from ssh_abduction.theory.settle import Problem
 
 
@@ -46,6 +48,8 @@ def improved(
             of_dstate = [*dict(zip(dstates, places, strict=True)).values()]
             facing = misfit.poses(dstates, places).gaussian()[1][-len(of_dstate) :]
             found = completed(problem.trace, problem.theory, dstates, of_dstate, facing.tolist())
+            if found is not None and problem.theory.misread:
+                found = with_faults(found, problem.trace, problem.trace, problem.theory)
             if found is not None and (cost := add(found)) < nats:
                 best, nats, cheaper = found, cost, True
                 break
@@ -112,7 +116,7 @@ def _joined(
         for s in here
         for x in there
         if abs(math.remainder(facing[s] - facing[x], math.tau)) < ONE_WAY
-        and (views[s] == views[x] or None in (views[s], views[x]))
+        and (problem.theory.misread or views[s] == views[x] or None in (views[s], views[x]))
     ]
     links = [
         (s, action.name, x)

@@ -24,7 +24,7 @@ from ssh_abduction.solver.solution.weighed import Rival
 from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory.evidence.displacement import jumped
-from ssh_abduction.theory.fields import FAULT
+from ssh_abduction.theory.fields import FAULT, MISREAD, ONE_WAY
 from ssh_abduction.theory.pairs import pairs_in
 from ssh_abduction.theory.settle import Problem
 
@@ -35,11 +35,6 @@ if TYPE_CHECKING:
 Course: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
 # Computes the cost in nats of a map with these dstates and places.
 CostOf: TypeAlias = Callable[[Sequence[int], Sequence[int]], float]
-# If the theory forbids misread views, a view is still misread with the probability exp(-MISREAD):
-# one in 33.
-MISREAD = 3.5
-# Two dstates of a place face one way if their headings differ by less than this many radians.
-ONE_WAY = 0.4
 # Leave out rivals that cost CERTAIN nats more than the best map. Even a million of them together
 # have a probability of only 0.005.
 CERTAIN = 19.0

@@ -161,6 +161,7 @@ class Weighing:
     def changes(self) -> Source:
         """Return the source of local changes of the best map."""
         theory, task = self._task.theory, self._task
+        trusting = theory.replace(misread=0.0) if theory.star == "none" else theory
 
         def change() -> None:
             improved(task.problem, self._misfit, self.candidates[0].map, self._add_valid, WITHIN)
@@ -168,7 +169,7 @@ class Weighing:
 
         return Source(
             turn("local changes"),
-            lambda: bool(self.candidates) and not theory.has_faults,
+            lambda: bool(self.candidates) and not trusting.has_faults,
             change,
         )
 

@@ -279,7 +279,7 @@ class Weighed:
         said = [
             (weight, rival, [t for kind, t in rival.faults if (kind, t) not in known])
             for weight, rival in zip(self.weights, self.rivals, strict=True)
-            if any(kind == "misread" and (kind, t) not in known for kind, t in rival.faults)
+            if rival.estimated and any(kind == "misread" for kind, _ in {*rival.faults} - known)
         ]
         weight, rival, wrong = max(said, key=lambda found: found[0], default=(0.0, best, []))
         if weight < DOUBTED:

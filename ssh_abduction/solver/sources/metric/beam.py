@@ -32,7 +32,6 @@ from itertools import islice
 
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.drives import frames_of
-from ssh_abduction.data.groups import first_index_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.step import Action
 from ssh_abduction.data.trace import Trace
@@ -110,7 +109,7 @@ class Extending:
         self._place, self._dstate = problem.prior.place.tolist(), problem.prior.dstate.tolist()
         self.reckoning = HypothesisPoses(trace, problem.prior)
         self._frames = frames_of(trace)
-        self.sights = Sights(trace, self.bare, misreads=theory.misread > 0)
+        self.sights = Sights(trace, self.bare.replace(misread=theory.misread))
         self.fault = {
             kind: [FAULT * theory.fault_tenths(kind, step) / 10 for step in trace.steps]
             for kind in ("misread", "slipped", "jumped")
@@ -262,13 +261,9 @@ class Extending:
         actions = self._log.actions
         return self.reckoning.square_ahead(option.of, t, option.dstate, actions) <= 2 * DEAREST
 
-    def _doubt(self, t: int) -> float:
-        """Return the cost in nats of treating the view of step t as misread; inf if forbidden."""
-        return self.fault["misread"][t] if "misread" in self.fault else math.inf
-
     def _misread(self, found: Hypothesis, dstate: int, t: int) -> float:
         """Return by how many nats the cost of misread views grows if step t is at a dstate."""
-        seen, number, doubt = found.seen[dstate], self.sights.seen[t], self._doubt(t)
+        seen, number, doubt = found.seen[dstate], self.sights.seen[t], self.sights.doubts[t]
         if number in seen and math.isinf(doubt):
             return 0.0
         after = {**seen, number: seen.get(number, 0.0) + doubt}
@@ -302,7 +297,7 @@ class Extending:
             links = {**links, (moved.here, self._log.actions[t - 1]): there}
         # If views may be misread, each step adds its doubt. Otherwise, each view counts once.
         if number not in seen[there] or "misread" in self.fault:
-            doubt = self._doubt(t) + seen[there].get(number, 0.0)
+            doubt = self.sights.doubts[t] + seen[there].get(number, 0.0)
             seen = [*seen[:there], {**seen[there], number: doubt}, *seen[there + 1 :]]
         return replace(
             moved,
@@ -518,13 +513,7 @@ class Beam:
         trace = self._believed(found)
         if not self._fault:
             return trace
-        steps = list(trace.steps)
-        first = first_index_of(self._sights.seen)
-        for t, label in found.labels.items():
-            right = self._trace.steps[first[self._sights.right(found.seen[label])]]
-            steps[t] = replace(steps[t], view=right.view)
-            if self._bare.star in ("pattern", "frame"):
-                steps[t] = replace(steps[t], star=right.star)
+        steps = list(found.mended(trace, self._sights, self._bare).steps)
         for t, kind in found.faults:
             if kind == "slipped":
                 steps[t] = replace(steps[t], action=Action.that_slipped(t))

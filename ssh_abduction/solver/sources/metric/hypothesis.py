@@ -36,7 +36,8 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.geometry.equations import noises
 from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.sources.metric.completing import valid_map
-from ssh_abduction.solver.sources.metric.sights import Sight, Sights
+from ssh_abduction.solver.sources.metric.sights import Sight, Sights, seen_at_both
+from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.prior import Prior, spreads_of
 from ssh_abduction.theory.theory import Theory
@@ -174,7 +175,7 @@ class Hypothesis:
         links: dict[tuple[int, int], int] = {}
         shown: list[dict[int, Sight]] = [{} for _ in range(max(places) + 1)]
         for t, label in labels.items():
-            seen[label][sights.seen[t]] = math.inf
+            seen[label] = seen_at_both(seen[label], {sights.seen[t]: sights.doubts[t]})
             shown[places[label]][sights.drive[t]] = sights.shown[t]
             if t + 1 in labels:
                 links[label, log.actions[t]] = labels[t + 1]
@@ -214,12 +215,29 @@ class Hypothesis:
         least = max(ways) / 10
         return median([way for way in ways if way > least] or [1.0])
 
-    def ssh_map(self, trace: Trace, theory: Theory) -> SSHMap | None:
-        """Make the map of these steps, which are those of the trace; None if it breaks an axiom."""
+    def ssh_map(self, trace: Trace, theory: Theory, sights: Sights) -> SSHMap | None:
+        """Make the map of these steps, which are those of the trace; None if it breaks an axiom.
+
+        The theory may allow misread views, but no other faults.
+        """
+        if theory.misread:
+            mended, bare = self.mended(trace, sights, theory), theory.replace(misread=0.0)
+            found = self.ssh_map(mended, bare, sights)
+            return found and with_faults(found, trace, mended, theory)
         labels = [self.labels[t] for t in sorted(self.labels)]
         order = list(dict.fromkeys(labels))  # of first visits
         places, facing = numbered(self.places[s] for s in order), self.poses[1][order].tolist()
         return valid_map(trace, theory, numbered(labels), places, facing)
+
+    def mended(self, trace: Trace, sights: Sights, theory: Theory) -> Trace:
+        """Return the trace of these steps, where each step shows what is right at its dstate."""
+        steps = list(trace.steps)
+        for i, t in enumerate(sorted(self.labels)):
+            right = sights.example(sights.right(self.seen[self.labels[t]]))
+            steps[i] = replace(steps[i], view=right.view)
+            if theory.star in ("pattern", "frame"):
+                steps[i] = replace(steps[i], star=right.star)
+        return replace(trace, steps=tuple(steps))
 
     def beside(self, other: Hypothesis) -> Hypothesis:
         """Put a hypothesis about other steps beside this one. Their frames stay unrelated."""

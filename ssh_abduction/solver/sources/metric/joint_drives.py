@@ -97,7 +97,7 @@ class Joining:
         self.broken = 0.0
         self._problem, self._log = problem, log
         self._bare = problem.theory.replace(displacement="none", weigh="count")
-        self.sights = Sights(problem.trace, self._bare, misreads=False)
+        self.sights = Sights(problem.trace, self._bare)
         # The ways to lay one map on another.
         self._ways: _Anchors = {}
         # The ways that fit, each with its cost in nats.
@@ -247,9 +247,9 @@ class Joining:
         cost if they are one place; inf if they cannot be. Dstates coincide if they are nearer than
         `near` metres.
         """
-        may_be_one = self.sights.may_be_one
+        merging = self.sights.merging
         alike = np.array(
-            [[may_be_one(seen, others) for others in second.seen] for seen in first.seen]
+            [[merging(seen, others) == 0 for others in second.seen] for seen in first.seen]
         )
         denied = denied_pairs(self._problem.theory, first, second)
         (at, facing), (there, turned) = first.poses, second.poses
@@ -328,7 +328,7 @@ class Joining:
     def _map(self, part: Hypothesis) -> SSHMap | None:
         """Make the map of a part; None if it breaks an axiom."""
         look_at_clock()
-        return part.ssh_map(self._trace_of(part), self._bare)
+        return part.ssh_map(self._trace_of(part), self._bare, self.sights)
 
     def _trace_of(self, part: Hypothesis) -> Trace:
         """Return the trace of the drives of a part."""

@@ -37,7 +37,7 @@ from ssh_abduction.solver.sources.metric.hypothesis import (
     parts_of,
     rotated,
 )
-from ssh_abduction.solver.sources.metric.sights import Sight, Sights
+from ssh_abduction.solver.sources.metric.sights import Sight, Sights, seen_at_both
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.pairs import pairs_in
 from ssh_abduction.theory.prior import spreads_of
@@ -103,6 +103,8 @@ class Overlay:
         self._spreads = spreads_of(problem.trace).max(axis=0) + np.array([slack, slack, SLACK]) ** 2
         # What each dstate shows of itself, and of its place, in nats; and a dstate of each place.
         self._shown = problem.prior.seen[[self._step_at[s] for s in range(len(both.places))]]
+        # A view is as frequent as the rarest one that agrees, or may be misread as any other.
+        self._saved = np.max if theory.misread else np.min
         self._first = firsts(zip(both.places, range(len(both.places)), strict=True))
         links: list[dict[int, int]] = [{} for _ in both.places]
         for (s, action), x in both.links.items():
@@ -309,11 +311,12 @@ class Overlay:
                     pairs.append((state.links[s][action], there))
                 else:
                     state.links[s][action] = there
-            state.seen[s] = {**state.seen[s], **state.seen[x]}
+            state.nats += self._sights.merging(state.seen[s], state.seen[x])
+            state.seen[s] = seen_at_both(state.seen[s], state.seen[x])
             state.dstate = [s if i == x else i for i in state.dstate]
             p, q = sorted(state.place[self._both.places[i]] for i in (s, x))
             headings = self._heading[s], self._heading[x]
-            state.nats -= float(self._shown[[s, x], 0].min())
+            state.nats -= float(self._saved(self._shown[[s, x], 0]))
             if p == q:
                 self._condition([headings])
             else:
@@ -381,7 +384,7 @@ class Overlay:
         """Whether two dstates show the same, except for gateways that changed."""
         seen, sights = self._state.seen, self._sights
         first, second = (sights.shown[self._step_at[i]] for i in (s, x))
-        return sights.may_be_one(seen[s], seen[x]) and sights.are_alike(first, second)
+        return sights.merging(seen[s], seen[x]) < math.inf and sights.are_alike(first, second)
 
     def _coinciding(self, place: int) -> list[tuple[float, tuple[int, int]]]:
         """List pairs of dstates at a place that show the same and may face the same way.
@@ -432,7 +435,7 @@ def smoothed_map(problem: Problem, log: Log, begin: SSHMap | None = None) -> SSH
     one to the other. None if the map breaks an axiom.
     """
     bare = problem.theory.replace(displacement="none", weigh="count")
-    sights = Sights(problem.trace, bare, misreads=False)
+    sights = Sights(problem.trace, bare)
     whole, *parts = smoothed(problem, log, sights, begin)
     for part in parts:
         led = (
@@ -444,7 +447,7 @@ def smoothed_map(problem: Problem, log: Log, begin: SSHMap | None = None) -> SSH
         overlay = Overlay(whole, part, problem, sights)
         joined = pair is not None and overlay.merge(*pair)
         whole = overlay.part() if joined else whole.beside(part)
-    return whole.ssh_map(problem.trace, bare)
+    return whole.ssh_map(problem.trace, bare, sights)
 
 
 class KeptApart:

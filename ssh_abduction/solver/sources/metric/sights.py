@@ -38,15 +38,16 @@ class Sights:
         shown: What each step shows of its place, whichever way it faces: its star, or None without
             stars. A star of four openings is turned to a normal form.
         drive: The number of the drive of each step.
+        doubts: For each step, the nats of treating its view as misread; inf if that is forbidden.
         dearest: The most nats by which an extension of a hypothesis may cost more than its cheapest
             extension.
     """
 
-    def __init__(self, trace: Trace, theory: Theory, *, misreads: bool) -> None:
+    def __init__(self, trace: Trace, theory: Theory) -> None:
         """Read the views and stars of all steps.
 
-        The theory's field `changed`, times FAULT nats, is the cost of a changed gateway. With
-        `misreads`, stars may be wrong. Then any step may be at any place.
+        The theory's field `changed`, times FAULT nats, is the cost of a changed gateway. If it
+        allows misread views, stars may be wrong, too. Then any step may be at any place.
         """
         starts = starts_of(trace)
         shows = [
@@ -61,7 +62,10 @@ class Sights:
         self.shown = [_shown(step, star) for step in trace.steps]
         self._steps, self._star = trace.steps, theory.star
         self.drive = [bisect_right(starts, t) for t in range(len(trace))]
-        self._misreads, self._price = misreads, FAULT * theory.changed
+        self.doubts = [
+            FAULT * theory.fault_tenths("misread", step) / 10 or math.inf for step in trace.steps
+        ]
+        self._misreads, self._price = theory.misread > 0, FAULT * theory.changed
         self.dearest = DEAREST + CHANGES * self._price
 
     def changes(self, seen: Mapping[int, Sight], t: int) -> float:
@@ -86,10 +90,22 @@ class Sights:
             return first.keys() == second.keys()
         return self.misread(dict.fromkeys([*first, *second], math.inf)) == 0.0
 
+    def merging(self, first: Mapping[int, float], second: Mapping[int, float]) -> float:
+        """Return how many nats more misread views cost if two dstates are one; inf if forbidden."""
+        if not self._misreads:
+            return 0.0 if self.may_be_one(first, second) else math.inf
+        return (
+            self.misread(seen_at_both(first, second)) - self.misread(first) - self.misread(second)
+        )
+
     def right(self, seen: Mapping[int, float]) -> int:
         """Return what steps at a dstate saw rightly, if the misread views cost the least nats."""
         known = [number for number in seen if self._shows[number][0] is not None]
         return min(known or seen, key=partial(self._wrong, seen))
+
+    def example(self, number: int) -> Step:
+        """Return the first step that shows what has a number in `seen`."""
+        return self._steps[self.seen.index(number)]
 
     def _wrong(self, seen: Mapping[int, float], right: int) -> float:
         """Return the cost in nats of the views at a dstate that differ from the right one."""
@@ -236,6 +252,11 @@ def _equally_large(first: Star, second: Star) -> Iterator[tuple[Frame, Frame]]:
     """Yield the pairs of frames of two stars that have equally many gateways."""
     pairs = product(first.frames, second.frames)
     return ((frame, other) for frame, other in pairs if frame.slots == other.slots)
+
+
+def seen_at_both(first: Mapping[int, float], second: Mapping[int, float]) -> dict[int, float]:
+    """Return what steps at two dstates saw, as `Sights.misread` takes it."""
+    return {n: first.get(n, 0.0) + second.get(n, 0.0) for n in [*first, *second]}
 
 
 def _turns(frame: Frame, other: Frame) -> bool:
