@@ -12,10 +12,14 @@ import tournament
 from instances import CELL
 from pose_graphs import Fitted
 from tournament import THEORY, Judged, judged_graph, judged_map
+from truth import partition
 from wings import NOISE, WEAK, WingDrive, wings
 
-from ssh_abduction import solve
+from ssh_abduction import Theory, solve
+from ssh_abduction.checker.cost_claims import cost_of
 from ssh_abduction.data.odometry import displacement_between
+from ssh_abduction.solver.costs.misfit import Misfit
+from ssh_abduction.theory.settle import settle
 
 EXACT = replace(WEAK, along=0.001, across=0.001, heading=0.0001, turning=0.0001)
 EXACT = replace(EXACT, position=0.001, angle=0.001)
@@ -123,3 +127,21 @@ def test_saved_answers_are_not_computed_again(
         tournament.main()
     assert asked == [wings(seed).known.name for seed in (4, 5, 6)]
     assert capsys.readouterr().out.splitlines()[-1].startswith("| peer | 3 | 0 | 0 |")
+
+
+def test_repeated_wing_predicts_its_views() -> None:
+    """If the second wing looks otherwise, the true map has to pay for its views."""
+    drive = wings(0)
+    courses = partition(drive.known.dstates), partition(drive.known.places)
+    views = drive.trace.views
+    other = [f"{view}'" if drive.wing_of(t) == 2 else view for t, view in enumerate(views)]
+    nats = []
+    for trace in (drive.trace, drive.trace.with_views(other)):
+        problem = settle(trace, Theory.topological())
+        misfit = Misfit(problem)
+        nats.append(misfit.nats_of_course(*courses))
+        aliases = misfit.aliases_of(*courses)
+        assert {i for i, alias in enumerate(aliases) if alias} == drive.false
+        checked, _ = cost_of(trace, problem.theory, *courses, (), aliases)
+        assert nats[-1] == pytest.approx(checked, abs=0.01)
+    assert nats[1] > nats[0] + 10

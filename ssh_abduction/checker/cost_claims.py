@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import brief
-from ssh_abduction.data.groups import firsts
+from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Closure, Covariance, Displacement, Odometry
 from ssh_abduction.data.trace import Trace
@@ -66,8 +66,11 @@ WORK = 5 * LONGEST**3
 MARGIN = 3.0
 # The nats of a fault that costs as much as a dstate, and of an alias of false closures.
 FAULT = 5.0
-# The nats of a misread view that only a rival has, as the theory forbids it.
+# The nats of a misread view that only a rival has, as the theory forbids it. Parts of a building
+# that repeat others differ from them as often.
 SUSPECTED = 3.5
+# Where an alias lays a part on another one, dstates that face one way differ by less radians.
+TWIST = 0.4
 # The direction from one place to another is too uncertain to use if they are closer than this many
 # metres.
 NEAR = 1.0
@@ -174,6 +177,10 @@ def cost_of(
     for of, names in enumerate((dstates, at)):
         for name in set(names):
             nats += model.shown(of, [t for t, x in enumerate(names) if x == name])
+    pairs = errors.repeats(dstates, at, model.near) if aliases else ({}, {})
+    for of, names in enumerate((dstates, at)):
+        steps = gathered((name, t) for t, name in enumerate(names))
+        nats -= sum(model.repeated(of, steps[a], steps[b]) for a, b in pairs[of].items())
     for kind, step in faults:
         tenths = theory.fault_tenths(kind, trace.steps[step])
         nats += FAULT * tenths / 10 if tenths or kind != "misread" else SUSPECTED
@@ -186,6 +193,7 @@ class _Occam:
     Attributes:
         wide: The covariance of a Gaussian that is as dense at its mean as the prior, (3, 3).
         crowd: The logarithm of the number of new places: half of those of the building.
+        near: Half of the usual length of a travel, in metres.
     """
 
     def __init__(self, trace: Trace, theory: Theory) -> None:
@@ -204,11 +212,14 @@ class _Occam:
             if trace.actions[t - 1].kind == "travel" and gone:
                 usual.append(abs(gone))
         each = median(usual) ** 2 if usual else area
-        self.crowd = math.log(max(area / each / 2, 2))
+        self.crowd, self.near = math.log(max(area / each / 2, 2)), math.sqrt(each) / 2
         self.wide: Array = np.diag([area / math.tau, area / math.tau, math.tau])
         stars = [self._gateways(t) if theory.star != "none" else None for t in range(len(trace))]
         views = self._rarity(trace.views)
+        self._shows: tuple[list[Any], list[Any]] = [*zip(trace.views)], [*zip(stars)]
         if theory.level == "causal":
+            if theory.star != "none":
+                self._shows = [*zip(trace.views, stars, strict=True)], []
             both = [a + b for a, b in zip(views, self._rarity(stars), strict=True)]
             self._seen = both, [0.0] * len(trace)
         else:
@@ -231,6 +242,18 @@ class _Occam:
         """Return the nats of what steps at one dstate (of=0) or place (of=1) see."""
         pick = min if self._theory.misread or self._theory.changed else max
         return pick(self._seen[of][t] for t in steps)
+
+    def repeated(self, of: int, steps: Sequence[int], others: Sequence[int]) -> float:
+        """Return the nats saved if steps at one dstate or place see what it repeats of another."""
+        pick = min if self._theory.misread or self._theory.changed else max
+        if not self._shows[of]:
+            return 0.0
+        here, there = (pick(some, key=self._seen[of].__getitem__) for some in (steps, others))
+        first, second = self._shows[of][here], self._shows[of][there]
+        if None in (*first, *second):
+            return 0.0
+        share, odd = math.exp(-self._seen[of][here]), math.exp(-SUSPECTED)
+        return math.log(((1 - odd) * (first == second) + odd * share) / share)
 
     def _gateways(self, step: int) -> int | None:
         """Count the gateways that a step sees; None if some are unknown."""
@@ -326,6 +349,34 @@ class _Errors:
             gone = pose[i, :2] + _turned(told, pose[i, 2]) - _turned(pose[j], angle)
             if alias:
                 motions[alias - 1] = np.append(gone, angle) / MISSING
+
+    def repeats(
+        self, dstates: Sequence[int], places: Sequence[int], near: float
+    ) -> tuple[dict[int, int], dict[int, int]]:
+        """Find the dstates and the places that repeat earlier ones, by the motions of aliases.
+
+        A place repeats the nearest other place to where an alias lays it, within `near` metres.
+        """
+        pose, (_, _, _, motions) = self._poses(self._best)[1], self._parts(self._best)
+        order = {name: i for i, name in enumerate(dict.fromkeys(dstates))}
+        rank = {name: i for i, name in enumerate(dict.fromkeys(places))}
+        first = firsts((s, (t, places[t])) for t, s in enumerate(dstates))
+        at = firsts((p, pose[t, :2]) for t, p in enumerate(places))
+        pairs: tuple[dict[int, int], dict[int, int]] = {}, {}
+        for *gone, turn in MISSING * motions:
+            for p, here in at.items():
+                image = _turned(here, turn) + gone
+                off = {q: math.dist(image, there) for q, there in at.items() if q != p}
+                if not off or off[q := min(off, key=off.__getitem__)] >= near:
+                    continue
+                late, early = sorted((p, q), key=rank.__getitem__, reverse=True)
+                pairs[1].setdefault(late, early)
+                for (s, (t, sp)), (x, (u, xp)) in product(first.items(), first.items()):
+                    twist = _remainder(pose[t, 2] + turn - pose[u, 2])
+                    if (sp, xp) == (p, q) and abs(twist) < TWIST:
+                        late, early = sorted((s, x), key=order.__getitem__, reverse=True)
+                        pairs[0].setdefault(late, early)
+        return pairs
 
     def volume(self, wide: Array) -> float:
         """Compute by how much the loops are less surely predicted than by the prior, in nats.

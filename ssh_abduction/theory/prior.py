@@ -8,7 +8,7 @@ and views, integrated over the unknown poses. The prior says:
   The robot comes to each with the same probability. The positions of places are uniform over A,
   and headings are uniform over 2 pi.
 - A dstate has a view with the probability with which steps have it. So has a place its number of
-  gateways.
+  gateways. But if a part of the building repeats another part, it mostly shows the same.
 
 A displacement to a new place has the density 1/A, and there are N/2 new places. A displacement
 to a known place must agree with it: its density is that of a Gaussian with the covariance S with
@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property
 from statistics import median
 from typing import TypeAlias
@@ -39,7 +39,7 @@ from ssh_abduction.data.drives import travels_of
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Step, Trace
-from ssh_abduction.theory.fields import FAULT
+from ssh_abduction.theory.fields import FAULT, MISREAD
 from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.float64]
@@ -65,6 +65,7 @@ class Prior:
         base: For each step, what to add to the volume of a map of the steps up to it (`Poses`). A
             map in which each step is at a new place then costs what its places cost. (steps,)
         seen: The nats of what each step shows of its dstate, and of its place, (steps, 2).
+        near: Half of the usual length of a travel, in metres.
     """
 
     def __init__(self, trace: Trace, theory: Theory) -> None:
@@ -74,6 +75,7 @@ class Prior:
         self._has_places = theory.level == "topological"
         ways = travels_of(trace)
         usual = median(ways) ** 2 if ways else self.area
+        self.near = math.sqrt(usual) / 2
         self.crowd = math.log(max(self.area / (UNSEEN * usual), FEWEST))
         stays = self._has_places and "turn_stays" in theory.hard and not theory.jumped
         kinds = ["", *(action.kind for action in trace.actions)]
@@ -91,7 +93,9 @@ class Prior:
         if spreads.any():
             volume = volume - np.log(math.tau * spreads).sum(1) / 2
         self.base: Array = np.cumsum(self._apart.sum(1) + self.crowd - volume)
-        self.seen: Array = np.array([*_seen(trace, theory)]).T
+        self._shows = _shows(trace, theory)
+        self.seen: Array = np.array([*map(_nats_of, self._shows)]).T
+        self._repeats = bool(trace.closures)
         self._misreads = bool(theory.misread or theory.changed)
 
     @property
@@ -136,6 +140,23 @@ class Prior:
         )
         return math.fsum([*seen, -self.crowd * len({*places})])
 
+    def repeated(self, of: int, names: Sequence[int], pairs: Mapping[int, int]) -> float:
+        """Return the nats that `shown` saves if dstates (of=0) or places (of=1) repeat others.
+
+        `names` has the number of the dstate or place of each step, and `pairs` the number of the
+        one that it repeats.
+        """
+        pick, saved = min if self._misreads else max, 0.0
+        nats = self.seen[:, of].tolist()
+        steps = gathered(zip(names, range(len(names)), strict=True))
+        step = {name: pick(steps[name], key=nats.__getitem__) for name in {*pairs, *pairs.values()}}
+        for name, other in pairs.items():
+            here, there = (self._shows[of][step[i]] for i in (name, other))
+            if None not in (*here, *there):
+                chance, odd = math.exp(-nats[step[name]]), math.exp(-MISREAD)
+                saved += math.log((1 - odd) * (here == there) / chance + odd)
+        return saved
+
     def least(self, dstates: Sequence[int], places: Sequence[int]) -> tuple[Array, Array]:
         """Return lower bounds on what 0, 1, 2, … dstates, and places, cost.
 
@@ -145,7 +166,8 @@ class Prior:
         seen = self.seen
         if self._misreads:  # a dstate may have a more probable view than its first step
             seen = np.minimum(seen, seen.min(axis=0))
-        new = self._apart[:, ::-1] + seen
+        # What a part of the building repeats may cost nothing to show.
+        new = self._apart[:, ::-1] + seen * (not self._repeats)
         if not self._has_places:
             new = new.sum(axis=1, keepdims=True) * [1.0, 0.0]
         of_dstates, of_places = np.sort(new[[*dstates], 0]), np.sort(new[[*places], 1])
@@ -223,21 +245,19 @@ def _area(trace: Trace) -> float:
     return max(*found, box())
 
 
-def _seen(trace: Trace, theory: Theory) -> Iterator[list[float]]:
-    """Yield the nats of what each step shows of its dstate, and then of what it shows of its place.
-
-    Unknown views and stars have no cost.
-    """
+def _shows(trace: Trace, theory: Theory) -> list[list[tuple[Hashable, ...]]]:
+    """List what each step shows of its dstate, and what it shows of its place. None is unknown."""
     stars = [_star(step) if theory.star != "none" else None for step in trace.steps]
-    both: Iterable[tuple[Sequence[Hashable], ...]] = ((trace.views,), (stars,))
     if theory.level == "causal":
-        both = ((trace.views, stars), ())
-    for kinds in both:
-        nats = [0.0] * len(trace)
-        for shown in kinds:
-            share = _shares(shown)
-            nats = [sum_ + share[name] for sum_, name in zip(nats, shown, strict=True)]
-        yield nats
+        kinds = [trace.views, stars] if theory.star != "none" else [trace.views]
+        return [[*zip(*kinds, strict=True)], [() for _ in stars]]
+    return [[(view,) for view in trace.views], [(star,) for star in stars]]
+
+
+def _nats_of(shows: Sequence[tuple[Hashable, ...]]) -> list[float]:
+    """Return the nats of what each step shows. Unknown views and stars have no cost."""
+    shares = [(_shares(kind), kind) for kind in zip(*shows, strict=True)]
+    return [sum(share[kind[t]] for share, kind in shares) for t in range(len(shows))]
 
 
 def _shares(shown: Sequence[Hashable]) -> Mapping[Hashable, float]:

@@ -56,6 +56,7 @@ class Misfit:
         self._equations = Equations.of(self.trace)
         self._known: dict[_Groups, float] = {}
         self._likelihood: dict[_Groups, tuple[float, float, Aliases]] = {}
+        self._saved: dict[_Groups, float] = {}
 
     def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
         """Return a lower bound on the misfit of maps with returns, ignoring `wrong` moves.
@@ -95,7 +96,24 @@ class Misfit:
     ) -> float:
         """Return -log of the marginal likelihood if steps are at these dstates and places."""
         prior, nats = self._prior, self._explained(dstates, places, wrong)[1]
-        return nats + float(prior.base[-1]) + prior.lost(wrong) + prior.shown(dstates, places)
+        nats += float(prior.base[-1]) + prior.lost(wrong) + prior.shown(dstates, places)
+        return nats - self._repeated(dstates, places, wrong)
+
+    def _repeated(
+        self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int]
+    ) -> float:
+        """Return the nats that views and stars save where aliases lay a part on another part."""
+        groups, aliases = (
+            _groups_of(dstates, places, wrong),
+            self.aliases_of(dstates, places, wrong),
+        )
+        if not aliases:
+            return 0.0
+        if groups not in self._saved:
+            pairs = self._explaining(groups).repeats(aliases, self._prior.near)
+            named = enumerate((numbered(dstates), numbered(places)))
+            self._saved[groups] = sum(self._prior.repeated(of, x, pairs[of]) for of, x in named)
+        return self._saved[groups]
 
     def aliases_of(
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()

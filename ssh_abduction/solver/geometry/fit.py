@@ -22,8 +22,10 @@ none agrees better than a motion that is uniform over the building, one closure 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import TypeAlias
 
 import numpy as np
@@ -35,7 +37,8 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.geometry.equations import Aliases, Equations
 from ssh_abduction.solver.geometry.poses import Poses
-from ssh_abduction.theory.fields import FAULT
+from ssh_abduction.theory.evidence.loops import vectors_turned
+from ssh_abduction.theory.fields import FAULT, ONE_WAY
 from ssh_abduction.theory.prior import wide_of
 
 Array: TypeAlias = NDArray[np.float64]
@@ -103,6 +106,26 @@ class Explaining:
         other, cost = self.poses(found).likelihood(self.wide)
         cost += FAULT * _count(found)
         return (square, nats, believed) if nats <= cost else (other, cost, found)
+
+    def repeats(self, aliases: Aliases, near: float) -> tuple[dict[int, int], dict[int, int]]:
+        """Find the dstates, and the places, that repeat earlier ones: aliases lay one on the other.
+
+        Places then differ by less than `near` metres, and headings by less than ONE_WAY. Returns
+        the number of the earlier one for the number of the later one.
+        """
+        at, facing, place, motions = self.poses(aliases).laid()
+        dstates, places = dict[int, int](), dict[int, int]()
+        for *gone, turn in motions:
+            off = np.hypot(*(vectors_turned(at, turn) + gone - at[:, None]).T)
+            np.fill_diagonal(off, math.inf)
+            for p, q in enumerate(off.argmin(axis=1).tolist()):
+                if off[p, q] >= near:
+                    continue
+                places.setdefault(max(p, q), min(p, q))
+                for s, x in product(np.flatnonzero(place == p), np.flatnonzero(place == q)):
+                    if abs(math.remainder(facing[s] + turn - facing[x], math.tau)) < ONE_WAY:
+                        dstates.setdefault(int(max(s, x)), int(min(s, x)))
+        return dstates, places
 
     def poses(self, aliases: Sequence[int], kept: Collection[int] | None = None) -> Poses:
         """Collect the equations of a map with these aliases. None keeps all closures."""
