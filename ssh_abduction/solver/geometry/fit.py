@@ -36,7 +36,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.geometry.equations import Aliases, Equations
-from ssh_abduction.solver.geometry.poses import Poses
+from ssh_abduction.solver.geometry.poses import Poses, laid_with_motions
 from ssh_abduction.theory.evidence.loops import vectors_turned
 from ssh_abduction.theory.fields import FAULT, ONE_WAY
 from ssh_abduction.theory.prior import wide_of
@@ -113,7 +113,7 @@ class Explaining:
         Places then differ by less than `near` metres, and headings by less than ONE_WAY. Returns
         the number of the earlier one for the number of the later one.
         """
-        at, facing, place, motions = self.poses(aliases).laid()
+        at, facing, place, motions = laid_with_motions(self.poses(aliases))
         dstates, places = dict[int, int](), dict[int, int]()
         for *gone, turn in motions:
             off = np.hypot(*(vectors_turned(at, turn) + gone - at[:, None]).T)

@@ -174,16 +174,6 @@ class Poses:
         covariance = self._covariance(unknown, fixed, entries)
         return part, unknown[entries], covariance, squares
 
-    def laid(self) -> tuple[Array, Array, NDArray[np.int_], Array]:
-        """Return the best positions, (places, 2), headings and places of dstates, and motions.
-
-        The motions (x, y, turn) are those of aliases, (aliases, 3).
-        """
-        unknown, places = self.best[0], int(self._place[: self._dstates].max()) + 1
-        at, facing, _ = self._split(unknown)
-        motions = unknown[self._known : -2].reshape(-1, 3)
-        return at[:places], facing[: self._dstates], self._place[: self._dstates], motions
-
     def _best(self, start: Array | None = None, still: float = STILL) -> tuple[Array, float]:
         """Find the unknowns with the least sum of squares, and this sum.
 
@@ -533,6 +523,17 @@ class Poses:
         covariance: Array = np.zeros((len(wanted), len(wanted)))
         covariance[np.ix_(is_free, is_free)] = inverse(information, np.full(len(free), held), rows)
         return covariance
+
+
+def laid_with_motions(poses: Poses) -> tuple[Array, Array, NDArray[np.int_], Array]:
+    """Return the best positions, (places, 2), headings and places of dstates, and motions.
+
+    The motions (x, y, turn) are those of aliases, (aliases, 3).
+    """
+    unknown, place = poses.best[0], poses._place[: poses._dstates]
+    at, facing, _ = poses._split(unknown)
+    motions = unknown[poses._known : -2].reshape(-1, 3)
+    return at[: int(place.max()) + 1], facing[: poses._dstates], place, motions
 
 
 def _graph(first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:

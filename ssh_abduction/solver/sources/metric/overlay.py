@@ -103,8 +103,6 @@ class Overlay:
         self._spreads = spreads_of(problem.trace).max(axis=0) + np.array([slack, slack, SLACK]) ** 2
         # What each dstate shows of itself, and of its place, in nats; and a dstate of each place.
         self._shown = problem.prior.seen[[self._step_at[s] for s in range(len(both.places))]]
-        # A view is as frequent as the rarest one that agrees, or may be misread as any other.
-        self._saved = np.max if theory.misread else np.min
         self._first = firsts(zip(both.places, range(len(both.places)), strict=True))
         links: list[dict[int, int]] = [{} for _ in both.places]
         for (s, action), x in both.links.items():
@@ -316,7 +314,9 @@ class Overlay:
             state.dstate = [s if i == x else i for i in state.dstate]
             p, q = sorted(state.place[self._both.places[i]] for i in (s, x))
             headings = self._heading[s], self._heading[x]
-            state.nats -= float(self._saved(self._shown[[s, x], 0]))
+            # The merged dstate has the most frequent view if views may be misread (`Prior.shown`).
+            saved = max if self._problem.theory.misread else min
+            state.nats -= float(saved(self._shown[[s, x], 0]))
             if p == q:
                 self._condition([headings])
             else:
