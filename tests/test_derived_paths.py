@@ -441,6 +441,29 @@ def test_routes_are_told_in_words() -> None:
         directions_to(replace(named, fit=None), trace, [0], [5])
 
 
+def test_words_follow_bends_of_the_way_and_not_its_places() -> None:
+    """A zigzag through a hall is one leg, and a bend in the open is no opening."""
+    points = [(4.0 * k, 0.5 * (-1) ** k) for k in range(5)] + [(20.0, 4.5)]
+    ssh_map, trace = drive(points, [*range(6)], width=9.0)
+    assert directions_to(with_building(ssh_map, trace), trace, [0], [5]) == (
+        "go 16 m on",
+        "turn half left",
+        "go 6 m on, to place 5",
+    )
+
+
+def test_a_turn_into_a_door_is_told_before_the_door() -> None:
+    """The corridor is 2 m wide, so the course is within 1.2 m of the line to the door."""
+    points = [(0.0, 0.0), (8.0, 0.0), (8.0, 2.5)]
+    doors = [(1, 2)]
+    ssh_map, trace = drive(points, [0, 1, 2], doors=doors)
+    assert directions_to(with_building(ssh_map, trace), trace, [0], [2]) == (
+        "go 8 m along corridor 0, to the first opening on the left",
+        "turn left",
+        "go 2 m on, through the door, to place 2",
+    )
+
+
 def test_an_opening_that_was_never_driven_through_is_counted() -> None:
     ssh_map, trace = drive(CROSS, TOUR)
     first = trace.steps[0]
