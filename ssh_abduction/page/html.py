@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.data.checks import a_function, needed
+from ssh_abduction.data.checks import a_function, an_instance, needed
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.files import filled
 from ssh_abduction.data.map_parts import write_map
@@ -112,6 +112,8 @@ def view_page(
             checked_trace(given)
     if beliefs is not None:
         a_function("beliefs", beliefs, MapError, what="a function of a map")
+    if ground is not None:
+        an_instance("ground", ground, Ground, MapError, mend="make one, or leave it out")
     if (run is None) != (beliefs is None):
         raise MapError(
             "beliefs: expected both a run and its beliefs, or neither, got one of the two; give "
