@@ -743,10 +743,10 @@ def test_page_over_walls_in_the_browser(browser: Any, house: Path) -> None:
     page = Shown(browser, (house / "page.html").as_uri())
     assert browser.find_elements("css selector", ".walls")
     assert browser.find_elements("css selector", ".ground .street")
-    assert not browser.find_elements("css selector", "svg .dstate")  # arrows are off at first
+    assert not browser.find_elements("css selector", "#drawings .dstate")  # off at first
     assert page.drawn(".laser").get_attribute("d") != ""
     page.click("layer-arrows")
-    assert browser.find_elements("css selector", "figure .dstate")
+    assert browser.find_elements("css selector", "#drawings .dstate")
     page["find"].send_keys("0\ue007")  # Enter
     assert page["found"].text == "place 0"
     assert browser.find_elements("css selector", ".found")
