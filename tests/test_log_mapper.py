@@ -94,6 +94,18 @@ def test_search_gives_a_map_and_a_belief(scans: tuple[Scan, ...]) -> None:
     assert [event.kind for event in events] == ["new"] * len(events)
     assert {place["place"] for place in mapper.to_dict()["places"]} == set(range(len(events)))
     assert not mapper.is_due
+    sure = mapper.to_dict()["sure"]
+    assert sure["bound"] <= sure["nats"]
+    # A person says that two visits far apart are at one place, and takes it back.
+    places = mapper.to_dict()["places"]
+    first, second = places[0]["scans"][0], places[2]["scans"][0]
+    mapper.correct("same_place", first, second)
+    assert mapper.is_due
+    with pytest.raises(LogError, match="expected corrections that a map can obey"):
+        solved(mapper.task(work=1.0))
+    mapper.correct("elsewhere", second, first)
+    assert mapper.accept(solved(mapper.task(work=1.0))) == []
+    assert not mapper.is_due
     seen = mapper.observe(scans[99])
     assert isinstance(seen, RobotSeen)
     assert seen.on_map is not None
@@ -140,6 +152,37 @@ def test_numbers_of_places_last(
     last = mapper._names.place_of
     assert [last[10 * k] for k in range(len(numbers))] == numbers
     assert [event for event in said if event in events] == events
+
+
+def test_next_is_the_least_sure_join() -> None:
+    mapper = OnlineLogMapper()
+    assert mapper.next() == "no join is known to be doubtful"
+    doubtful = [{"scans": [0, 20], "probability": 0.9}]
+    rivals = [{"probability": 0.4, "joined": [[10, 30]], "apart": []}]
+    mapper.accept(replace(found(0, 1, 0, 2), sure={"doubtful": doubtful, "rivals": rivals}))
+    assert mapper.next().startswith("drive through place 2: the visits of scans 10 and 30")
+    mapper.accept(replace(found(0, 1, 0, 2), sure={"doubtful": doubtful, "rivals": []}))
+    assert mapper.next().endswith("at one place with probability 0.90")
+
+
+def test_corrections_of_other_scans_are_refused() -> None:
+    mapper = OnlineLogMapper()
+    mapper.accept(found(0, 1, 2))
+    for kind, first, second in (("alike", 0, 10), ("elsewhere", 0, 11), ("elsewhere", 0, 0)):
+        with pytest.raises(LogError, match="expected"):
+            mapper.correct(kind, first, second)
+    assert not mapper.is_due
+
+
+def test_visits_are_shown_before_there_is_a_map(scans: tuple[Scan, ...]) -> None:
+    mapper = OnlineLogMapper()
+    for scan in scans[:40]:
+        mapper.observe(scan)
+    shown = mapper.to_dict()
+    assert shown["places"] == []
+    assert len(shown["provisional"]) >= 2
+    mapper.accept(replace(found(0, 1), scans=(0, 1000)))  # a map of all visits so far
+    assert mapper.to_dict()["provisional"] == []
 
 
 def test_folder_that_cannot_be_written_is_told_once(
@@ -189,6 +232,7 @@ def test_page_shows_the_robot_to_this_computer_only(scans: tuple[Scan, ...]) -> 
     assert b"<svg" in answer("/", here)[1]
     assert json.loads(answer("/state", here)[1])["robot"] is None
     session.take(scans[0])
+    assert session.tick()
     state = json.loads(answer("/state", here)[1])
     assert state["robot"] == [0.0, 0.0, 0.0]
     assert state["edges"] == [[0, 1], [1, 2]]

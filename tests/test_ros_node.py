@@ -6,19 +6,27 @@ import math
 import os
 import subprocess
 import sys
-from dataclasses import replace
+from array import array
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from coarse import every_second_beam, hall
 
+from perception.readers.bag_geometry import Mount
+from perception.readers.scans import Damaged
 from perception.readers.writers import write_carmen
 from ssh_abduction.cli import main
 from ssh_abduction.robot_logs import stamps
 from ssh_abduction.robot_logs.log_mapper import OnlineLogMapper
+from ssh_abduction.robot_logs.ros_node import LaserFrames, scan_of
 from ssh_abduction.robot_logs.stamps import StampPairing
 
+TURNED = 0.5  # radians: that of ros_player.py
 TESTS = Path(__file__).parent
 needs_ros = pytest.mark.skipif(find_spec("rclpy") is None, reason="ROS 2 is not installed")
 
@@ -75,17 +83,107 @@ def test_node_without_ros_says_what_to_install(capsys: pytest.CaptureFixture[str
     assert "expected ROS 2, got none; pip install" in capsys.readouterr().err
 
 
-@needs_ros
-def test_node_maps_a_drive_over_dds(tmp_path: Path) -> None:
-    scans = [replace(scan, corrected=None) for scan in every_second_beam(hall(every=0.5)[:60])]
-    write_carmen(tmp_path / "a.log", scans)
+@dataclass
+class Message:
+    """A LaserScan as rclpy gives it: ranges are an array of floats."""
+
+    ranges: Any
+    header: Any
+    angle_min: float = -1.0
+    angle_max: float = 1.0
+    angle_increment: float = 0.5
+    range_min: float = 0.1
+    range_max: float = 10.0
+
+
+def test_scan_of_a_laser_that_hangs_upside_down() -> None:
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=2, nanosec=0))
+    message = Message(array("f", [1.0, math.nan, 0.05, 10.0, math.inf]), header)
+    scan = scan_of(message, Mount((0.2, 0.0, 0.0), is_flipped=True), (1.0, 2.0, 3.0), 7)
+    assert scan.laser.mount == (0.2, 0.0, 0.0)
+    assert (scan.laser.first, scan.laser.step) == (1.0, -0.5)
+    assert scan.odometry == (1.0, 2.0, 3.0)
+    assert scan.time == 2.0
+    assert np.isnan(scan.ranges).tolist() == [False, True, True, False, False]
+    assert scan.ranges[[0, 3, 4]].tolist() == [1.0, math.inf, math.inf]
+    with pytest.raises(Damaged, match="first angle and a step in radians"):
+        scan_of(replace(message, angle_increment=0.0), Mount(), (0.0, 0.0, 0.0), 0)
+
+
+def test_scans_wait_until_the_first_one_may_go() -> None:
+    one, known = StampPairing(), set[str]()
+    for at in (0.0, 1.0):
+        one.add_pose(at, (at, 0.0, 0.0))
+    one.add_scan(0.5, "laser")
+    assert not list(one.ready(known.__contains__))
+    known.add("laser")
+    assert [at for at, *_ in one.ready(known.__contains__)] == [0.5]
+
+
+def over_dds(house: Path, log: Path, *more: str, by_frames: bool = False) -> str:
+    """What the node prints while a log is played. It ends when nothing comes any more."""
     given = {**os.environ, "ROS_DOMAIN_ID": str(os.getpid() % 100)}
-    house = tmp_path / "house"
+    given["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     call = [sys.executable, "-m", "ssh_abduction", "live", "--save", str(house), "--set", "idle=20"]
-    with subprocess.Popen(call, env=given, stdout=subprocess.PIPE, text=True) as node:
-        play = [sys.executable, str(TESTS / "ros_player.py"), str(tmp_path / "a.log"), "20"]
-        subprocess.run(play, env=given, check=True, timeout=120)
+    with subprocess.Popen([*call, *more], env=given, stdout=subprocess.PIPE, text=True) as node:
+        play = [sys.executable, str(TESTS / "ros_player.py"), str(log), "20"]
+        subprocess.run(play + ["tf"] * by_frames, env=given, check=True, timeout=120)
         out, _ = node.communicate(timeout=120)
+    return out
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("logs") / "a.log"
+    scans = every_second_beam(hall(every=0.5)[:60])
+    write_carmen(path, [replace(scan, corrected=None) for scan in scans])
+    return path
+
+
+@needs_ros
+def test_node_maps_a_drive_over_dds(log: Path, tmp_path: Path) -> None:
+    out = over_dds(tmp_path / "house", log, "--ros-args", "-p", "use_sim_time:=true")
     assert "listening to /scan, reliable" in out
     assert "place 0 is new" in out
-    assert len(OnlineLogMapper.load(house)) == 60
+    assert len(OnlineLogMapper.load(tmp_path / "house")) == 60
+    # A robot that drives on does not stop because an old state cannot be read.
+    state = tmp_path / "house" / "drive.state"
+    state.write_bytes(b'{"format": "ssh-live", "version": 0}\n')
+    assert "place 0 is new" in over_dds(tmp_path / "house", log)
+    assert state.read_bytes() == b'{"format": "ssh-live", "version": 0}\n'
+
+
+@needs_ros
+@pytest.mark.skipif(find_spec("tf2_msgs") is None, reason="tf2_msgs is not installed")
+def test_node_takes_poses_and_the_mount_from_frames(log: Path, tmp_path: Path) -> None:
+    assert "place 0 is new" in over_dds(tmp_path / "a", log, "--odom", "/tf", by_frames=True)
+    live = OnlineLogMapper.load(tmp_path / "a").live.log
+    assert len(live) == 60
+    assert live.scans[0].laser.mount == pytest.approx((0.0, 0.0, TURNED))
+
+
+def link(parent: str, child: str, x: float, turn: float) -> Any:
+    """A transform, as rclpy gives it."""
+    turned = SimpleNamespace(x=0.0, y=0.0, z=math.sin(turn / 2), w=math.cos(turn / 2))
+    move = SimpleNamespace(x=x, y=0.0, z=0.0)
+    header = SimpleNamespace(frame_id=parent)
+    pose = SimpleNamespace(translation=move, rotation=turned)
+    return SimpleNamespace(header=header, child_frame_id=child, transform=pose)
+
+
+def test_transforms_say_where_the_robot_and_its_laser_are() -> None:
+    frames, said = LaserFrames("odom", ()), list[str]()
+    message = SimpleNamespace(header=SimpleNamespace(frame_id="/laser"), ranges=[])
+    assert frames.mount(message, True, said.append) is None
+    assert frames.mount(message, False, said.append) == Mount()
+    assert "No transform leads from the robot" in said.pop()
+    assert frames.add(link("base", "mast", 1.0, math.pi / 2), True) is None
+    assert frames.add(link("mast", "laser", 1.0, 0.0), True) is None
+    assert frames.add(link("odom", "base", 3.0, 0.5), False) == pytest.approx((3.0, 0.0, 0.5))
+    assert frames.add(link("map", "odom", 3.0, 0.5), False) is None
+    mount = frames.mount(message, True, said.append)
+    assert mount is not None
+    assert mount.pose == pytest.approx((1.0, 1.0, math.pi / 2), abs=1e-5)
+    assert not said
+    told = LaserFrames("odom", (1.0, 2.0, 90.0)).mount(message, True, said.append)
+    assert told == Mount((1.0, 2.0, math.pi / 2))

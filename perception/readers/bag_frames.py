@@ -126,7 +126,7 @@ def transforms_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
                 child, parent = map(frame_name, (stamped.child_frame_id, stamped.header.frame_id))
                 transform = stamped.transform
                 try:
-                    edge = _record(frames, child, parent, transform, is_static)
+                    edge = record_transform(frames, child, parent, transform, is_static)
                 except Damaged as damage:
                     damaged.append(Damage(number, f"{connection.topic}: {child}: {damage}"))
                     continue
@@ -140,10 +140,10 @@ def transforms_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
     return frames
 
 
-def _record(
+def record_transform(
     frames: Frames, child: str, parent: str, transform: Any, is_static: bool
 ) -> FrameTransform:
-    """Record a message with the transform from a parent frame to a child frame."""
+    """Record a message with the transform from a parent frame to a child frame. Raises Damaged."""
     from scipy.spatial.transform import Rotation
 
     move, turn = transform.translation, transform.rotation

@@ -30,7 +30,7 @@ FLOOR, BELOW, MANY_BELOW, ON_FLOOR = 0.05, 0.1, 0.1, 0.6
 def ranges_of(message: Any) -> Array:
     """Return the ranges of a scan, or the first echoes. A beam without an echo met nothing."""
     beams = message.ranges
-    if not isinstance(beams, np.ndarray):
+    if len(beams) and hasattr(beams[0], "echoes"):
         beams = [beam.echoes[0] if len(beam.echoes) else np.inf for beam in beams]
     return np.array(beams, dtype=np.float64)
 

@@ -553,7 +553,7 @@ class _ScanPoses:
         for correction in self.corrections:
             corrected = moved(correction.at(time), corrected)
         mount = self.mounts[frame_name(message.header.frame_id)]
-        ranges, laser = _measured(message, mount, self.fov)
+        ranges, laser = measured(message, mount, self.fov)
         return Scan(ranges, laser, pose, corrected if self.corrections else None, time, number)
 
 
@@ -576,8 +576,11 @@ def _scans(
             yield Damage(number, f"{connection.topic}: {damage}")
 
 
-def _measured(message: Any, mount: Mount, fov: float | None) -> tuple[Array, LaserScanner]:
-    """Read ranges and laser of a message. The beams of a flipped laser turn clockwise."""
+def measured(message: Any, mount: Mount, fov: float | None = None) -> tuple[Array, LaserScanner]:
+    """Read ranges and laser of a message. The beams of a flipped laser turn clockwise.
+
+    `fov` is the field of view in degrees according to the user. Raises Damaged.
+    """
     nearest, reach = float(message.range_min), float(message.range_max)
     ranges = ranges_of(message)
     if not len(ranges):

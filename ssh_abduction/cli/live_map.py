@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli import import_log
-from ssh_abduction.cli.outcome import StopFlag, warn
+from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c, warn
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import named
@@ -40,7 +39,13 @@ def positive(text: str) -> float:
             {"type": positive},
         ),
         "--scan TOPIC=/scan": "topic of the LaserScan",
-        "--odom TOPIC=/odom": "topic of the Odometry",
+        "--odom TOPIC=/odom": (
+            "topic of the Odometry; /tf takes the transforms from the frame odom instead"
+        ),
+        "--ros-args ARG": (
+            "all that follows is for ROS 2, such as -p use_sim_time:=true",
+            {"nargs": argparse.REMAINDER, "default": []},
+        ),
         "--set idle S": (
             "end when no message came for S seconds (default: never)",
             {"type": positive},
@@ -70,21 +75,25 @@ def run_live(options: argparse.Namespace) -> int:
     Take laser scans one at a time. Say when a place is new, moved, or joined with another one. The
     map follows in another process.
     """
+    from perception.errors import LogError
     from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper
 
     where = options.save if options.save is not None else options.onto
     folder = None if where is None else Path(where)
-    if folder is not None:
+    if folder is not None and options.replay is not None:
         import_log.check_folder(folder)
     tell = lambda note: warn([note])  # noqa: E731
+    mapper = OnlineLogMapper(options.width or import_log.WIDTH, tell)
     if options.onto is not None:
         mapper = OnlineLogMapper.load(options.onto, tell)
         mapper.lift()
     elif folder is not None and OnlineLogMapper.is_saved(folder):
-        mapper = OnlineLogMapper.load(folder, tell)
-        print(f"{named(folder)}: the drive goes on after {counted(len(mapper), 'scans')}")
-    else:
-        mapper = OnlineLogMapper(options.width or import_log.WIDTH, tell)
+        try:
+            mapper = OnlineLogMapper.load(folder, tell)
+            print(f"{named(folder)}: the drive goes on after {counted(len(mapper), 'scans')}")
+        except LogError as error:  # a robot that drives should not stop for this
+            warn([f"{error}; the map is kept in memory, and not saved"])
+            folder = None
     session = LiveSession(mapper, folder, lambda line: print(line, flush=True), options.work_limit)
     if options.page is not None:
         from ssh_abduction.robot_logs.live_page import LivePage
@@ -103,23 +112,28 @@ def run_live(options: argparse.Namespace) -> int:
 def _listen(options: argparse.Namespace, session: LiveSession) -> None:
     """Give the scans that ROS 2 brings to a session."""
     from ssh_abduction.robot_logs.log_mapper import OnlineLogMapper
-    from ssh_abduction.robot_logs.ros_node import run_node
+    from ssh_abduction.robot_logs.ros_node import NodeOptions, run_node
 
-    mount = None
-    if options.mount is not None:
-        x, y, degrees = options.mount
-        mount = (x, y, math.radians(degrees))
     width, tell = options.width or import_log.WIDTH, session.mapper.live.tell.to
-    run_node(
-        session,
-        lambda: OnlineLogMapper(width, tell),
-        options.scan,
-        options.odom,
-        mount,
-        options.idle,
-        lambda line: print(line, flush=True),
+    given = NodeOptions(
+        options.scan, options.odom, options.mount, idle=options.idle, ros_args=options.ros_args
     )
-    session.end()
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    def fresh() -> OnlineLogMapper:
+        return OnlineLogMapper(width, tell)
+
+    # The first Ctrl-C or SIGTERM ends the drive, the second one the last search.
+    with on_ctrl_c(interrupt):
+        run_node(
+            session,
+            lambda: OnlineLogMapper(width, tell),
+            given,
+            lambda line: print(line, flush=True),
+        )
+        session.end()
 
 
 def _replay(options: argparse.Namespace, session: LiveSession) -> None:

@@ -17,7 +17,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -30,19 +30,21 @@ from perception.places.distinctive import WIDTH, Visit
 from perception.places.importing import Grown, Imported, Tell, assembled, tell_nobody
 from perception.places.live import LiveLog, LivePlace
 from perception.readers.scans import RobotLog, Scan
-from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.checks import an_instance, one_of
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import json_line, mend_of, parse_json, read_file, write_file
+from ssh_abduction.data.groups import first_index_of, indices_of
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.page.content import Ground
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_ground import ground_of
 from ssh_abduction.robot_logs.log_maps import BARE
-from ssh_abduction.solver import LimitError, Watch, in_process, solve
+from ssh_abduction.solver import LimitError, Solution, Watch, in_process, solve
 
 NAMES = "drive.names"
-FORMAT, VERSION, MOST = "ssh-live-names", 1, 2**26
+FORMAT, VERSION, MOST = "ssh-live-names", 2, 2**26
 # The standard deviation of the position of the robot relative to a known place: metres, and metres
 # for each metre driven since the last visit that the map has.
 NEAR, DRIFT = 0.5, 0.02
@@ -50,10 +52,14 @@ NEAR, DRIFT = 0.5, 0.02
 AWAY = 1.5
 # A place has moved if its middle is this many metres from where it was.
 MOVED = 1.0
+LOOK = 1.0  # metres from one look at visits to come to the next
 EVERY = 1.0  # seconds from saving to saving
 POLL = 0.2  # seconds to wait for a search
 # Units of work of a search, each about a second of a quiet core.
 WORK = 5.0
+RIVALS = 5  # rivals that are told
+# What a person says of two visits, as in corrections: a place is the same, or another one.
+SAID = ("same_place", "elsewhere")
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +85,7 @@ class Event:
     """A change of the map.
 
     Attributes:
-        kind: "new", "joined", "retracted" or "moved".
+        kind: "new", "joined", "retracted", "moved" or "renamed" (by a person).
         place: The number of the place.
         other: For "joined", the number that is no longer used. For "retracted", the number of the
             place that it was joined with.
@@ -103,6 +109,7 @@ class MapTask:
     grown: Grown
     width: float
     work: float
+    said: tuple[tuple[str, int, int], ...] = ()  # corrections: a kind of SAID, and two scans
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +126,8 @@ class FoundMap:
             the new trajectory with the old map first.
         said: How good the map is: the verdict of its solution.
         files: The files of the map, by name.
+        sure: The same as plain data: `nats`, `bound`, `confidence`, `doubtful` joins and `rivals`.
+            A join is two scans, each of a visit.
     """
 
     scans: tuple[int, ...]
@@ -128,12 +137,14 @@ class FoundMap:
     said: str
     files: Mapping[str, bytes]
     located: bool = True
+    sure: Mapping[str, Any] = field(default_factory=dict)
 
 
 def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
-    """Search for the map of a task. Return None if there is none, or nothing to map yet.
+    """Search for the map of a task. Return None if there is nothing to map yet.
 
-    The watch is that of `in_process`, which stops the process of the search.
+    The watch is that of `in_process`, which stops the process of the search. Raises LogError if
+    the search finds no map, and AbductionError if corrections contradict each other.
     """
     grown = task.grown
     try:
@@ -142,12 +153,17 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
         )
     except LogError:  # the robot hardly moved
         return None
-    solution = solve(done.trace, BARE, max_maps=1, work_limit=task.work)
+    first = first_index_of(int(step.extra["visit"]) for step in done.trace.steps)
+    steps, scans = [first[k] for k in range(len(done.visits))], [v.scan for v in done.visits]
+    said: dict[str, Any] = {kind: [] for kind in SAID}
+    for kind, *pair in task.said:
+        said[kind].append(tuple(steps[nearest(scans, scan)] for scan in pair))
+    solution = solve(done.trace, BARE.replace(**said), max_maps=1, work_limit=task.work)
     if not solution.maps:
-        return None
+        what = "corrections that a map can obey" if task.said else "a map"
+        raise LogError(f"live: expected {what}, got none; give more work, or take one back")
     ssh_map = solution.maps[0]
-    first = {int(step.extra["visit"]): t for t, step in reversed([*enumerate(done.trace.steps)])}
-    places = (ssh_map.dstates[ssh_map.dstate_at[first[k]]].place for k in range(len(done.visits)))
+    places = (ssh_map.dstates[ssh_map.dstate_at[t]].place for t in steps)
     ground = Ground(ground_of(task.log, done, ssh_map))
     files = {
         "trace.jsonl": "".join(f"{line}\n" for line in done.trace.to_lines()).encode(),
@@ -155,14 +171,56 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
         "page.html": view_page(solution, done.trace, ground=ground).html.encode(),
     }
     return FoundMap(
-        tuple(visit.scan for visit in done.visits),
+        tuple(scans),
         tuple(-1 if place is None else place for place in places),
         done.poses,
         np.array([visit.middle for visit in done.visits]).reshape(-1, 2),
         solution.verdict,
         files,
         _is_located(done),
+        _sureness(solution, done.trace, scans),
     )
+
+
+def nearest(scans: Sequence[int], scan: int) -> int:
+    """The index of the visit whose scan is nearest: later scans may move a visit a little."""
+    return min(range(len(scans)), key=lambda k: abs(scans[k] - scan))
+
+
+def _sureness(solution: Solution, trace: Trace, scans: Sequence[int]) -> dict[str, Any]:
+    """How sure a map is, as in `FoundMap`. `scans` has the scan of each visit."""
+    weighed = solution.weighed
+    if weighed is None:
+        return {}
+    visit_at = [int(step.extra["visit"]) for step in trace.steps]
+    steps = first_index_of(visit_at)
+
+    def joins(at: Sequence[int]) -> set[tuple[int, int]]:
+        groups = indices_of([at[steps[k]] for k in range(len(scans))]).values()
+        return {pair for visits in groups for pair in itertools.pairwise(visits)}
+
+    def told(pairs: set[tuple[int, int]]) -> list[list[int]]:
+        return [[scans[k] for k in pair] for pair in sorted(pairs)]
+
+    best, *others = (joins(rival.at) for rival in weighed.rivals)
+    rivals = [
+        {"probability": round(p, 4), "joined": told(other - best), "apart": told(best - other)}
+        for p, other in zip(weighed.weights[1:], others, strict=True)
+        if other != best
+    ]
+    return {
+        "nats": round(weighed.nats, 2),
+        "bound": round(weighed.bound, 2),
+        "confidence": weighed.place_confidence,
+        # None if the search did not finish: then it is unknown which joins are doubtful.
+        "doubtful": None
+        if weighed.doubtful is None
+        else [
+            {"scans": [scans[visit_at[t]] for t in pair], "probability": round(p, 4)}
+            for *pair, p in weighed.doubtful
+        ],
+        "rivals": rivals[:RIVALS],
+    }
 
 
 def _is_located(done: Imported) -> bool:
@@ -189,14 +247,13 @@ class _Names:
     middles: dict[int, tuple[float, float]] = field(default_factory=dict)  # metres, on the map
     texts: dict[int, str] = field(default_factory=dict)  # the names that a person gave
     anchor: tuple[Pose, Pose] | None = None  # a pose on the track, and the same on the map
+    said: list[tuple[str, int, int]] = field(default_factory=list)  # as in `MapTask`
 
     def update(self, found: FoundMap) -> list[Event]:
         """Number the places of a map, and say what changed."""
         number_of, resting = dict[int, int](), dict[int, int]()
         for number, scan in enumerate(self.founders):
-            # Later scans may move a visit a little.
-            visit = min(range(len(found.scans)), key=lambda k: abs(found.scans[k] - scan))
-            used = number_of.setdefault(found.places[visit], number)
+            used = number_of.setdefault(found.places[nearest(found.scans, scan)], number)
             resting |= {} if used == number else {number: used}
         events = [Event("joined", used, n) for n, used in resting.items() if n not in self.resting]
         events += [
@@ -233,6 +290,7 @@ class OnlineLogMapper:
     Attributes:
         live: The scans, the track, the visits and the closures so far.
         said: How good the last map is; empty without a map.
+        sure: The same as plain data (see `FoundMap`).
 
     Raises:
         LogError: An argument is invalid.
@@ -246,11 +304,12 @@ class OnlineLogMapper:
 
     def __init__(self, width: float = WIDTH, tell: Tell = tell_nobody) -> None:
         self.live = LiveLog(width, tell)
-        self.said = ""
+        self.said, self.sure = "", dict[str, Any]()
         self._names = _Names()
         self._asked = 0  # the number of final visits at the last task
         self._way = 0.0  # metres since the anchor
         self._last: Pose | None = None
+        self._looked, self._expected = -math.inf, list[Visit]()  # the last look at visits to come
 
     def __len__(self) -> int:
         """The number of scans."""
@@ -311,17 +370,35 @@ class OnlineLogMapper:
         self._asked = len(self.live.visits)
         nothing = np.zeros(0)
         scans = tuple(replace(scan, ranges=nothing) for scan in self.live.log.scans)
-        return MapTask(RobotLog(scans), self.live.grown(), self.live.width, work)
+        said = tuple((kind, first, second) for kind, first, second in self._names.said)
+        return MapTask(RobotLog(scans), self.live.grown(), self.live.width, work, said)
 
     def accept(self, found: FoundMap | None) -> list[Event]:
         """Take the result of `solved`, and return what changed."""
         if found is None:
             return []
         events = self._names.update(found)
-        self.said, self._way = found.said, 0.0
+        self.said, self.sure, self._way = found.said, dict(found.sure), 0.0
         return events
 
-    def name(self, place: int, text: str) -> None:
+    def correct(self, kind: str, first: int, second: int) -> None:
+        """Say that two visits are at one place ("same_place") or at two ("elsewhere").
+
+        A visit is given by its scan, as in `to_dict`. This replaces what was said of the two
+        visits before. The next search obeys. Raises LogError for another kind or scan.
+        """
+        one_of("kind", kind, SAID, LogError)
+        scans, pair = self._names.place_of, (min(first, second), max(first, second))
+        if first == second or not scans.keys() >= {*pair}:
+            raise LogError(
+                f"scans: expected two different ones of {', '.join(map(str, sorted(scans)))}, got "
+                f"{first} and {second}; take scans of the map"
+            )
+        self._names.said = [one for one in self._names.said if tuple(one[1:]) != pair]
+        self._names.said.append((kind, *pair))
+        self._asked = -1
+
+    def name(self, place: int, text: str) -> Event:
         """Name a place by its number. Raises LogError if there is none of this number."""
         if place not in self._names.middles:
             raise LogError(
@@ -329,20 +406,56 @@ class OnlineLogMapper:
                 f"{place}; take a number of the map"
             )
         self._names.texts[place] = text
+        return Event("renamed", place)
+
+    def _provisional(self) -> list[list[float]]:
+        """The middles of the visits that the last map lacks, in metres on the map."""
+        if abs(self._way - self._looked) > LOOK:
+            self._looked, self._expected = self._way, self.live.expected()
+        last = max(self._names.place_of, default=-1)
+        visits = [one for one in (*self.live.visits, *self._expected) if one.scan > last]
+        middles = (one.middle.tolist() for one in visits)
+        if self._names.place_of:  # there is a map, and it may not be known where the robot is on it
+            here = (self._on_map((x, y, 0.0)) for x, y in middles)
+            middles = (list(at[:2]) for at in here if at)
+        return [[round(x, 2), round(y, 2)] for x, y in middles]
+
+    def next(self) -> str:
+        """Where the robot should look again to make the map surer, in words."""
+        pairs = [(one["probability"], *one["scans"]) for one in self.sure.get("doubtful") or ()]
+        for rival in self.sure.get("rivals", ()):
+            pairs += [(rival["probability"], *pair) for pair in rival["joined"]]
+        if not pairs:
+            return "no join is known to be doubtful"
+        p, first, second = min(pairs, key=lambda pair: abs(pair[0] - 0.5))
+        place = self._names.place_of[second]
+        return (
+            f"drive through place {place}: the visits of scans {first} and {second} are at one "
+            f"place with probability {p:.2f}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The map so far as plain data: places by number, edges, and the pose of the robot."""
         names, order = self._names, sorted(self._names.place_of.items())
         travels = {tuple(sorted((a, b))) for (_, a), (_, b) in itertools.pairwise(order)}
+        scans = {n: [scan for scan, at in order if at == n] for n in names.middles}
         return {
             "places": [
-                {"place": place, "x": round(x, 2), "y": round(y, 2), "name": names.texts.get(place)}
+                {
+                    "place": place,
+                    "x": round(x, 2),
+                    "y": round(y, 2),
+                    "name": names.texts.get(place),
+                    "scans": scans[place],
+                }
                 for place, (x, y) in sorted(names.middles.items())
             ],
             "edges": sorted(pair for pair in travels if pair[0] != pair[1]),
+            "provisional": self._provisional(),
             "scans": len(self.live),
             "visits": len(self.live.visits),
             "said": self.said,
+            "sure": self.sure,
         }
 
     def finish(self, name: str | None = None) -> Imported:
@@ -352,7 +465,8 @@ class OnlineLogMapper:
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Save the state in a folder. To save there again only adds what is new. Raises OSError."""
         self.live.save(folder)
-        names = {"format": FORMAT, "version": VERSION, "said": self.said, **asdict(self._names)}
+        names = {"format": FORMAT, "version": VERSION, "said": self.said, "sure": self.sure}
+        names |= {"names": asdict(self._names)}
         write_file(Path(folder) / NAMES, json_line(names).encode())
 
     @staticmethod
@@ -367,13 +481,13 @@ class OnlineLogMapper:
         mapper.live = LiveLog.load(folder, tell)
         file = Path(folder) / NAMES
         data = parse_json(read_file(file, MOST, "the names of places", LogError))
-        if (data.pop("format", None), version := data.pop("version", None)) != (FORMAT, VERSION):
+        if (data.get("format"), version := data.get("version")) != (FORMAT, VERSION):
             raise LogError(
                 f"{named(file)}: expected names of version {VERSION}, got {version}; move the "
                 "folder away, and start anew"
             )
-        mapper.said = data.pop("said")
-        for field_name, value in data.items():
+        mapper.said, mapper.sure = data["said"], data["sure"]
+        for field_name, value in data["names"].items():
             by_number = isinstance(value, dict)
             kept = {int(key): one for key, one in value.items()} if by_number else value
             setattr(mapper._names, field_name, kept)
@@ -449,6 +563,7 @@ class LiveSession:
         self.maps = 0  # the number of maps so far
         self.events: list[str] = []  # what was said of the maps
         self.page: bytes | None = None  # of the last map
+        self.told = mapper.to_dict()  # the map as plain data, at most a second old
         self._say, self._search, self._saved, self._failed = say, MapSearch(), 0.0, False
 
     def take(self, scan: Scan) -> RobotSeen:
@@ -457,30 +572,39 @@ class LiveSession:
         return self.seen
 
     def tick(self, wait: float = 0.0) -> bool:
-        """Do what is due: take a map, begin a search, save. Return whether there is a new map."""
+        """Do what is due: take a map, begin a search, save. Return whether `told` is new."""
         found = self._search.taken(wait)
         if self._search.error:
             self._say(f"no new map: {self._search.error}")
             self._search.error = ""
         if found is not None:
             for event in self.mapper.accept(found):
-                self.events.append(str(event))
-                self._say(self.events[-1])
+                self.happened(event)
             self.maps += 1
             self.page = found.files.get("page.html")
             self._keep(found.files)
         if self.mapper.is_due and not self._search.is_busy:
             self._search.begin(self.mapper.task(self.work))
-        if time.monotonic() - self._saved > EVERY:
+        is_new = found is not None or time.monotonic() - self._saved > EVERY
+        if is_new:
             self.save()
-        return found is not None
+            self.told = self.mapper.to_dict()
+        return is_new
+
+    def happened(self, event: Event) -> None:
+        """Say an event, and keep it for pages and topics."""
+        self.events.append(str(event))
+        self._say(self.events[-1])
 
     def state(self) -> dict[str, Any]:
-        """The map, the robot and what was said, as plain data for a page."""
-        seen, found = self.seen, self.mapper.to_dict()
+        """The map, the robot and what was said, as plain data for a page.
+
+        A page may ask from another thread.
+        """
+        seen = self.seen
         robot = (seen.on_map or seen.pose) if seen else None
         return {
-            **found,
+            **self.told,
             "robot": robot,
             "belief": seen.belief if seen else {},
             "events": self.events,

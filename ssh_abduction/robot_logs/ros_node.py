@@ -1,9 +1,11 @@
 """A ROS 2 node that maps a building while the robot drives.
 
-It takes LaserScan and Odometry, and publishes the map as markers and as JSON, the belief of the
-place, and what changed. `/tf_static` says where the laser is, if the message of TF is installed.
+It takes LaserScan, and Odometry or transforms. It publishes the map as markers and as JSON, the
+belief of the place, and what changed. `/tf_static` says where the laser is, if the message of TF is
+installed.
 
-The numbers and names that a service needs are parameters of the node: `place`, `to` and `text`.
+The numbers and texts that a service needs are parameters of the node. The node has a lifecycle:
+while it is inactive, it takes no scans.
 """
 
 from __future__ import annotations
@@ -11,91 +13,185 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import networkx as nx
 import numpy as np
 
 from perception.errors import LogError
-from perception.readers.bag_frames import flat_pose, frame_name, stamp_of
-from perception.readers.scans import Damaged, Scan, laser_of
+from perception.readers.bag_frames import (
+    Frames,
+    flat_pose,
+    frame_name,
+    mount_of,
+    record_transform,
+    stamp_of,
+)
+from perception.readers.bag_geometry import Mount, believed
+from perception.readers.bags import measured
+from perception.readers.scans import Damaged, Scan
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.odometry import Pose
 from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper
-from ssh_abduction.robot_logs.stamps import StampPairing
+from ssh_abduction.robot_logs.stamps import BACK, StampPairing
 
 # Seconds to wait for a topic before that is said, and from one look at the topics to the next.
 PATIENCE, LOOK = 5.0, 1.0
 TICK = 0.1  # seconds
 DEEP = 2000  # messages of a topic that wait, if it is reliable
+# Parameters of the node, and their values if no option sets them. `place`, `to`, `first`, `second`
+# and `text` are for services.
+PARAMETERS = {
+    "scan_topic": "/scan",
+    "odom_topic": "/odom",
+    "odom_frame": "odom",
+    "autostart": True,
+    **{"place": 0, "to": 0, "first": 0, "second": 0, "text": ""},
+}
 MISSING = (
     "live: expected ROS 2, got none; pip install 'ssh-abduction[ros2]', source its setup file, or "
     "give --replay LOG"
 )
 
 
+@dataclass(frozen=True)
+class NodeOptions:
+    """Options of the node. The first four are parameters of the node, too.
+
+    Attributes:
+        scan_topic: The topic of the LaserScan.
+        odom_topic: The topic of the Odometry, or of TF: "/tf" takes the transforms to the robot
+            from the frame of the parameter `odom_frame`.
+        mount: The pose of the laser on the robot in metres and degrees; None takes it from
+            `/tf_static`.
+        autostart: Whether the node activates itself. If not, a lifecycle manager does.
+        idle: End if nothing came for so many seconds; None for never.
+        ros_args: Arguments of ROS, such as `-p use_sim_time:=true`.
+    """
+
+    scan_topic: str = "/scan"
+    odom_topic: str = "/odom"
+    mount: Sequence[float] | None = None
+    autostart: bool = True
+    idle: float | None = None
+    ros_args: Sequence[str] = ()
+
+
 def run_node(
     session: LiveSession,
     new_mapper: Callable[[], OnlineLogMapper],
-    scan_topic: str,
-    odom_topic: str,
-    mount: Pose | None,
-    idle: float | None,
+    options: NodeOptions,
     say: Callable[[str], None],
 ) -> None:
-    """Run the node until Ctrl-C, or until nothing came for `idle` seconds.
+    """Run the node until a KeyboardInterrupt, or until nothing came for a while.
 
-    `mount` is the pose of the laser on the robot; None takes it from `/tf_static`. Raises LogError
-    if ROS 2 is not installed.
+    Raises LogError if ROS 2 is not installed, or cannot read its arguments.
     """
     try:
         import rclpy
+        from rclpy.lifecycle import LifecycleNode
+        from rclpy.signals import SignalHandlerOptions
     except ImportError:
         raise LogError(MISSING) from None
-    rclpy.init(args=[])
-    node = rclpy.create_node("ssh_abduction")
-    live = _LiveNode(node, session, new_mapper, scan_topic, odom_topic, mount, say)
     try:
-        while rclpy.ok() and (idle is None or time.monotonic() - live.heard < idle):
+        given = ["--ros-args", *options.ros_args] if options.ros_args else []
+        rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # its classes are private
+        raise LogError(f"--ros-args: expected arguments of ROS, got {error}; mend them") from None
+    node = LifecycleNode("ssh_abduction")
+    pairing, idle = StampPairing(), math.inf if options.idle is None else options.idle
+    try:
+        live = LiveNode(node, session, pairing, new_mapper, options, say)
+        while rclpy.ok() and time.monotonic() - live.heard < idle:
             rclpy.spin_once(node, timeout_sec=TICK)
-    except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+    except KeyboardInterrupt:
         say("interrupted: the drive ends here")
     finally:
-        if live.pairing.lost:
-            parts = (f"{count} {why}" for why, count in live.pairing.lost.items())
+        if pairing.lost:
+            parts = (f"{count} {why}" for why, count in pairing.lost.items())
             say(f"scans that were lost: {', '.join(parts)}")
         node.destroy_node()
         rclpy.try_shutdown()
 
 
-def scan_of(message: Any, mount: Pose, odometry: Pose, number: int) -> Scan:
-    """Make a Scan of a LaserScan."""
-    ranges = np.array(message.ranges, np.float64)
+def scan_of(message: Any, mount: Mount, odometry: Pose, number: int) -> Scan:
+    """Make a Scan of a LaserScan. Raises Damaged."""
+    ranges, laser = measured(message, mount)
     with np.errstate(invalid="ignore"):
         ranges[~(ranges >= message.range_min)] = np.nan
-        ranges[ranges >= message.range_max] = np.inf
-    laser = laser_of(
-        message.angle_min, message.angle_increment, len(ranges), message.range_max, mount
-    )
+        ranges[ranges >= laser.reach] = np.inf
     return Scan(ranges, laser, odometry, None, stamp_of(message.header), number)
 
 
-class _LiveNode:
-    """The topics and services of a node, around a session."""
+class LaserFrames:
+    """Where the laser is on the robot: as a person says, or as transforms do.
+
+    Args:
+        odom: The frame of the odometry.
+        given: What a person says: metres ahead, metres to the left, degrees to the left; or empty.
+    """
+
+    def __init__(self, odom: str, given: Sequence[float]) -> None:
+        self.odom, self.base = odom, ""  # `base` is the frame of the robot
+        self.given = given
+        self.known: Frames = {}
+        self._mounts: dict[str, Mount] = {}  # by the frame of the scans
+
+    def add(self, transform: Any, is_static: bool) -> Pose | None:
+        """Add a transform. Return the pose of the robot if it has one. Raises Damaged."""
+        child, parent = map(frame_name, (transform.child_frame_id, transform.header.frame_id))
+        record_transform(self.known, child, parent, transform.transform, is_static)
+        if is_static or parent != self.odom:
+            return None
+        self.base = child
+        return flat_pose(transform.transform.translation, transform.transform.rotation)
+
+    def mount(self, message: Any, may_wait: bool, say: Callable[[str], None]) -> Mount | None:
+        """Where the laser of a scan is; None if transforms may still come and `may_wait`."""
+        frame = frame_name(message.header.frame_id)
+        if self.given:
+            x, y, degrees = self.given
+            return Mount((x, y, math.radians(degrees)))
+        if frame in self._mounts:
+            return self._mounts[frame]
+        notes, assumed = list[str](), dict[str, str]()
+        mount = mount_of(self.known, self.odom, self.base, frame, notes, assumed)
+        if assumed:
+            if may_wait:
+                return None
+            say(f"/tf_static: {assumed['mount']}")
+            return mount
+        try:
+            mount = believed(mount, [message], frame, "/tf_static", False, notes)
+        except LogError as error:
+            notes.append(f"{error}; the laser is taken to be level")
+            mount = Mount(mount.pose, mount.is_flipped)
+        for note in notes:
+            say(note)
+        self._mounts[frame] = mount
+        return mount
+
+
+class LiveNode:
+    """The topics and services of a lifecycle node, around a session."""
 
     def __init__(
         self,
         node: Any,
         session: LiveSession,
+        pairing: StampPairing,
         new_mapper: Callable[[], OnlineLogMapper],
-        scan_topic: str,
-        odom_topic: str,
-        mount: Pose | None,
+        options: NodeOptions,
         say: Callable[[str], None],
     ) -> None:
         from nav_msgs.msg import Odometry
+        from rclpy.clock import Clock, ClockType
+        from rclpy.lifecycle import SimpleManagedEntity
+        from rclpy.parameter import Parameter
         from rclpy.qos import DurabilityPolicy, QoSProfile
         from sensor_msgs.msg import LaserScan
         from std_msgs.msg import String
@@ -103,29 +199,48 @@ class _LiveNode:
         from visualization_msgs.msg import MarkerArray
 
         self.node, self.session, self._say = node, session, say
-        self.pairing, self.heard = StampPairing(), time.monotonic()
-        self._new_mapper, self._mount = new_mapper, mount
-        self._mounts: dict[str, Pose] = {}
-        self._begun, self._said, self._paused = time.monotonic(), set[str](), False
-        self._kinds = {
-            scan_topic: (LaserScan, self._on_scan),
-            odom_topic: (Odometry, self._on_odom),
+        self.pairing, self.heard = pairing, time.monotonic()
+        self._new_mapper = new_mapper
+        self._begun, self._said, self._told_events = time.monotonic(), set[str](), 0
+        for name, value in PARAMETERS.items():
+            node.declare_parameter(name, getattr(options, name, value))
+        node.declare_parameter(
+            "mount", Parameter.Type.DOUBLE_ARRAY if options.mount is None else [*options.mount]
+        )
+        given = tuple(node.get_parameter_or("mount").value or ())
+        self._frames = LaserFrames(str(self._value("odom_frame")), given)
+        self._by_frames = self._value("odom_topic").strip("/") == "tf"
+        self._listen_to_frames()
+        self._kinds: dict[str, tuple[Any, Callable[[Any], None]]] = {
+            str(self._value("scan_topic")): (LaserScan, self._on_scan)
         }
-        self._listening: set[str] = set()
+        if not self._by_frames:
+            self._kinds[str(self._value("odom_topic"))] = (Odometry, self._on_odom)
+        self._listening, self._came = set[str](), set[Any]()
         last = session.mapper.live.log.scans[-1].time if len(session.mapper) else None
         self._after = -math.inf if last is None else last
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._markers = node.create_publisher(MarkerArray, "~/markers", latched)
-        self._map = node.create_publisher(String, "~/map", latched)
-        self._belief = node.create_publisher(String, "~/belief", 10)
-        for name, value in (("place", 0), ("to", 0), ("text", "")):
-            node.declare_parameter(name, value)
-        for name in ("save", "reset", "name", "route", "why"):
+        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._topics = {
+            name: node.create_publisher(kind, f"~/{name}", quality)
+            for name, kind, quality in (
+                ("markers", MarkerArray, latched),
+                ("map", String, latched),
+                ("events", String, latched),
+                ("belief", String, 10),
+            )
+        }
+        for name in ("save", "reset", "name", "correct", "route", "why", "next"):
             node.create_service(Trigger, f"~/{name}", self._service(getattr(self, f"_{name}")))
         node.create_service(SetBool, "~/pause", self._service(self._pause))
-        self._listen_to_frames(mount)
-        node.create_timer(TICK, self._tick)
-        node.create_timer(LOOK, self._look)
+        # Timers go on if the simulated time stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(TICK, self._tick, clock=steady)
+        node.create_timer(LOOK, self._look, clock=steady)
+        self._state = SimpleManagedEntity()
+        node.add_managed_entity(self._state)
+        if self._value("autostart"):
+            node.trigger_configure()
+            node.trigger_activate()
 
     def _once(self, text: str) -> None:
         if text not in self._said:
@@ -140,31 +255,44 @@ class _LiveNode:
         except Damaged as error:
             self._once(f"{what}: a message was dropped: {error}")
 
-    def _listen_to_frames(self, mount: Pose | None) -> None:
+    def _listen_to_frames(self) -> None:
+        """Listen to transforms, if their message is installed. Raises LogError if it must be."""
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:
-            if mount is None:
+            if self._by_frames:
+                raise LogError(
+                    "/tf: expected the ROS package tf2_msgs, which reads transforms, got none; "
+                    "install it, or name a topic with Odometry"
+                ) from None
+            if not self._frames.given:
+                self._frames.given = (0.0, 0.0, 0.0)
                 self._once(
                     "tf2_msgs is not installed, so the laser is taken to be in the middle of the "
                     "robot; if it is not, give --set mount=X,Y,DEGREES"
                 )
             return
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(TFMessage, "/tf_static", self._on_frames, latched)
+        fixed, moving = (partial(self._on_frames, is_static=static) for static in (True, False))
+        self.node.create_subscription(TFMessage, "/tf_static", fixed, latched)
+        if self._by_frames:
+            topic = str(self._value("odom_topic"))
+            self.node.create_subscription(TFMessage, topic, moving, DEEP)
 
-    def _on_frames(self, message: Any) -> None:
+    def _on_frames(self, message: Any, is_static: bool) -> None:
         for one in message.transforms:
-            with self._told("/tf_static"):
-                at = flat_pose(one.transform.translation, one.transform.rotation)
-                self._mounts[frame_name(one.child_frame_id)] = at
+            with self._told("transforms"):
+                if (pose := self._frames.add(one, is_static)) is not None:
+                    self._add_pose(stamp_of(one.header), pose)
 
     def _look(self) -> None:
         """Listen to the topics that are there, and say what is missing."""
         from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 
+        is_late = time.monotonic() - self._begun > PATIENCE
+        topics = dict(self.node.get_topic_names_and_types())
         for topic, (kind, call) in self._kinds.items():
             sources = self.node.get_publishers_info_by_topic(topic)
             if len(sources) > 1:
@@ -178,56 +306,76 @@ class _LiveNode:
                 self.node.create_subscription(kind, topic, call, quality)
                 how = "reliable" if is_reliable else "best effort, so messages may be lost"
                 self._once(f"listening to {topic}, {how}")
-            elif not sources and time.monotonic() - self._begun > PATIENCE:
-                there = sorted(name for name, _ in self.node.get_topic_names_and_types())
-                if topic not in self._listening:
-                    self._once(
-                        f"{topic}: expected messages, got none for {PATIENCE:.0f} s; there are "
-                        f"{', '.join(there)}; name the topic"
-                    )
+            if is_late and kind not in self._came:
+                there = ", ".join(f"{name} ({' '.join(of)})" for name, of in sorted(topics.items()))
+                self._once(
+                    f"{topic}: expected messages {kind.__name__}, got none for {PATIENCE:.0f} s "
+                    f"from {len(sources)} publishers; there are {there}; name the topic"
+                )
+        if is_late and self._by_frames and not self._frames.base:
+            known = ", ".join(
+                f"{one} to {child}" for child, of in self._frames.known.items() for one in of
+            )
+            self._once(
+                f"expected transforms from {self._frames.odom} for {PATIENCE:.0f} s, got "
+                f"{known or 'none'}; set the parameter odom_frame"
+            )
 
     def _on_odom(self, message: Any) -> None:
-        self.heard = time.monotonic()
-        before = self.pairing.restarts
+        self._came.add(type(message))
+        self._frames.base = frame_name(message.child_frame_id)
         with self._told("odometry"):
             at = flat_pose(message.pose.pose.position, message.pose.pose.orientation)
-            self.pairing.add_pose(stamp_of(message.header), at)
+            self._add_pose(stamp_of(message.header), at)
+
+    def _add_pose(self, at: float, pose: Pose) -> None:
+        self.heard, before = time.monotonic(), self.pairing.restarts
+        self.pairing.add_pose(at, pose)
         if self.pairing.restarts > before:
             self._after = -math.inf
             self._say("the clock went back: it started anew")
         self._work()
 
     def _on_scan(self, message: Any) -> None:
+        self._came.add(type(message))
         self.heard = time.monotonic()
         if not len(message.ranges):
             self._once("a scan has no ranges; look at the driver of the laser")
-            return
-        self.pairing.add_scan(stamp_of(message.header), message)
-        self._work()
+        elif not self._state.is_activated:
+            self.pairing.lost["while paused"] += 1
+        else:
+            self.pairing.add_scan(stamp_of(message.header), message)
+            self._work()
+
+    def _mount_of(self, message: Any) -> Mount | None:
+        may_wait = time.monotonic() - self._begun < PATIENCE
+        return self._frames.mount(message, may_wait, self._once)
 
     def _work(self) -> None:
-        for at, message, pose in self.pairing.ready():
-            if at <= self._after or self._paused:  # known from the saved state
+        for at, message, pose in self.pairing.ready(lambda one: self._mount_of(one) is not None):
+            if self._after - at > BACK:
+                self._say("the clock is behind the saved state: the robot may be anywhere")
+                self.session.mapper.lift()
+                self._after = -math.inf
+            if at <= self._after:  # known from the saved state
                 continue
-            frame = frame_name(message.header.frame_id)
-            mount = self._mount or self._mounts.get(frame, (0.0, 0.0, 0.0))
-            if self._mount is None and self._mounts and frame not in self._mounts:
-                self._once(
-                    f"/tf_static: expected the frame {frame}, got {', '.join(self._mounts)}; the "
-                    "laser is taken to be in the middle of the robot"
-                )
-            number = len(self.session.mapper)
-            self.session.take(scan_of(message, mount, pose, number))
+            mount = self._mount_of(message)
+            assert mount is not None
+            with self._told("scan"):
+                self.session.take(scan_of(message, mount, pose, len(self.session.mapper)))
 
     def _tick(self) -> None:
         from std_msgs.msg import String
 
         if self.session.tick():
             self._publish()
+        for text in self.session.events[self._told_events :]:
+            self._topics["events"].publish(String(data=text))
+        self._told_events = len(self.session.events)
         if self.session.seen is not None:
             seen = self.session.seen
             said = {"pose": seen.pose, "on_map": seen.on_map, "belief": seen.belief}
-            self._belief.publish(String(data=json.dumps(said)))
+            self._topics["belief"].publish(String(data=json.dumps(said)))
 
     def _publish(self) -> None:
         """Publish the map as JSON and as markers."""
@@ -235,28 +383,32 @@ class _LiveNode:
         from std_msgs.msg import String
         from visualization_msgs.msg import Marker, MarkerArray
 
-        found = self.session.mapper.to_dict()
-        self._map.publish(String(data=json.dumps(found)))
+        found, now = self.session.told, self.node.get_clock().now().to_msg()
+        self._topics["map"].publish(String(data=json.dumps(found)))
         at = {place["place"]: (place["x"], place["y"]) for place in found["places"]}
 
         def marker(sort: str, number: int, kind: int, size: float) -> Any:
             made = Marker(ns=sort, id=number, type=kind, action=Marker.ADD)
-            made.header.frame_id = "odom"
+            made.header.frame_id, made.header.stamp = self._frames.odom, now
             made.pose.orientation.w = made.color.a = made.color.g = 1.0
             made.scale.x = made.scale.y = made.scale.z = size
             return made
 
         clear = Marker(action=Marker.DELETEALL)
-        clear.header.frame_id = "odom"
+        clear.header.frame_id = self._frames.odom
         markers = [clear]
         for place, (x, y) in at.items():
             ball = marker("places", place, Marker.SPHERE, 0.6)
             ball.pose.position.x, ball.pose.position.y = x, y
             markers.append(ball)
+        for number, (x, y) in enumerate(found["provisional"]):
+            dot = marker("provisional", number, Marker.SPHERE, 0.3)
+            dot.pose.position.x, dot.pose.position.y = x, y
+            markers.append(dot)
         lines = marker("edges", 0, Marker.LINE_LIST, 0.1)
         for pair in found["edges"]:
             lines.points += [Point(x=at[n][0], y=at[n][1]) for n in pair]
-        self._markers.publish(MarkerArray(markers=[*markers, lines]))
+        self._topics["markers"].publish(MarkerArray(markers=[*markers, lines]))
 
     def _service(self, act: Callable[[Any], str]) -> Callable[[Any, Any], Any]:
         """Make the callback of a service: `act` returns what is said, or raises AbductionError."""
@@ -283,17 +435,26 @@ class _LiveNode:
         return "a new drive begins"
 
     def _pause(self, request: Any) -> str:
-        self._paused = bool(request.data)
-        return "scans are dropped" if self._paused else "scans are taken"
+        if request.data == self._state.is_activated:
+            (self.node.trigger_deactivate if request.data else self.node.trigger_activate)()
+        return "scans are dropped" if request.data else "scans are taken"
 
     def _name(self, _: Any) -> str:
-        self.session.mapper.name(self._value("place"), self._value("text"))
-        self._publish()
+        self.session.happened(self.session.mapper.name(self._value("place"), self._value("text")))
         return f"place {self._value('place')} is {self._value('text')}"
+
+    def _correct(self, _: Any) -> str:
+        """Say with `text` that the scans `first` and `second` are at one place, or at two."""
+        kind, first, second = map(self._value, ("text", "first", "second"))
+        self.session.mapper.correct(kind, first, second)
+        return f"{kind} {first}, {second}: the next search obeys"
+
+    def _next(self, _: Any) -> str:
+        return self.session.mapper.next()
 
     def _route(self, _: Any) -> str:
         """The places on the shortest route, in metres, from `place` to `to`."""
-        found = self.session.mapper.to_dict()
+        found = self.session.told
         at = {place["place"]: (place["x"], place["y"]) for place in found["places"]}
         graph = nx.Graph()
         graph.add_nodes_from(at)

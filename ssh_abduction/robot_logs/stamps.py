@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from bisect import bisect
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from ssh_abduction.data.odometry import Pose
@@ -61,7 +61,7 @@ class StampPairing:
         """Add a scan at a time in seconds."""
         if time == self._last:
             self.lost["doubled"] += 1
-        elif time < self._last and self._last - time <= BACK:
+        elif time < self._last:
             self.lost["out of order"] += 1
         else:
             self._last = time
@@ -70,9 +70,16 @@ class StampPairing:
                 self._scans.popleft()
                 self.lost["too many"] += 1
 
-    def ready(self) -> Iterator[tuple[float, Any, Pose]]:
-        """Yield the scans whose poses are known: the time, the scan and its pose."""
+    def ready(
+        self, may_go: Callable[[Any], bool] = lambda _: True
+    ) -> Iterator[tuple[float, Any, Pose]]:
+        """Yield the scans whose poses are known: the time, the scan and its pose.
+
+        All scans wait while the first one may not go.
+        """
         while self._scans and self._times and self._scans[0][0] <= self._times[-1]:
+            if not may_go(self._scans[0][1]):
+                break
             time, scan = self._scans.popleft()
             k = bisect(self._times, time)
             if k == 0:
