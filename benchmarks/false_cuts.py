@@ -107,8 +107,7 @@ def carried(log: RobotLog) -> RobotLog:
     for one, other in pairwise(last):
         poses.append(moved(poses[-1], displacement_between(one.odometry, other.odometry)))
     after = (replace(scan, odometry=pose) for scan, pose in zip(last, poses, strict=True))
-    scans = [replace(scan, time=None) for scan in (*first, *after)]
-    return replace(log, scans=tuple(scans))
+    return replace(log, scans=(*first, *after))
 
 
 def row(log: RobotLog, notes: Sequence[str], cuts: Sequence[int]) -> str:

@@ -79,7 +79,7 @@ POINTS = 150
 # worth a nat. A pose loses what the odometry says against it, but at most MISSED nats, as odometers
 # miss a turn once in thousands of steps. A pose that puts more than the share INTRUDING of the
 # points into free space does not count: few walls fit by chance. Where odometers truly missed a
-# turn, at most 24 % of the points intrude, and 80 % where they did not.
+# turn, at most 24 % of the points intrude, and at least 80 % where they did not.
 POOR, HEADINGS, MISSED = 0.5, 24, 8.0
 # Matching fails in at most 1.5 % of the scans of good logs.
 FAILING = 0.05
