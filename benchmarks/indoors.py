@@ -10,8 +10,9 @@ that `map` wrote. A corridor of the plan counts if the robot visited three of it
 is whole if one corridor of the map, and no other, has at least two of them, and all but one.
 
 The order of the places of a corridor of the map is judged by Kendall's tau: it is compared with
-their true positions along the line that fits them best. A place is truly left of the corridor if it
-is left of this line.
+their true positions along the line that fits them best. A place is truly left of the path of a
+corridor if its shortest way through the free space of the plan leaves the path to the left. The
+path is the chain of the true positions of its places.
 """
 
 from __future__ import annotations
@@ -20,19 +21,26 @@ import json
 import sys
 import xml.etree.ElementTree as ET
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from follower import BODY, CELL, World
+from skimage.graph import MCP_Geometric
 
+from simulator.plans import Plan
+from simulator.rounds import Building
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.building.derive import with_building
 from ssh_abduction.output.roads import place_of_steps
 from ssh_abduction.solver import Solution
 
 
-def judged(ssh_map: SSHMap, trace: Trace, told: dict[str, Any], labels: list[str]) -> Counter[str]:
+def judged(
+    ssh_map: SSHMap, trace: Trace, told: dict[str, Any], labels: list[str], world: World
+) -> Counter[str]:
     """Count what is right, by the truth of the drive and the labels of the rooms of the plan."""
     places, counts = place_of_steps(ssh_map), Counter[str]()
     scans = [int(step.extra["scan"]) for step in trace.steps]
@@ -55,7 +63,7 @@ def judged(ssh_map: SSHMap, trace: Trace, told: dict[str, Any], labels: list[str
             found = any(d["side"] == "through" for d in trace[t].extra.get("doors", ()))
             more = {"doors found": found, "doors true": passed, "doors": found and passed}
             counts += Counter(more)
-    counts += ordered(ssh_map, trace)
+    counts += ordered(ssh_map, trace, world)
     corridors = [{*c.order} for c in ssh_map.corridors]
 
     def label(name: str) -> str:
@@ -75,7 +83,7 @@ def judged(ssh_map: SSHMap, trace: Trace, told: dict[str, Any], labels: list[str
     return counts
 
 
-def ordered(ssh_map: SSHMap, trace: Trace) -> Counter[str]:
+def ordered(ssh_map: SSHMap, trace: Trace, world: World) -> Counter[str]:
     """Count pairs of places of corridors in order and not, and places on the right side."""
     seen: dict[int, list[Any]] = defaultdict(list)
     for step, place in zip(trace.steps, place_of_steps(ssh_map), strict=True):
@@ -87,16 +95,32 @@ def ordered(ssh_map: SSHMap, trace: Trace) -> Counter[str]:
         at = np.array([where[p] for p in c.order])
         axis = np.linalg.svd(at - at.mean(axis=0))[2][0]
         axis = axis * np.sign((at[-1] - at[0]) @ axis)
-        across = np.array([-axis[1], axis[0]])
         along = [float(x) for x in at @ axis]
         for x, y in combinations(along, 2):
             counts["in order" if x < y else "out of order"] += 1
-        left = {p: float(across @ (where[p] - at.mean(axis=0))) > 0 for p in where}
+        way = next(path.order for path in ssh_map.paths if path.id == c.path)
+        left = left_of([where[p] for p in way], where, world)
         told = {**dict.fromkeys(c.left, True), **dict.fromkeys(c.right, False)}
         counts["beside"] += len(set(where) - set(c.order))
         counts["sides"] += len(told)
         counts["sides right"] += sum(left[p] == side for p, side in told.items())
     return counts
+
+
+def left_of(line: Sequence[Any], where: dict[int, Any], world: World) -> dict[int, bool]:
+    """Whether the shortest way from a chain of points to each place leaves it to the left."""
+    share = np.linspace(0, len(line) - 1, 20 * len(line))
+    chain = np.array([np.interp(share, range(len(line)), np.array(line)[:, k]) for k in (0, 1)]).T
+    costs = MCP_Geometric(np.where(world.clear > BODY, CELL, 100.0))
+    costs.find_costs([world.cell(point) for point in chain])
+    found = {}
+    for place, at in where.items():
+        steps = np.array(costs.traceback(world.cell(at))) * CELL + world.corner
+        off = steps[min(round(1 / CELL), len(steps) - 1)] - steps[0]
+        k = int(np.hypot(*(chain - steps[0]).T).argmin())
+        ahead = chain[min(k + 3, len(chain) - 1)] - chain[max(k - 3, 0)]
+        found[place] = float(ahead[0] * off[1] - ahead[1] * off[0]) > 0
+    return found
 
 
 def main(arguments: list[str]) -> None:
@@ -108,7 +132,8 @@ def main(arguments: list[str]) -> None:
         trace = Trace.load(Path(folder) / "trace.jsonl")
         ssh_map = with_building(Solution.load(Path(folder) / "maps.json").maps[0], trace)
         told = json.loads(Path(log).with_suffix(".truth.json").read_text())
-        counts = judged(ssh_map, trace, told, labels)
+        world = World(Building.of(Plan.load(plan)))
+        counts = judged(ssh_map, trace, told, labels, world)
         total, maps = total + counts, maps + 1
         print(folder, dict(counts))
     pairs = total["in order"] + total["out of order"]
