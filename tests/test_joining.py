@@ -337,9 +337,9 @@ def test_unknown_view_does_not_join_two_known_ones() -> None:
     trace = Trace.from_steps(["a", None, "b"], ["travel", "travel"])
     sights = Sights(trace, settle(trace, Theory(star="none")).theory)
     a, unknown, b = (dict.fromkeys([number], math.inf) for number in sights.seen)
-    assert sights.may_be_one(a, unknown)
-    assert sights.may_be_one(a | unknown, a)
-    assert not sights.may_be_one(a | unknown, b | unknown)
+    assert sights.merging(a, unknown) == 0.0
+    assert sights.merging(a | unknown, a) == 0.0
+    assert sights.merging(a | unknown, b | unknown) == math.inf
     assert sights.right({min(unknown): 3.0, min(b): 1.0, min(a): 2.0}) == min(a)
 
 

@@ -56,7 +56,6 @@ class Misfit:
         self._equations = Equations.of(self.trace)
         self._known: dict[_Groups, float] = {}
         self._likelihood: dict[_Groups, tuple[float, float, Aliases]] = {}
-        self._saved: dict[_Groups, float] = {}
 
     def of_returns(self, returns: Iterable[Equality], wrong: Collection[int] = ()) -> float:
         """Return a lower bound on the misfit of maps with returns, ignoring `wrong` moves.
@@ -103,17 +102,12 @@ class Misfit:
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int]
     ) -> float:
         """Return the nats that views and stars save where aliases lay a part on another part."""
-        groups, aliases = (
-            _groups_of(dstates, places, wrong),
-            self.aliases_of(dstates, places, wrong),
-        )
-        if not aliases:
+        if not (aliases := self.aliases_of(dstates, places, wrong)):
             return 0.0
-        if groups not in self._saved:
-            pairs = self._explaining(groups).repeats(aliases, self._prior.near)
-            named = enumerate((numbered(dstates), numbered(places)))
-            self._saved[groups] = sum(self._prior.repeated(of, x, pairs[of]) for of, x in named)
-        return self._saved[groups]
+        of_map = self._explaining(_groups_of(dstates, places, wrong))
+        pairs = of_map.repeats(aliases, self._prior.near)
+        named = enumerate((numbered(dstates), numbered(places)))
+        return sum(self._prior.repeated(of, x, pairs[of]) for of, x in named)
 
     def aliases_of(
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()

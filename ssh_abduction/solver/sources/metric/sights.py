@@ -84,19 +84,14 @@ class Sights:
         """
         return self._wrong(seen, self.right(seen)) if len(seen) > 1 else 0.0
 
-    def may_be_one(self, first: Mapping[int, float], second: Mapping[int, float]) -> bool:
-        """Whether steps that saw this (`seen`) may be at one dstate, if no view is misread."""
-        if first.keys() == second.keys() or not self._has_unknown:
-            return first.keys() == second.keys()
-        return self.misread(dict.fromkeys([*first, *second], math.inf)) == 0.0
-
     def merging(self, first: Mapping[int, float], second: Mapping[int, float]) -> float:
         """Return how many nats more misread views cost if two dstates are one; inf if forbidden."""
-        if not self._misreads:
-            return 0.0 if self.may_be_one(first, second) else math.inf
-        return (
-            self.misread(seen_at_both(first, second)) - self.misread(first) - self.misread(second)
-        )
+        if first.keys() == second.keys() and not self._misreads:
+            return 0.0
+        if not (self._misreads or self._has_unknown):
+            return math.inf
+        cost = self.misread(seen_at_both(first, second))
+        return cost - self.misread(first) - self.misread(second)
 
     def right(self, seen: Mapping[int, float]) -> int:
         """Return what steps at a dstate saw rightly, if the misread views cost the least nats."""
