@@ -90,23 +90,17 @@ def paragraph(sentence: str) -> str:
     return f"<p>{html_text(sentence)}</p>"
 
 
-def html_table(
-    head: Sequence[str],
-    rows: Iterable[Iterable[object]],
-    more: str = "rows",
-    *,
-    is_whole: bool = False,
-) -> str:
+def html_table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "rows") -> str:
     """Make an HTML table, whose cells become plain text.
 
-    Unless it `is_whole`, it has at most ROWS rows and short cells. If rows are left out, a sentence
-    below says how many. `more` is the word for rows in that sentence.
+    It has at most ROWS rows and short cells. If rows are left out, a sentence below says how many.
+    `more` is the word for rows in that sentence.
     """
     listed = list(rows)
-    shown = listed if is_whole else [map(_cut, map(str, row)) for row in listed[:ROWS]]
+    shown = [[*map(_cut, map(str, row))] for row in listed[:ROWS]]
     names = "".join(f"<th>{html_text(name)}</th>" for name in head)
     body = "".join(
-        f"<tr>{''.join(f'<td>{html_text(str(cell))}</td>' for cell in row)}</tr>" for row in shown
+        f"<tr>{''.join(f'<td>{html_text(cell)}</td>' for cell in row)}</tr>" for row in shown
     )
     missing = len(listed) - len(shown)
     left = paragraph(f"and {missing} more {more}") if missing else ""

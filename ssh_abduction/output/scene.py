@@ -1,9 +1,8 @@
 """What a picture shows, as a value: marks in the coordinates of the map, with x right and y up.
 
 `drawing` draws any scene, as SVG or with matplotlib. `scene_of` makes the scene of a map: its
-places, paths, dstates, links, regions, floors and faults. `robot_logs/log_picture.py` makes that of
-a log. Sizes of marks, such as the width of a line, are in units of the page, which are a pixel
-each.
+places, paths, dstates, links, regions, floors and faults. Sizes of
+marks, such as the width of a line, are in units of the page, which are a pixel each.
 
 A dstate (distinctive state) is a place and a heading. A map with poses is drawn to scale, with
 ellipses of two standard deviations that show how uncertain positions relative to the first dstate
