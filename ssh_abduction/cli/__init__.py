@@ -27,7 +27,6 @@ from typing import Any
 
 from ssh_abduction.cli import (
     about,
-    agents,
     compare,
     correct,
     demo,
@@ -36,6 +35,7 @@ from ssh_abduction.cli import (
     learn,
     live_map,
     mapping,
+    mcp,
     repair,
     simulate,
     solve,
@@ -81,7 +81,7 @@ VERBS: Mapping[str, tuple[Verb, ...]] = {
         use.run_view,
         correct.run_name,
         correct.run_correct,
-        agents.run_mcp,
+        mcp.run_mcp,
     ),
     "learn: recognise places from images": (
         learn.run_train,

@@ -400,6 +400,19 @@ def is_done(folder: Path, logs: Sequence[str], settings: dict[str, Any]) -> bool
     return is_same and not run.get("interrupted") and bool(content == _content(logs))
 
 
+def logs_in(folder: Path) -> list[str]:
+    """Return the logs of the map in a folder, in their order. Raises AbductionError without one."""
+    run = _run_in(folder)
+    sources = [drive.get("source") for drive in run.get("drives", ())] or [
+        run.get("log", {}).get("source")
+    ]
+    if not all(isinstance(source, str) for source in sources):
+        raise AbductionError(
+            f"{named(folder)}: expected a folder with the map of a log, got none; map a log first"
+        )
+    return [*dict.fromkeys(sources)]
+
+
 def digest(logs: Sequence[str]) -> str | None:
     """Compute the SHA-256 digest of the unpacked content of logs, as hexadecimal text.
 

@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ssh_abduction.cli import import_log, jobs, shared
 from ssh_abduction.cli.correct import say_obeyed
-from ssh_abduction.cli.outcome import EXIT_ERROR, Guard, StopFlag, exit_code, on_ctrl_c, warn
+from ssh_abduction.cli.outcome import (
+    EXIT_ERROR,
+    EXIT_UNPROVEN,
+    Guard,
+    StopFlag,
+    exit_code,
+    on_ctrl_c,
+    warn,
+)
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.corrections import (
@@ -30,12 +38,13 @@ from ssh_abduction.data.corrections import (
     to_yaml,
 )
 from ssh_abduction.data.errors import AbductionError, MapError, brief, named
+from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.runtime import workers
 from ssh_abduction.runtime.loggers import begin_stage, stages
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solver import Stop, check_limit
+from ssh_abduction.solver import Solution, Stop, check_limit
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
@@ -63,6 +72,9 @@ class MapQuestion(jobs.FileQuestion):
     known: tuple[SSHMap, ...] | None = None
     # Units of work for the search for minimal maps; None for the default of `map_log`.
     work: float | None = None
+    # Whether logs are added to those of the map in the folder. Views are clustered anew, so the
+    # fingerprints of the old drives change, and are not compared.
+    adding: bool = False
 
     patience: ClassVar = 10.0
     killed: ClassVar = (
@@ -80,8 +92,10 @@ class MapQuestion(jobs.FileQuestion):
 
     def obeying(self, folder: Path) -> MapQuestion:
         """Return this question with the corrections in a folder, if any. Raises MapError."""
-        file = beside(folder / "maps.json")
-        return self if file is None else replace(self, corrections=load_corrections(file))
+        if (file := beside(folder / "maps.json")) is None:
+            return self
+        said = load_corrections(file)
+        return replace(self, corrections=replace(said, drives={}) if self.adding else said)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -258,6 +272,10 @@ class MapQuestion(jobs.FileQuestion):
     {
         "logs log...": import_log.LOG_SAID,
         "--together": "the logs are drives through one building: find their joint maps",
+        "--add": (
+            "the logs are further drives through the building whose map is in the folder: map them "
+            "with its logs. Names stay with their places, and the answer says how many numbers stay"
+        ),
         "-o --output FOLDER!": "folder to write; each of several logs gets a folder inside it",
         **shared.max_maps("minimal maps", 300),
         "--work-limit W": (
@@ -307,6 +325,8 @@ def run_map(options: argparse.Namespace) -> int:
         work=options.work_limit,
         maps=options.maps,
     )
+    if options.add:
+        return _added(replace(question, adding=True), options)
     if options.together:
         return _together(question, options)
     folders, same = import_log.folders_of(options.logs, Path(options.output))
@@ -364,6 +384,61 @@ def _together(question: MapQuestion, options: argparse.Namespace) -> int:
     return _here(question, logs, folder)
 
 
+def _added(question: MapQuestion, options: argparse.Namespace) -> int:
+    """Map the logs of the map in the folder and further ones together. Return the exit code."""
+    folder = Path(options.output)
+    before = import_log.logs_in(folder)
+    for log in before:
+        if not Path(log).exists():
+            raise AbductionError(
+                f"{named(log)}: expected the log of the map in {named(folder)}, got no such file; "
+                "call this where the map was made, or put the log there"
+            )
+    old = Solution.load(folder / "maps.json").maps
+    options.logs = [*before, *(log for log in options.logs if log not in before)]
+    code = _together(question, options)
+    new = Solution.load(folder / "maps.json").maps
+    if old and new and code in (0, EXIT_UNPROVEN):
+        print(_numbers_kept(old[0], new[0]))
+    return code
+
+
+def _with_corrections(answer: jobs.FileAnswer, folder: Path) -> jobs.FileAnswer:
+    """Add the corrections in a folder to an answer of more drives, with the new fingerprints.
+
+    Raises MapError if the steps of the old drives are at other scans, as corrections name steps.
+    """
+    files, file = dict(answer.files), beside(folder / "maps.json")
+    if file is None or not files:
+        return answer
+    scans = [
+        [json.loads(line).get("scan") for line in data.splitlines()[1:]]
+        for data in ((folder / "trace.jsonl").read_bytes(), files["trace.jsonl"])
+    ]
+    if scans[0] != scans[1][: len(scans[0])]:
+        raise MapError(
+            f"{named(file)}: expected drives whose steps are where they were, got other steps when "
+            "the logs were imported together; nothing was written: map them into another folder"
+        )
+    marks = {d["name"]: d["fingerprint"] for d in json.loads(files["maps.json"])["drives"]}
+    said = to_yaml(replace(load_corrections(file), drives=marks))
+    return replace(answer, files=(*answer.files, (file.name, said.encode())))
+
+
+def _numbers_kept(old: SSHMap, new: SSHMap) -> str:
+    """Say how many places of a map are in another one, whose first steps are those of the map."""
+    at = [
+        [m.dstates[label].place for label in m.dstate_at[: len(old.dstate_at)]] for m in (old, new)
+    ]
+    steps = [gathered((place, t) for t, place in enumerate(some)) for some in at]
+    kept = sum(steps[1].get(place) == some for place, some in steps[0].items())
+    more = len({s.place for s in new.dstates} - {*at[1]})
+    return (
+        f"{kept} of {counted(len(steps[0]), 'places')} keep their visits and their number; "
+        f"{counted(more, 'places')} {'is' if more == 1 else 'are'} new"
+    )
+
+
 def _check_alone(path: str, folder: Path) -> None:
     """Raise MapError if a log that is mapped among others has corrections in its folder."""
     if (file := beside(folder / "maps.json")) is not None:
@@ -382,7 +457,7 @@ def _here(question: MapQuestion, logs: Sequence[str], folder: Path) -> int:
         warn([warning])
 
     def keep(answer: jobs.FileAnswer) -> None:
-        _keep(answer, folder)
+        _keep(_with_corrections(answer, folder) if question.adding else answer, folder)
         warn([warning for warning in answer.warnings if warning not in printed])
 
     import_log.check_run_folder(folder)

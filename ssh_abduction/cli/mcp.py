@@ -10,7 +10,9 @@ from ssh_abduction.cli.parsing import verb
 @verb(
     {
         "folders folder...": "folder that map wrote, or that live saves to",
-        "--write": "let agents name places and correct joins, in corrections.yaml of the folders",
+        "--set write true|false=false": (
+            "whether agents may name things and correct joins, in corrections.yaml of the folders"
+        ),
     }
 )
 def run_mcp(options: argparse.Namespace) -> int:
@@ -18,7 +20,7 @@ def run_mcp(options: argparse.Namespace) -> int:
 
     Serve the Model Context Protocol on standard input and output. Tools list rooms and places, find
     things by name, tell a route in words, say whether two visits were to one place, how sure that
-    is and why, and plan the next experiment. Without --write nothing is changed. No other folder
+    is and why, and plan the next experiment. Without write=true nothing is changed. No other folder
     is read or written.
     """
     from ssh_abduction.cli.agent_desk import MapDesk, server_of  # loads numpy and clingo
