@@ -374,7 +374,7 @@ def _length(log: RobotLog) -> tuple[float, list[str]]:
         tried = Units(UNITS[unit]).convert(stretch)
         seen = follow(tried)
         ways = [np.hypot(*np.diff(way[:, :2], axis=0).T) for way in (tried.odometry, seen.poses)]
-        if seen.breaks or share_failing(seen) > HOPELESS:
+        if seen.breaks or share_failing(seen) > FAILING:
             return math.inf
         return float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9))
 
