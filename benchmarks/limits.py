@@ -151,6 +151,7 @@ class Case:
             "-m",
             "ssh_abduction",
             "solve",
+            "--strict",
             str(path),
             "--json",
             f"--theory={FAMILIES[self.family][0]}",

@@ -376,7 +376,7 @@ def test_refused_path_becomes_a_rule_for_clingo() -> None:
     asked.grow(len(trace))
     assert isinstance(asked._labels, VisitLabels)
     assert asked._fitting
-    labels = asked._labels.fewest()
+    labels = next(asked._labels.improving(), None)
     assert isinstance(labels, list)
     contrary = asked._fitting.contrary(labels)
     program = asked._labels.program
@@ -405,7 +405,7 @@ def test_sides_and_paths_refuse_the_same_labels(theory: Theory) -> None:
         engine.grow(len(trace))
         assert isinstance(engine._labels, VisitLabels)
         assert engine._fitting
-        labels = engine._labels.fewest()
+        labels = next(engine._labels.improving(), None)
         assert labels
         chart = engine._labels.chart
         control = engine._fitting._base(labels, engine._fitting._members(labels))
@@ -476,7 +476,7 @@ def test_framed_search_at_the_time_limit_gives_map_and_bound() -> None:
     assert solution.cost
     assert solution.cost.dstates == solution.bound.dstates == 36
     assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
-    with patch.object(VisitLabels, "fewest", side_effect=KeyboardInterrupt):
+    with patch.object(VisitLabels, "improving", side_effect=KeyboardInterrupt):
         solution = solve(walk.trace, Theory.topological())
     assert solution.status is Status.FEASIBLE
     assert check(walk.trace, solution.maps[0], Theory.topological()) == ()
@@ -513,10 +513,10 @@ def test_framed_engine_continues_after_a_limit() -> None:
 
         with patch.object(engine.asker.watch, "check", check_once):
             try:
-                labels = engine._labels.fewest()
+                labels = next(engine._labels.improving(), None)
             except LimitError:
                 stopped += 1
-                labels = engine._labels.fewest()
+                labels = next(engine._labels.improving(), None)
         assert labels is not None
         assert len(set(labels)) == engine.bound
         fewest.add(len(set(labels)))

@@ -33,7 +33,6 @@ from ssh_abduction import (
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.cost_claims import misfit
 from ssh_abduction.cli import main
-from ssh_abduction.cli.text import by_displacements
 from ssh_abduction.data import (
     Action,
     Fault,
@@ -534,14 +533,6 @@ def test_named_step_is_a_number_and_survives_pickle() -> None:
     assert steps == tuple(range(8))
     assert [*map(str, pickle.loads(pickle.dumps(steps)))][3:5] == ["monday:3", "tuesday:0"]
     assert named_steps(drives_of(THERE), 4) == range(4)
-
-
-def test_at_most_twelve_weights_are_printed() -> None:
-    there = Trace.from_steps("ab", ["travel"], displacements=[(5, 0, 0)])
-    solution = solve(there)
-    many = replace(solution, maps=solution.maps * 20)
-    told = "\n".join(by_displacements(many))
-    assert told.endswith(f"{', '.join(['0.05'] * 12)}, and 8 more")
 
 
 @pytest.mark.parametrize("words", [[], ["--json"]])
