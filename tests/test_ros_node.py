@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import queue
+import signal
 import subprocess
 import sys
+import threading
+import time
 from array import array
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -22,7 +27,7 @@ from perception.readers.scans import Damaged
 from perception.readers.writers import write_carmen
 from ssh_abduction.cli import main
 from ssh_abduction.robot_logs import stamps
-from ssh_abduction.robot_logs.log_mapper import OnlineLogMapper
+from ssh_abduction.robot_logs.log_mapper import OnlineLogMapper, solved
 from ssh_abduction.robot_logs.ros_node import LaserFrames, scan_of
 from ssh_abduction.robot_logs.stamps import StampPairing
 
@@ -58,6 +63,9 @@ def fed(*items: tuple[str, float]) -> tuple[list[tuple[float, float]], dict[str,
         ([("p", 0), ("s", 1), ("s", 0.5), ("p", 1)], [(1, 1)], {"out of order": 1}),
         # The clock starts anew.
         ([("p", 9), ("s", 9.5), ("p", 0), ("s", 0.5), ("p", 1)], [(0.5, 0.5)], {"no odometry": 1}),
+        ([("p", 9), ("p", 0), ("s", 0.5), ("p", 1)], [(0.5, 0.5)], {}),
+        # Poses are missing.
+        ([("p", 0), ("s", 0), ("s", 1), ("p", 2), ("s", 2)], [(0, 0), (2, 2)], {"no odometry": 1}),
     ],
 )
 def test_scans_get_the_pose_of_their_time(
@@ -120,10 +128,12 @@ def test_scans_wait_until_the_first_one_may_go() -> None:
     assert [at for at, *_ in one.ready(known.__contains__)] == [0.5]
 
 
+DDS = {"ROS_DOMAIN_ID": str(os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
 def over_dds(house: Path, log: Path, *more: str, by_frames: bool = False) -> str:
     """What the node prints while a log is played. It ends when nothing comes any more."""
-    given = {**os.environ, "ROS_DOMAIN_ID": str(os.getpid() % 100)}
-    given["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    given = {**os.environ, **DDS}
     call = [sys.executable, "-m", "ssh_abduction", "live", "--save", str(house), "--set", "idle=20"]
     with subprocess.Popen([*call, *more], env=given, stdout=subprocess.PIPE, text=True) as node:
         play = [sys.executable, str(TESTS / "ros_player.py"), str(log), "20"]
@@ -151,6 +161,70 @@ def test_node_maps_a_drive_over_dds(log: Path, tmp_path: Path) -> None:
     state.write_bytes(b'{"format": "ssh-live", "version": 0}\n')
     assert "place 0 is new" in over_dds(tmp_path / "house", log)
     assert state.read_bytes() == b'{"format": "ssh-live", "version": 0}\n'
+
+
+@needs_ros
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of packages of ROS
+def test_node_obeys_and_ends_over_dds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import rclpy
+    from rclpy.parameter import Parameter
+    from rclpy.parameter_client import AsyncParameterClient
+    from sensor_msgs.msg import LaserScan
+    from std_srvs.srv import Trigger
+
+    mapper = OnlineLogMapper()
+    for scan in every_second_beam(hall(every=0.5)[:120]):
+        mapper.observe(scan)
+    mapper.accept(solved(mapper.task()))
+    mapper.save(tmp_path)
+    places = mapper.to_dict()["places"]
+    [first, second] = next(place["scans"] for place in places if len(place["scans"]) > 1)
+    for name, value in DDS.items():
+        monkeypatch.setenv(name, value)
+    command = [sys.executable, "-m", "ssh_abduction", "live", "--save", str(tmp_path)]
+    said = queue.SimpleQueue[str]()
+
+    def wait_for(part: str) -> None:
+        while part not in said.get(timeout=60):
+            pass
+
+    with contextlib.ExitStack() as last:
+        node = last.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        last.callback(node.kill)
+        threading.Thread(target=lambda: [said.put(line) for line in node.stdout or ()]).start()
+        rclpy.init()
+        last.callback(rclpy.shutdown)
+        person = rclpy.create_node("person")
+
+        def call(name: str, **values: Any) -> Any:
+            client = person.create_client(Trigger, f"/ssh_abduction/{name}")
+            assert client.wait_for_service(timeout_sec=60)
+            parameters = AsyncParameterClient(person, "ssh_abduction")
+            made = [Parameter(key, value=value) for key, value in values.items()]
+            set_all = parameters.set_parameters(made)
+            rclpy.spin_until_future_complete(person, set_all, timeout_sec=60)
+            answer = client.call_async(Trigger.Request())
+            rclpy.spin_until_future_complete(person, answer, timeout_sec=60)
+            return answer.result()
+
+        laser, _ = (person.create_publisher(LaserScan, "/scan", 10) for _ in range(2))
+        wait_for("/scan: expected one publisher, got 2; stop all but one")
+        wait_for("listening to /scan, reliable")
+        while not laser.get_subscription_count():
+            time.sleep(0.05)
+        laser.publish(LaserScan())
+        wait_for("a scan has no ranges")
+        assert call("route", place=0, to=1).message == "0 1"
+        assert "places: expected two of 0, 1" in call("route", to=99).message
+        assert not call("correct", text="elsewhere", first=first, second=first).success
+        assert call("correct", second=second).success
+        wait_for(f"place {len(places)} is new")
+        assert call("reset").success
+        assert '"scans": 0' in call("save").message
+        node.send_signal(signal.SIGTERM)
+        wait_for("interrupted: the drive ends here")
+        wait_for("0 places after 0 scans")
+        assert node.wait(60) == 0
 
 
 @needs_ros

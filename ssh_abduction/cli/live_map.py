@@ -105,7 +105,7 @@ def run_live(options: argparse.Namespace) -> int:
         _listen(options, session)
     else:
         _replay(options, session)
-    _say_map(mapper)
+    _say_map(session.mapper)
     return 0
 
 
@@ -119,19 +119,15 @@ def _listen(options: argparse.Namespace, session: LiveSession) -> None:
         options.scan, options.odom, options.mount, idle=options.idle, ros_args=options.ros_args
     )
 
-    def interrupt() -> None:
-        raise KeyboardInterrupt
-
-    def fresh() -> OnlineLogMapper:
-        return OnlineLogMapper(width, tell)
-
     # The first Ctrl-C or SIGTERM ends the drive, the second one the last search.
-    with on_ctrl_c(interrupt):
+    stop = StopFlag()
+    with on_ctrl_c(stop.ask):
         run_node(
             session,
             lambda: OnlineLogMapper(width, tell),
             given,
             lambda line: print(line, flush=True),
+            stop.is_set,
         )
         session.end()
 

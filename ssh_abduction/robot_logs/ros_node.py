@@ -37,12 +37,12 @@ from perception.readers.scans import Damaged, Scan
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.odometry import Pose
 from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper
-from ssh_abduction.robot_logs.stamps import BACK, StampPairing
+from ssh_abduction.robot_logs.stamps import BACK, MOST_POSES, StampPairing
 
 # Seconds to wait for a topic before that is said, and from one look at the topics to the next.
 PATIENCE, LOOK = 5.0, 1.0
 TICK = 0.1  # seconds
-DEEP = 2000  # messages of a topic that wait, if it is reliable
+DEEP = MOST_POSES  # messages of a topic that wait, if it is reliable
 # Parameters of the node, and their values if no option sets them. `place`, `to`, `first`, `second`
 # and `text` are for services.
 PARAMETERS = {
@@ -86,13 +86,17 @@ def run_node(
     new_mapper: Callable[[], OnlineLogMapper],
     options: NodeOptions,
     say: Callable[[str], None],
+    is_over: Callable[[], bool],
 ) -> None:
-    """Run the node until a KeyboardInterrupt, or until nothing came for a while.
+    """Run the node until `is_over`, or until nothing came for a while.
+
+    Signal handlers may not raise meanwhile: code of ROS in C++ would make a RuntimeError of it.
 
     Raises LogError if ROS 2 is not installed, or cannot read its arguments.
     """
     try:
         import rclpy
+        from rclpy.executors import SingleThreadedExecutor
         from rclpy.lifecycle import LifecycleNode
         from rclpy.signals import SignalHandlerOptions
     except ImportError:
@@ -106,11 +110,13 @@ def run_node(
     pairing, idle = StampPairing(), math.inf if options.idle is None else options.idle
     try:
         live = LiveNode(node, session, pairing, new_mapper, options, say)
-        while rclpy.ok() and time.monotonic() - live.heard < idle:
-            rclpy.spin_once(node, timeout_sec=TICK)
-    except KeyboardInterrupt:
-        say("interrupted: the drive ends here")
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not is_over() and time.monotonic() - live.heard < idle:
+            executor.spin_once(timeout_sec=TICK)
     finally:
+        if is_over():
+            say("interrupted: the drive ends here")
         if pairing.lost:
             parts = (f"{count} {why}" for why, count in pairing.lost.items())
             say(f"scans that were lost: {', '.join(parts)}")
@@ -459,7 +465,11 @@ class LiveNode:
         graph = nx.Graph()
         graph.add_nodes_from(at)
         graph.add_weighted_edges_from((a, b, math.dist(at[a], at[b])) for a, b in found["edges"])
-        way = nx.shortest_path(graph, self._value("place"), self._value("to"), "weight")
+        ends = self._value("place"), self._value("to")
+        if not at.keys() >= {*ends}:
+            numbers = ", ".join(map(str, at)) or "none yet"
+            raise LogError(f"places: expected two of {numbers}, got {ends}; set `place` and `to`")
+        way = nx.shortest_path(graph, *ends, "weight")
         return " ".join(map(str, way))
 
     def _why(self, _: Any) -> str:

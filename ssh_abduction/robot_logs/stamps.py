@@ -25,10 +25,14 @@ from ssh_abduction.data.odometry import Pose
 MOST_SCANS, MOST_POSES = 2000, 20_000
 # A clock that goes back by more than this many seconds has started anew.
 BACK = 1.0
+# A pose is not interpolated between two poses that are more than this many seconds apart.
+GAP = 1.0
 
 
 class StampPairing:
     """Scans wait for poses on both sides of their time. Their pose is interpolated.
+
+    A scan is lost if poses are missing around its time.
 
     Attributes:
         lost: How many scans were lost, by the reason.
@@ -49,7 +53,7 @@ class StampPairing:
             if self._times[-1] - time <= BACK:
                 return
             self.restarts += 1
-            self.lost["no odometry"] += len(self._scans)
+            self.lost += Counter({"no odometry": len(self._scans)})
             self._scans.clear()
             self._times, self._poses, self._last = [], [], -math.inf
         self._times.append(time)
@@ -82,7 +86,7 @@ class StampPairing:
                 break
             time, scan = self._scans.popleft()
             k = bisect(self._times, time)
-            if k == 0:
+            if k == 0 or (time > self._times[k - 1] and self._times[k] - self._times[k - 1] > GAP):
                 self.lost["no odometry"] += 1
             else:
                 yield time, scan, self._at(k - 1, time)
