@@ -13,6 +13,7 @@ import pytest
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.explain.graph_repair import GraphMove, axiom_names, read_moves, repair
+from ssh_abduction.solver import Watch
 
 OPPOSITE = {"north": "south", "east": "west", "up": "down", "southwest": "northeast"}
 OPPOSITE |= {b: a for a, b in OPPOSITE.items()}
@@ -126,6 +127,57 @@ def test_verb_says_who_is_blamed_and_why(
     assert json.loads(capsys.readouterr().out)["blamed"] == [{"edge": 2, **edges[1]._asdict()}]
     assert main(["repair", str(file), "--set", "without=deterministic,reversible"]) == 0
     assert capsys.readouterr().out == "3 edges: no contradiction\n"
+
+
+def tangle(places: int) -> list[GraphMove]:
+    """Drawn edges of which most are wrong."""
+    chance = random.Random(places)
+    pairs = [chance.sample(range(places), 2) for _ in range(2 * places)]
+    return [GraphMove(f"p{a}", chance.choice([*OPPOSITE]), f"p{b}") for a, b in pairs]
+
+
+@pytest.mark.parametrize("work", [0.001, 0.02, 0.05, 0.1, 0.2, 0.4])
+def test_a_limit_leaves_the_best_answer_so_far(work: float) -> None:
+    edges = tangle(30)
+    whole = repair(edges, most=3)
+    found = repair(edges, most=3, watch=Watch(work=work))
+    assert found.stopped == "work limit"
+    assert found.least <= whole.fewest <= found.fewest
+    assert not found.complete
+    assert found.blamed in (None, whole.blamed)
+    assert {*found.clashes} <= {*whole.clashes}
+    for wrong in found.repairs:
+        kept = [e for i, e in enumerate(found.moves) if i not in wrong]
+        assert repair(kept).fewest == 0
+
+
+def test_verb_tells_what_a_limit_left_unknown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "graph.json"
+    file.write_text(json.dumps([edge._asdict() for edge in tangle(30)]))
+    limited = ["repair", str(file), "--work-limit", "0.001"]
+    assert main([*limited, "--strict"]) == 10
+    first, blamed, *_, last = capsys.readouterr().out.splitlines()
+    assert first == (
+        "59 edges: at least 0 wrong; the smallest repair found drops 59, and smaller ones may "
+        "exist (search stopped: work limit)"
+    )
+    assert blamed == "blamed in every smallest repair: unknown, as the search was stopped"
+    assert last.endswith("mends an edge is unknown, as the search was stopped")
+    assert main([*limited, "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert (record["blamed"], record["complete"]) == (None, False)
+    assert record["repairs"][0][0]["or_action"] is None
+    assert main(["repair", str(file), "--work-limit", "0"]) == 1
+    assert "--work-limit: expected a number of units of work" in capsys.readouterr().err
+
+
+def test_an_interrupt_leaves_the_best_answer_so_far() -> None:
+    watch = Watch()
+    watch.interrupted = True
+    found = repair(tangle(30), watch=watch)
+    assert (found.stopped, found.blamed) == ("interrupted", None)
 
 
 def test_graphml_and_node_link_json_are_read(tmp_path: Path) -> None:

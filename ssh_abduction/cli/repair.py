@@ -6,10 +6,15 @@ import argparse
 from collections.abc import Iterator
 
 from ssh_abduction.cli import shared
+from ssh_abduction.cli.outcome import EXIT_UNPROVEN, Guard, on_ctrl_c
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.files import json_line
+from ssh_abduction.runtime.program import interrupted_code
+
+# The limits of the search, and their units.
+LIMITS = {"time": "seconds", "work": "units of work", "memory": "MiB"}
 
 
 @verb(
@@ -24,6 +29,8 @@ from ssh_abduction.data.files import json_line
             "north leads around to where you began",
             {"default": ""},
         ),
+        **shared.limits("the best answer so far", work=True),
+        **shared.STRICT,
         **shared.JSON,
     }
 )
@@ -34,48 +41,68 @@ def run_repair(options: argparse.Namespace) -> int:
     Find every smallest set of edges to drop, or to turn into another action, after which the axioms
     hold: one action leads to one place, the opposite action leads back, and going north only never
     leads around. The edges that all smallest repairs blame are wrong, if any so small set is.
+
+    Exit codes: 0 done; 10 with --strict, if a limit ended the search.
     """
     from ssh_abduction.explain.graph_repair import Repairs, read_moves, repair  # loads clingo
+    from ssh_abduction.solver import Watch, check_limit
 
     if options.most < 1:
         raise MapError(f"most: expected 1 or more, got {options.most}; leave it out for 20")
+
+    for name, unit in LIMITS.items():
+        check_limit(f"--{name}-limit", unit, getattr(options, f"{name}_limit"))
 
     def lines(found: Repairs) -> Iterator[str]:
         all_edges = f"{counted(len(found.moves), 'edges')}"
         if not found.fewest:
             yield f"{all_edges}: no contradiction"
             return
-        some = "" if found.complete else " or more"
-        yield (
-            f"{all_edges}: at least {found.fewest} wrong; "
-            f"{counted(len(found.repairs), 'smallest repairs')}{some}"
-        )
+        many = counted(len(found.repairs), "smallest repairs")
+        many += "" if found.complete else " or more"
+        if found.least < found.fewest:
+            many = f"the smallest repair found drops {found.fewest}, and smaller ones may exist"
+        why = f" (search stopped: {found.stopped})" if found.stopped else ""
+        yield f"{all_edges}: at least {found.least} wrong; {many}{why}"
         for edges, axioms in found.clashes:
             yield f"  these clash ({', '.join(axioms)}): {'; '.join(map(said, edges))}"
-        if len(found.clashes) < found.fewest:
+        if found.clashes:
+            proved = f"; clingo proved that no {found.least - 1} suffice"
             yield (
-                f"  no edge is in two of these, so at least {len(found.clashes)} are wrong; clingo "
-                f"proved that no {found.fewest - 1} suffice"
+                f"  no edge is in two of these, so at least {len(found.clashes)} are wrong"
+                f"{proved if len(found.clashes) < found.least else ''}"
             )
-        else:
-            yield f"  no edge is in two of these, so at least {found.fewest} are wrong"
-        blamed = "; ".join(map(said, found.blamed)) or "none"
-        yield f"blamed in every smallest repair: {blamed}"
+        blamed = "; ".join(map(said, found.blamed or ())) or "none"
+        yield (
+            "blamed in every smallest repair: "
+            f"{'unknown, as the search was stopped' if found.blamed is None else blamed}"
+        )
         for number, (wrong, turns) in enumerate(zip(found.repairs, found.turns, strict=True), 1):
             yield f"repair {number}"
-            for edge, actions in zip(wrong, turns, strict=True):
+            for i, edge in enumerate(wrong):
+                actions = turns[i] if turns else ()
                 turned = f", or turn it to {' or '.join(actions)}" if actions else ""
                 yield f"  drop {said(edge)}{turned}"
+            if turns is None:
+                yield "  whether another action mends an edge is unknown, as the search was stopped"
 
     moves = read_moves(options.graph)
     without = [name.strip() for name in options.without.split(",") if name.strip()]
-    found = repair(moves, without=without, most=options.most)
+    watch = Watch(options.time_limit, options.memory_limit, work=options.work_limit)
+
+    def interrupt() -> None:
+        watch.interrupted = True
+
+    with on_ctrl_c(interrupt), Guard(interrupt):
+        found = repair(moves, without=without, most=options.most, watch=watch)
 
     def said(edge: int) -> str:
         return f"edge {edge + 1} ({found.moves[edge]})"
 
     print(json_line(found.to_dict()) if options.json else printable_lines(lines(found)))
-    return 0
+    if found.stopped == "interrupted":
+        return interrupted_code()
+    return EXIT_UNPROVEN if found.stopped else 0
 
 
 def printable_lines(lines: Iterator[str]) -> str:

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import clingo
 
@@ -25,7 +25,8 @@ from ssh_abduction.data.errors import MapError, brief, named
 from ssh_abduction.data.groups import minimal_part
 from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.words import meant
-from ssh_abduction.solver import Control
+from ssh_abduction.runtime.clock import counting
+from ssh_abduction.solver import Asker, Control, LimitError, Stop, Watch
 from ssh_abduction.theory import encodings
 
 ENCODING = "repair"
@@ -54,33 +55,45 @@ class Repairs:
 
     Attributes:
         moves: The edges of the graph. Other attributes name them by their index.
-        fewest: The number of edges in each repair.
-        repairs: The listed repairs, each as the indices of the wrong edges, ascending.
+        fewest: The number of edges in each listed repair.
+        repairs: The listed repairs, each as the indices of the wrong edges, ascending. If the
+            search was stopped before it proved that no repair is smaller, the smallest one found.
         complete: Whether all smallest repairs are listed.
-        blamed: The edges that are wrong in every smallest repair, also in those not listed.
+        blamed: The edges that are wrong in every smallest repair, also in those not listed; None
+            if unknown, as the search was stopped.
         turns: For each listed repair and each of its edges, the actions with which this edge is
-            right, if the others of the repair are dropped.
+            right, if the others of the repair are dropped; None for a repair of which they are
+            unknown.
         clashes: Sets of edges that have no edge in common, and of which each contradicts the
             axioms. So at least as many edges are wrong. Each has the names of its axioms.
+        least: At least so many edges are wrong: `fewest`, unless the search was stopped.
+        stopped: The limit that stopped the search, or "interrupted"; None if it was not stopped.
     """
 
     moves: tuple[GraphMove, ...]
     fewest: int
     repairs: tuple[tuple[int, ...], ...]
     complete: bool
-    blamed: tuple[int, ...]
-    turns: tuple[tuple[tuple[str, ...], ...], ...]
+    blamed: tuple[int, ...] | None
+    turns: tuple[tuple[tuple[str, ...], ...] | None, ...]
     clashes: tuple[tuple[tuple[int, ...], tuple[str, ...]], ...]
+    least: int
+    stopped: Stop | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the repairs as plain data, with the number of each edge from 1."""
         number = [move._asdict() | {"edge": e} for e, move in enumerate(self.moves, 1)]
         return {
             "fewest": self.fewest,
+            "at_least": self.least,
             "complete": self.complete,
-            "blamed": [number[e] for e in self.blamed],
+            "stopped": self.stopped,
+            "blamed": None if self.blamed is None else [number[e] for e in self.blamed],
             "repairs": [
-                [number[e] | {"or_action": list(a)} for e, a in zip(wrong, turned, strict=True)]
+                [
+                    number[e] | {"or_action": None if turned is None else list(turned[i])}
+                    for i, e in enumerate(wrong)
+                ]
                 for wrong, turned in zip(self.repairs, self.turns, strict=True)
             ],
             "clashes": [
@@ -96,13 +109,20 @@ def axiom_names() -> tuple[str, ...]:
     return tuple(re.findall(r"^% @axiom\((\w+)\)", text, re.MULTILINE))
 
 
-def repair(moves: Iterable[GraphMove], *, without: Collection[str] = (), most: int = 20) -> Repairs:
+def repair(
+    moves: Iterable[GraphMove],
+    *,
+    without: Collection[str] = (),
+    most: int = 20,
+    watch: Watch | None = None,
+) -> Repairs:
     """Find all smallest sets of edges without which the axioms hold.
 
     Args:
         moves: The edges.
         without: Names of axioms to leave out.
         most: List at most this many repairs.
+        watch: The limits of the search. At a limit, the answer is the best one so far.
 
     Raises:
         MapError: There is no such axiom.
@@ -112,60 +132,79 @@ def repair(moves: Iterable[GraphMove], *, without: Collection[str] = (), most: i
             known = ", ".join(axiom_names())
             hint = meant(name, axiom_names())
             raise MapError(f"axiom: expected {known}, got {brief(name)}; name one of these{hint}")
-    question = _GraphAxioms(tuple(dict.fromkeys(moves)), [*set(axiom_names()).difference(without)])
-    fewest, repairs, complete, blamed = question.smallest(most)
-    return Repairs(
-        question.moves,
-        fewest,
-        repairs,
-        complete,
-        blamed,
-        tuple(question.turns(wrong) for wrong in repairs),
-        tuple(question.clashes()),
-    )
+    moves, watch = tuple(dict.fromkeys(moves)), watch or Watch()
+    # To drop all edges is a repair, too.
+    found = Repairs(moves, len(moves), (tuple(range(len(moves))),), False, None, (None,), (), 0)
+    with counting(watch.counts_work):
+        watch.start()
+        question = _GraphAxioms(moves, [*set(axiom_names()).difference(without)], watch)
+        try:
+            for better in question.improved(found, most):
+                found = better
+        except LimitError as limit:
+            least = max(found.least, *question.bounds)
+            return replace(found, least=least, stopped=limit.reason)
+    return found
 
 
 class _GraphAxioms:
-    """A graph in clingo."""
+    """A graph in clingo.
 
-    def __init__(self, moves: tuple[GraphMove, ...], axioms: Sequence[str]) -> None:
-        self.moves, self._axioms = moves, axioms
+    Attributes:
+        bounds: Numbers of edges of which clingo has proved that at least so many are wrong.
+    """
+
+    def __init__(self, moves: tuple[GraphMove, ...], axioms: Sequence[str], watch: Watch) -> None:
+        self.moves, self.bounds, self._axioms = moves, [0], axioms
         self._labels = sorted({move.action for move in moves})
-        self._control = Control(["--opt-strategy=usc", "--project=project"])
+        self._asker = Asker(watch)
+        self._asker.control = control = Control(["--opt-strategy=usc", "--project=project"])
         for name in axioms:
-            self._control.add("base", [], f"axiom({name}).")
+            control.add("base", [], f"axiom({name}).")
         for e, move in enumerate(moves):
             source, action, target = map(json.dumps, move)
-            self._control.add("base", [], f"edge({e},{source},{action},{target}). label({action}).")
-        text = Path(encodings.path(ENCODING)).read_text(encoding="utf-8")
-        self._control.add("base", [], text)
-        self._control.ground([("base", [])])
-        self._config = cast(Any, self._control.configuration.solve)
-        self._config.opt_mode = "ignore"
+            control.add("base", [], f"edge({e},{source},{action},{target}). label({action}).")
+        control.add("base", [], Path(encodings.path(ENCODING)).read_text(encoding="utf-8"))
+        control.ground([("base", [])])
 
-    def smallest(self, most: int) -> tuple[int, tuple[tuple[int, ...], ...], bool, tuple[int, ...]]:
-        """Find the smallest repairs: their size, some, whether these are all, and who is blamed."""
-        if not self.moves:
-            return 0, ((),), True, ()
-        config = self._config
-        config.opt_mode, config.models = "optN", most + 1
-        found: set[tuple[int, ...]] = set()
-        fewest = 0
-        for model in self._control.models():
-            if model.optimality_proven:
-                found.add(_wrong_in(model))
-                fewest = model.cost[0]
-        repairs = tuple(sorted(found)[:most])
-        blamed = set.intersection(*map(set, found))
-        if len(found) > most:
-            config.opt_mode, config.models = f"enum,{fewest}", 0
-            config.enum_mode, config.project = "cautious", "auto"
-            *_, blamed = [set(_wrong_in(model)) for model in self._control.models()]
-            config.enum_mode = "auto"
-        config.opt_mode, config.models = "ignore", 1
-        return fewest, repairs, len(found) <= most, tuple(sorted(blamed))
+    def improved(self, found: Repairs, most: int) -> Iterator[Repairs]:
+        """Yield better and better answers, from the first one on. Raises LimitError."""
+        if self._mends([]):
+            yield replace(found, fewest=0, repairs=((),), complete=True, blamed=(), turns=((),))
+            return
+        for wrong in self._asker.answers(_wrong_in, "ignore", 1):
+            yield (found := replace(found, fewest=len(wrong), repairs=(wrong,)))
+        wrong = tuple(sorted(minimal_part(self._mends, [*found.repairs[0]])))
+        yield (found := replace(found, fewest=len(wrong), repairs=(wrong,)))
+        smallest: set[tuple[int, ...]] = set()
+        for wrong, is_smallest in self._asker.answers(
+            lambda model: (_wrong_in(model), model.optimality_proven),
+            "optN",
+            0,
+            on_bound=lambda bound: self.bounds.append(bound[0]),
+        ):
+            smallest |= {wrong} if is_smallest else set()
+            if smallest or len(wrong) < found.fewest:
+                repairs = tuple(sorted(smallest)[:most]) or (wrong,)
+                least = len(wrong) if smallest else found.least
+                found = replace(found, fewest=len(wrong), repairs=repairs, least=least)
+                found = replace(found, turns=(None,) * len(repairs))
+                yield found
+            if len(smallest) > most:
+                break
+        blamed = set.intersection(*map(set, smallest))
+        if len(smallest) > most:
+            mode = f"enum,{found.fewest}"
+            blamed = {e for e in blamed if not self._holds([(_wrong(e), False)], mode)}
+        found = replace(found, complete=len(smallest) <= most, blamed=tuple(sorted(blamed)))
+        yield found
+        for clash in self._clashes():
+            yield (found := replace(found, clashes=(*found.clashes, clash)))
+        for i, wrong in enumerate(found.repairs):
+            turns = (*found.turns[:i], self._turns(wrong), *found.turns[i + 1 :])
+            yield (found := replace(found, turns=turns))
 
-    def turns(self, wrong: tuple[int, ...]) -> tuple[tuple[str, ...], ...]:
+    def _turns(self, wrong: tuple[int, ...]) -> tuple[tuple[str, ...], ...]:
         """For each edge of a repair, find the actions with which it is right."""
 
         def is_right(edge: int, action: str) -> bool:
@@ -174,7 +213,7 @@ class _GraphAxioms:
 
         return tuple(tuple(a for a in self._labels if is_right(e, a)) for e in wrong)
 
-    def clashes(self) -> Iterable[tuple[tuple[int, ...], tuple[str, ...]]]:
+    def _clashes(self) -> Iterator[tuple[tuple[int, ...], tuple[str, ...]]]:
         """Find clashes without a common edge, until the edges that are in none do not clash."""
         left = list(range(len(self.moves)))
         while self._clash(left):
@@ -182,19 +221,24 @@ class _GraphAxioms:
             yield tuple(sorted(edges)), self._axioms_of(edges)
             left = [e for e in left if e not in edges]
 
-    def _clash(self, edges: Sequence[int]) -> bool:
+    def _clash(self, edges: Collection[int]) -> bool:
         """Whether these edges cannot all be right."""
         return not self._holds([(_wrong(e), False) for e in edges])
+
+    def _mends(self, edges: Collection[int]) -> bool:
+        """Whether the axioms hold if these edges alone may be wrong."""
+        return not self._clash([e for e in range(len(self.moves)) if e not in edges])
 
     def _axioms_of(self, edges: Sequence[int]) -> tuple[str, ...]:
         """Name the axioms that these edges break."""
         some = tuple(self.moves[e] for e in edges)
-        alone = (_GraphAxioms(some, [name]) for name in sorted(self._axioms))
+        alone = (_GraphAxioms(some, [name], self._asker.watch) for name in sorted(self._axioms))
         found = zip(sorted(self._axioms), alone, strict=True)
         return tuple(name for name, one in found if one._clash(range(len(some))))
 
-    def _holds(self, assumptions: list[tuple[clingo.Symbol, bool]]) -> bool:
-        return any(True for _ in self._control.models(assumptions))
+    def _holds(self, assumptions: list[tuple[clingo.Symbol, bool]], mode: str = "ignore") -> bool:
+        answers = self._asker.answers(_wrong_in, mode, 1, assumptions=assumptions)
+        return any(True for _ in answers)
 
 
 def _wrong(edge: int) -> clingo.Symbol:

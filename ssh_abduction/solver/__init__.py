@@ -11,6 +11,7 @@ TYPE_CHECKING = False
 
 if TYPE_CHECKING:
     from ssh_abduction.solver.asp import facts as facts
+    from ssh_abduction.solver.asp.control import Asker as Asker
     from ssh_abduction.solver.asp.control import Control as Control
     from ssh_abduction.solver.asp.control import new_control as new_control
     from ssh_abduction.solver.asp.limits import WAITING as WAITING
