@@ -226,3 +226,17 @@ def test_broken_graphml_is_a_clear_error(
     (tmp_path / "g.graphml").write_text("<a")
     assert main(["repair", str(tmp_path / "g.graphml")]) == 1
     assert "expected GraphML, got ParseError" in capsys.readouterr().err
+
+
+def test_a_name_twice_in_graphml_is_a_clear_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = nx.MultiDiGraph([("hall", "pantry", {"action": "east"})])
+    text = "\n".join(nx.generate_graphml(graph))
+    twice = text.replace('<node id="pantry" />', '<node id="pantry" /><node id="hall" />')
+    assert twice != text
+    (tmp_path / "g.graphml").write_text(twice)
+    assert main(["repair", str(tmp_path / "g.graphml")]) == 1
+    error = capsys.readouterr().err
+    assert "node 3: expected another name than node 1, got 'hall' twice; rename one" in error
+    assert error.count("\n") == 1

@@ -18,6 +18,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import clingo
 
@@ -288,7 +289,9 @@ def _of_graphml(file: str) -> dict[str, Any]:
             f"{named(file)}: expected GraphML, got {type(error).__name__}: {error}; write it with "
             "a graph library"
         ) from None
-    return dict(nx.node_link_data(graph, edges="edges"))
+    # Networkx makes one node of two with one name.
+    nodes = [node.get("id") for node in ElementTree.parse(file).findall(".//{*}node")]
+    return {**nx.node_link_data(graph, edges="edges"), "nodes": nodes}
 
 
 def _check_nodes(nodes: Any, edges: Any, where: str) -> None:
