@@ -522,3 +522,16 @@ def test_explanation_says_what_the_user_said() -> None:
         assert f"in short: {said}" in str(explanation)
     known = str(explain_pair(trace, 0, 1))
     assert "a dstate has one view, and step 0 sees 'a', step 1 sees 'b'" in known
+
+
+@pytest.mark.parametrize(
+    ("kind", "axiom"), [("misread", "one_pose"), ("slipped", "functional_view")]
+)
+def test_argument_uses_no_axiom_that_a_fault_may_excuse(kind: str, axiom: str) -> None:
+    """It needs only a few steps of a long trace, also where some steps may be wrong."""
+    gone = [(8.0, 0.0, 0.0)] * 39
+    trace = Trace.from_steps("ab" * 20, ["travel"] * 39, displacements=gone)
+    found = explain_pair(trace, 3, 4, Theory.causal().replace(**{kind: 1.5}), time_limit=20)
+    assert found.verdict is Verdict.DIFFERENT
+    assert found.derivation is not None
+    assert {link.axiom for link in found.derivation.links} == {axiom}

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import cached_property
 from itertools import islice
 from typing import Unpack
 
@@ -41,7 +42,8 @@ from ssh_abduction.explain.no_map import (
 from ssh_abduction.explain.place_reasons import changes_in_words
 from ssh_abduction.explain.verdict import Derivation, PairExplanation, Side, Verdict
 from ssh_abduction.solver import EQUAL, Cost, Judging, Status, Stop, facts
-from ssh_abduction.theory.settle import displacement_of
+from ssh_abduction.theory.fields import EXCUSED
+from ssh_abduction.theory.settle import Problem, displacement_of
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # Try pieces of at most this many steps before the whole trace. That takes less than a second.
@@ -282,10 +284,20 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
 
     # Few steps around the pair
 
+    @cached_property
+    def _sure(self) -> Problem:
+        """The problem without the axioms that faults may excuse. It has all maps of the trace."""
+        theory = self.problem.theory
+        kinds = [kind for kind in EXCUSED if getattr(theory, kind)]
+        excused = {axiom for kind in kinds for axiom in EXCUSED[kind]} - {*theory.without}
+        without = (*theory.without, *sorted(excused))
+        sure = theory.replace(**dict.fromkeys(kinds, 0), without=without)
+        return Problem.of(self.problem.trace, sure)
+
     def _ask_pieces(self, one: bool, most: int) -> None:
         """Find at most `most` steps around the pair that have no map of the side `one`."""
         for steps in self._pieces(most):
-            piece = Piece.of(self.problem, steps)
+            piece = Piece.of(self._sure, steps)
             if not self._has_map(piece, one):
                 self._sides[one] = replace(self._sides[one], possible=False)
                 self._ruling_out[one] = piece
@@ -295,10 +307,10 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
         """Yield lists of steps around the pair, from few to at most `most`.
 
         A map of the trace, restricted to fewer steps, is a map of these steps. This may be false if
-        the theory has faults or rules of the user. Then only the whole trace is yielded, if short.
+        the theory has rules of the user. Then only the whole trace is yielded, if short.
         """
         whole = range(len(self.trace))
-        if self.theory.rules or self.theory.has_faults:
+        if self.theory.rules:
             if len(self.trace) <= UNCUT:
                 yield list(whole)
             return
@@ -328,7 +340,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
 
     def _shrunk(self, piece: Piece, one: bool) -> Piece:
         """Drop steps at the ends of a piece while the rest has no map of the side `one`."""
-        if self.theory.rules or self.theory.has_faults:
+        if self.theory.rules:
             return piece
         for t in (*piece.steps, *reversed(piece.steps)):
             if t in (self.first, self.second) or t not in piece.steps:
@@ -336,7 +348,7 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             ends = [k for k in piece.steps if k - 1 not in piece.steps or k + 1 not in piece.steps]
             if t not in ends:
                 continue
-            fewer = Piece.of(self.problem, [k for k in piece.steps if k != t])
+            fewer = Piece.of(self._sure, [k for k in piece.steps if k != t])
             if not self._has_map(fewer, one):
                 piece = fewer
         return piece
