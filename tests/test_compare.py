@@ -425,7 +425,9 @@ def test_compare_in_the_shell_prints_the_result_of_python(
     solution = aces.solution()
     found = compare(solution)
     assert main(["compare", str(path)]) == 0
-    assert capsys.readouterr().out.startswith(f"{solution.summary}\n  4 = 2 x 2: ")
+    assert capsys.readouterr().out.startswith(
+        f"{solution.verdict}\n{solution.summary}\n  4 = 2 x 2: "
+    )
     assert main(["compare", str(path), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     joins = printed.pop("by_minimality")
@@ -451,7 +453,9 @@ def test_compare_uses_the_backbone_of_a_cut_list(
     cut, every = file_of("-n", "2", name="cut.json"), file_of()
     assert main(["compare", str(cut), str(every)]) == 0
     printed = capsys.readouterr().out
-    assert printed.startswith(
+    verdict, sentence = printed.splitlines()[:2]
+    assert verdict.endswith("Proven minimal, one of 2 or more such maps.")
+    assert sentence.startswith(
         "at least 2 minimal maps (listing was stopped by the maps limit): the same dstates; the "
         "places of steps 15–18 and 21 differ; "
     )
@@ -505,7 +509,9 @@ def test_compare_separates_minimal_from_larger_maps(
     path = file_of("--set", "within=3", trace=str(tmp_path / "trace.jsonl"))
     assert main(["compare", str(path)]) == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("2 minimal maps, and 9 larger ones: ")
+    verdict, sentence = printed.splitlines()[:2]
+    assert verdict.endswith("Proven minimal, one of 2 such maps.")
+    assert sentence.startswith("2 minimal maps, and 9 larger ones: ")
     assert "  2 maps with 12 dstates, " in printed
 
 

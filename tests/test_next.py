@@ -421,11 +421,12 @@ def test_next_prints_the_result_of_python(
 ) -> None:
     assert main(["next", *machines, "--json"]) == 0
     trace = Trace.load(machines[1])
-    expected: Experiment = next_experiment(solve(trace, Theory.causal(), max_maps=None), trace)
+    solution = solve(trace, Theory.causal(), max_maps=None)
+    expected: Experiment = next_experiment(solution, trace)
     assert json.loads(capsys.readouterr().out) == expected.to_dict()
     assert main(["next", *machines]) == 0
     out = capsys.readouterr().out
-    assert out.startswith(f"{expected.sentence}\n")
+    assert out.startswith(f"{solution.verdict}\n{expected.sentence}\n")
     first = expected.plan.branches[0].seen
     assert f"\n  {', '.join(expected.plan.actions)}\n    {first}: map" in out
 
@@ -454,7 +455,9 @@ def test_next_warns_that_maps_may_be_missing(
     assert main(["next", str(tmp_path / "maps.json"), ACES]) == 0
     said = capsys.readouterr()
     assert "there may be other maps that are as good or better" in said.err
-    assert said.out.startswith(
+    verdict, sentence = said.out.splitlines()[:2]
+    assert verdict.endswith("Proven minimal, one of 2 or more such maps.")
+    assert sentence.startswith(
         "2 maps predict the same along all links, as they have the same dstates"
     )
 

@@ -86,7 +86,7 @@ def run_compare(options: argparse.Namespace) -> int:
     if options.json:
         print(json_line({**record, **_record(listing, drives, sides), **found.to_dict()}))
         return 0
-    lines = [*_lines(found), *_faults(listing)]
+    lines = [listing.verdict, *_lines(found), *_faults(listing)]
     lines += [f"  {listing.joined}"] if listing.joined else []
     lines += [f"  {sides}"] if sides is not None and sides.possible else []
     print("\n".join([*lines, *map(str, drives)]))
@@ -224,7 +224,7 @@ def run_next(options: argparse.Namespace) -> int:
     if options.json:
         print(json_line(experiment.to_dict()))
     else:
-        print("\n".join(_plan_lines(experiment)))
+        print("\n".join([listing.verdict, *_plan_lines(experiment)]))
         if listing.sureness:
             print(listing.sureness)
         weighed = listing.weighed if len(listing.maps) == 1 else None
