@@ -22,6 +22,7 @@ from ssh_abduction.theory.theory import Theory
 
 mcp = pytest.importorskip("mcp")
 
+from ssh_abduction.cli import agent_desk  # noqa: E402
 from ssh_abduction.cli.agent_desk import MapDesk, server_of  # noqa: E402
 
 # Rooms: 0 has the corridor with places 0 to 3; 1 is place 4, left of it; 2 is place 5, right of it.
@@ -118,7 +119,8 @@ def test_questions(house: Path, tool: str, given: dict[str, str], expected: dict
         assert "through the door" in answer["said"]
 
 
-def test_a_reason_and_an_experiment_are_said(house: Path) -> None:
+def test_a_reason_and_an_experiment_are_said(house: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(agent_desk, "SECONDS", 1.0)
     reason = ask(house, "why", one="step 1", other="step 9")
     assert "the probability of one place is 0.8" in reason["said"]
     assert "there is nothing to tell apart" in ask(house, "next_experiment")["said"]

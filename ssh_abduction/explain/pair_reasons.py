@@ -217,7 +217,8 @@ class PairQuestion(LimitedQuestion[PairExplanation]):
             if self._sides[one].possible is False:
                 break
         settled = False in (self._sides[True].possible, self._sides[False].possible)
-        self._list_minimal_maps(settled)
+        if not (settled and self._best):  # a known map shows that the trace has one
+            self._list_minimal_maps(settled)
         if not settled and self._verdict() not in (Verdict.NO_MAP, Verdict.DISAGREE):
             for one in (True, False):
                 if not self._sides[one].maps and not self._over():
