@@ -1,7 +1,7 @@
 """Whether an agent gets true answers about a building, by the tools of `ssh-abduction mcp`.
 
-A robot drives through a simulated building, of which the truth is known. The official client of
-the Model Context Protocol asks about fifty questions about the map. Usage:
+A robot drives through a simulated building. Its truth is known. The official client of the Model
+Context Protocol asks about fifty questions about the map. Usage:
 
     python benchmarks/agent_questions.py LOG.log MAPS [LOG.log MAPS ...]
 

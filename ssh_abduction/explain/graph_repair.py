@@ -62,8 +62,8 @@ class Repairs:
         complete: Whether all smallest repairs are listed.
         blamed: The edges that are wrong in every smallest repair, also in those not listed; None
             if unknown, as the search was stopped.
-        turns: For each listed repair and each of its edges, the actions with which this edge is
-            right, if the others of the repair are dropped; None for a repair of which they are
+        turns: For each listed repair and each of its edges, the actions that make this edge right
+            if the other edges of the repair are dropped. None for a repair whose actions are
             unknown.
         clashes: Sets of edges that have no edge in common, and of which each contradicts the
             axioms. So at least as many edges are wrong. Each has the names of its axioms.
@@ -152,7 +152,7 @@ class _GraphAxioms:
     """A graph in clingo.
 
     Attributes:
-        bounds: Numbers of edges of which clingo has proved that at least so many are wrong.
+        bounds: Lower bounds on the number of wrong edges, as clingo has proved them.
     """
 
     def __init__(self, moves: tuple[GraphMove, ...], axioms: Sequence[str], watch: Watch) -> None:
