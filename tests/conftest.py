@@ -127,3 +127,22 @@ def room(tmp_path: Path) -> str:
     path = tmp_path / "room.jsonl"
     rectangle(8).save(path)
     return str(path)
+
+
+@pytest.fixture(scope="session")
+def files_of_round(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of the map of a log, a round through the world `triangle`."""
+    from perception.readers.logs import read_log
+    from ssh_abduction.robot_logs.log_maps import map_log
+
+    log = tmp_path_factory.mktemp("logs") / "round.log"
+    assert main(["simulate", "triangle", "-o", str(log), "--set", "every=0.5"]) == 0
+    return map_log(read_log(log), name="round", work_limit=3).files()
+
+
+@pytest.fixture
+def house(files_of_round: dict[str, bytes], tmp_path: Path) -> Path:
+    """The folder of the map of a log."""
+    for name, data in files_of_round.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path

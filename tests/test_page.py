@@ -23,7 +23,6 @@ import numpy as np
 import pytest
 from in_processes import until
 
-from perception.readers.logs import read_log
 from ssh_abduction import Localiser, Solution, SSHMap, Theory, Trace, solve, view_page
 from ssh_abduction.cli import main
 from ssh_abduction.cli.correct import correct_pair
@@ -35,7 +34,6 @@ from ssh_abduction.page.content import ALPHABET, DRAWN, LOST, beams_of, content_
 from ssh_abduction.page.html import Page
 from ssh_abduction.page.server import PageServer
 from ssh_abduction.rivals import Listing
-from ssh_abduction.robot_logs.log_maps import map_log
 from ssh_abduction.runtime.workers import _under_way
 from ssh_abduction.solver import Watch
 
@@ -59,21 +57,6 @@ def rivals() -> Solution:
 @pytest.fixture(scope="module")
 def content(route: Trace, rivals: Solution) -> dict[str, Any]:
     return content_of(rivals, route)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    log = tmp_path_factory.mktemp("logs") / "round.log"
-    assert main(["simulate", "triangle", "-o", str(log), "--set", "every=0.5"]) == 0
-    return map_log(read_log(log), name="round", work_limit=1).files()
-
-
-@pytest.fixture
-def house(made: dict[str, bytes], tmp_path: Path) -> Path:
-    """The folder of the map of a log."""
-    for name, data in made.items():
-        (tmp_path / name).write_bytes(data)
-    return tmp_path
 
 
 @pytest.mark.slow

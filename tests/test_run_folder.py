@@ -5,28 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
-
-from perception.readers.logs import read_log
 from ssh_abduction import Trace
 from ssh_abduction.cli import main
 from ssh_abduction.page.html import ground_in
-from ssh_abduction.robot_logs.log_maps import map_log
 from ssh_abduction.robot_logs.run_folder import NOTICE, with_notice
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    log = tmp_path_factory.mktemp("logs") / "round.log"
-    assert main(["simulate", "triangle", "-o", str(log), "--set", "every=0.5"]) == 0
-    return map_log(read_log(log), name="round", work_limit=3).files()
-
-
-@pytest.fixture
-def house(made: dict[str, bytes], tmp_path: Path) -> Path:
-    for name, data in made.items():
-        (tmp_path / name).write_bytes(data)
-    return tmp_path
 
 
 def notice(file: Path) -> str:

@@ -104,6 +104,13 @@ class KnownMap:
             text = f"{self.saved.drives[0].name}:{int(step[1])}"
         return *self.saved.thing(text), self.saved.numbered_or_named(text) is None
 
+    def two_steps(self, one: str, other: str) -> tuple[int, int]:
+        """Find a step at each of two things. Raises MapError if it is the same step."""
+        first, second = (step_of(self.saved.drives, self.found(text)[1]) for text in (one, other))
+        if first == second:
+            raise MapError(f"expected two visits, got step {first} twice; name two steps")
+        return first, second
+
     def called(self, kind: str, step: str) -> str:
         """Name a thing by its kind, number and name."""
         number = self.saved.number_at(kind, step)
@@ -298,9 +305,7 @@ class MapDesk:
     def why(self, one: str, other: str, building: str = "") -> Answer:
         """Say why two visits are at one place, or at two, by the axioms and the odometry."""
         known = self._known(building)
-        steps = [step_of(known.saved.drives, known.found(text)[1]) for text in (one, other)]
-        if steps[0] == steps[1]:
-            raise MapError(f"expected two visits, got step {steps[0]} twice; name two steps")
+        steps = known.two_steps(one, other)
         # A visit has several headings. Take those of one dstate, if the visits share one.
         at = known.map.dstate_at
         stays = [_stay(known.steps("place", known.map.place_of(t)), t) for t in steps]
@@ -365,10 +370,7 @@ class MapDesk:
         """
         known = self._known(building)
         kind = "same_place" if same else "elsewhere"
-        steps = [step_of(known.saved.drives, known.found(text)[1]) for text in (one, other)]
-        if steps[0] == steps[1]:
-            raise MapError(f"expected two visits, got step {steps[0]} twice; name two steps")
-        return {"said": correct_pair(str(known.saved.file), kind, steps[0], steps[1])}
+        return {"said": correct_pair(str(known.saved.file), kind, *known.two_steps(one, other))}
 
     def _known(self, building: str) -> KnownMap:
         """Read the map of a building. Raises MapError if there is no such building, or no map."""

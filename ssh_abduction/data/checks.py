@@ -50,6 +50,17 @@ def needed(what: str, package: str, install: str, error: Kind = AbductionError) 
         ) from None
 
 
+@contextmanager
+def free_port(name: str, port: int, error: Kind) -> Iterator[None]:
+    """Make a context in which a server that cannot listen at a port raises `error`."""
+    try:
+        yield
+    except (OSError, OverflowError) as wrong:
+        raise error(
+            f"{name}: expected a free port, got {port} ({wrong}); name another one, or 0 for any"
+        ) from None
+
+
 def a_number(
     name: str,
     value: object,

@@ -24,7 +24,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from ssh_abduction.data.checks import a_list, one_of
+from ssh_abduction.data.checks import a_list, free_port, one_of
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.errors import AbductionError, MapError, brief
 from ssh_abduction.data.schema import FieldReader
@@ -88,12 +88,8 @@ class PageServer(ThreadingHTTPServer):
         self.page = html_of(self._content(listing), served=True).encode()
         self._token = secrets.token_urlsafe(24)
         self._one_at_a_time = threading.Lock()
-        try:
+        with free_port("port", port, MapError):
             super().__init__(("127.0.0.1", port), _Handler)
-        except (OSError, OverflowError) as error:
-            raise MapError(
-                f"port: expected a free port, got {port} ({error}); name another one, or 0 for any"
-            ) from None
 
     def _content(self, maps: Maps) -> dict[str, Any]:
         content = content_of(maps, self._trace, self._run, self._called, self._ground)

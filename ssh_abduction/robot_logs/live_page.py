@@ -14,6 +14,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+from ssh_abduction.data.checks import free_port
 from ssh_abduction.data.errors import MapError
 
 PAGE = Path(__file__).with_name("live_page.html")
@@ -37,12 +38,8 @@ class LivePage(ThreadingHTTPServer):
         self, port: int, state: Callable[[], dict[str, Any]], whole: Callable[[], bytes | None]
     ) -> None:
         self.state, self.whole = state, whole
-        try:
+        with free_port("--page", port, MapError):
             super().__init__(("127.0.0.1", port), _PageHandler)
-        except (OSError, OverflowError) as error:
-            raise MapError(
-                f"--page: expected a free port, got {port} ({error}); take another, or 0 for any"
-            ) from None
         threading.Thread(target=self.serve_forever, daemon=True).start()
 
     @property
