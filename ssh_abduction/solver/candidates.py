@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Collection, Iterator, Set
+from collections.abc import Callable, Collection, Iterator, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -37,6 +37,7 @@ from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
+    from ssh_abduction.solver.geometry.poses import Poses
     from ssh_abduction.solver.sources.metric.beam import Beam
     from ssh_abduction.solver.sources.metric.joint_drives import Joining
 
@@ -141,11 +142,14 @@ class Candidates:
 
         return Joining(self._task.problem, self._task.log)
 
-    def smoothed(self, begin: SSHMap | None = None) -> SSHMap | None:
-        """Merge visits, or places of the map `begin`, at poses that fit all closures.
+    def smoothed(
+        self, begin: tuple[Sequence[int], Sequence[int], Poses] | None = None
+    ) -> SSHMap | None:
+        """Merge visits at poses that fit all closures, or the dstates and places of `begin`.
 
-        None if the checker refuses the map. Also None where there are no beams, or with lifts or
-        faults within a drive.
+        `begin` has the dstate of each step, the place of each dstate, and their equations. None if
+        the checker refuses the map. Also None where there are no beams, or with lifts or faults
+        within a drive.
         """
         if not (self._trusts_drives() and self._task.theory.displacement == "use"):
             return None

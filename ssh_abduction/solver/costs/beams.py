@@ -17,6 +17,7 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp.limits import StageTimeError
+from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.solution.weighed import EQUAL
@@ -46,12 +47,15 @@ class Beams:
         add: Callable[[SSHMap], float],
         has_map: Callable[[], bool],
         believed: Callable[[], Set[int]],
+        beginning: Callable[[SSHMap], tuple[list[int], list[int], Poses]],
     ) -> None:
         """Prepare the guesses.
 
         `add` returns the cost of a map in nats, and keeps the map if this cost is small. `has_map`
         says whether a map is known, and `believed` which closures the best map believes.
+        `beginning` is `Misfit.beginning`.
         """
+        self._beginning = beginning
         self._parts, self._add, self._has_map, self._believed = parts, add, has_map, believed
         # The cost of the best map of smoothing or a broad beam, and the estimate of it by a beam.
         self._best = math.inf, math.inf
@@ -136,8 +140,7 @@ class Beams:
         while believed not in tried:
             tried.add(frozenset(believed))
             if beam := self._parts.candidates.beam(NARROW, believed):
-                for ssh_map in self._parts.candidates.maps_of(beam):
-                    self._add(ssh_map)
+                self._maps_of(beam)
             believed = self._believed()
 
     def _is_time_for(self, width: int, last: int, left: float) -> bool:
@@ -165,18 +168,27 @@ class Beams:
 
     def _finish(self, beam: Beam, width: int) -> None:
         """Keep the maps that a beam ends with. Raises StageTimeError if it does not end in time."""
-        found = {self._add(one): one for one in self._parts.candidates.maps_of(beam)}
+        nats = self._maps_of(beam)
         self._ended = beam
         if width < BROAD:
             return
-        with suppress(StageTimeError):
-            best = found[min(found)] if found else None
-            if best and (merged := self._parts.candidates.smoothed(best)) is not None:
-                found[self._add(merged)] = merged
         # A beam without axioms would be the same if the checker refused nothing.
         broken = -math.inf if beam.refuses else 0.0
         estimate = beam.hypotheses[0].nats if beam.hypotheses else math.inf
-        self._take(min(found, default=math.inf), estimate, broken)
+        self._take(nats, estimate, broken)
+
+    def _maps_of(self, beam: Beam) -> float:
+        """Keep the maps that a beam ends with, and merge the places of the best one.
+
+        Return the least cost. Raises StageTimeError if the beam does not end in time.
+        """
+        candidates = self._parts.candidates
+        found = {self._add(one): one for one in candidates.maps_of(beam)}
+        with suppress(StageTimeError):
+            best = found[min(found)] if found else None
+            if best and (merged := candidates.smoothed(self._beginning(best))) is not None:
+                found[self._add(merged)] = merged
+        return min(found, default=math.inf)
 
     def _break_axioms(self) -> None:
         """Find `broken` with the widest beam that ended."""

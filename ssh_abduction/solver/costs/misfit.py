@@ -116,6 +116,12 @@ class Misfit:
         aliases = self._explained(dstates, places, wrong)[2]
         return aliases if any(aliases) else ()
 
+    def beginning(self, ssh_map: SSHMap) -> tuple[list[int], list[int], Poses]:
+        """Return the dstates and places of a map for `smoothed`, and their equations."""
+        dstates, places, wrong = _course_of(ssh_map)
+        of_dstate = _of_headings(numbered(dstates), numbered(places))
+        return numbered(dstates), of_dstate, self.poses(dstates, places, wrong)
+
     def poses(
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
     ) -> Poses:

@@ -127,7 +127,11 @@ class Weighing:
         self.proven = False
         self.of_labels: OfLabels | None = None
         self.beams = Beams(
-            parts, self.add, lambda: bool(self.candidates or parts.known.best), self._believed
+            parts,
+            self.add,
+            lambda: bool(self.candidates or parts.known.best),
+            self._believed,
+            self._misfit.beginning,
         )
         self._task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         self._forced: list[tuple[int, int]] = []  # pairs of steps at one dstate in all cheap maps

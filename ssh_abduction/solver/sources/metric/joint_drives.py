@@ -41,7 +41,12 @@ from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solver.geometry.fit import poses_of
 from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.solver.sources.metric.hypothesis import Array, Hypothesis, parts_of
-from ssh_abduction.solver.sources.metric.overlay import Overlay, denied_pairs, smoothed
+from ssh_abduction.solver.sources.metric.overlay import (
+    Overlay,
+    denied_pairs,
+    smoothed,
+    visits_apart,
+)
 from ssh_abduction.solver.sources.metric.sights import Sights
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence.loops import vectors_turned
@@ -151,7 +156,8 @@ class Joining:
         """
         if not self._problem.trace.closures:
             return alone
-        for both in smoothed(self._problem, self._log, self.sights, None):
+        apart = visits_apart(self._problem)
+        for both in smoothed(self._problem, self._log, self.sights, *apart):
             parts = [part for part in alone if part.labels.keys() <= both.labels.keys()]
             covers = sum(len(part.labels) for part in parts) == len(both.labels)
             saves = covers and len(parts) > 1 and both.nats < _nats_of(parts)

@@ -404,20 +404,29 @@ class Overlay:
         return found
 
 
-def smoothed(problem: Problem, log: Log, sights: Sights, begin: SSHMap | None) -> list[Hypothesis]:
-    """Merge visits, or the places and dstates of the map `begin`.
+def smoothed(
+    problem: Problem,
+    log: Log,
+    sights: Sights,
+    labels: Sequence[int],
+    places: Sequence[int],
+    poses: Poses,
+) -> list[Hypothesis]:
+    """Merge places and dstates at the poses that fit them best.
 
     There is a hypothesis for each part of the trace that displacements and closures connect.
+
+    Args:
+        problem: The trace and the theory.
+        log: The log of the trace.
+        sights: What each step shows.
+        labels: The dstate of each step before the merges.
+        places: The place of each dstate before the merges.
+        poses: The equations of these dstates and places.
     """
-    trace, theory = problem.trace, problem.theory
-    if begin is None:
-        labels, places = [*range(len(trace))], numbered(visits_by_turns(trace, theory))
-    else:
-        labels = [*begin.dstate_at]
-        places = numbered(-1 - s.id if s.place is None else s.place for s in begin.dstates)
     prior = problem.prior
     found = []
-    for apart in parts_of(Poses(trace, labels, places).gaussian(), labels, places, log, sights):
+    for apart in parts_of(poses.gaussian(), labels, places, log, sights):
         new = firsts((label, t) for t, label in apart.labels.items()).values()
         price = float(prior.dstate[[*new]].sum())
         new = firsts((apart.places[label], t) for t, label in apart.labels.items()).values()
@@ -428,15 +437,24 @@ def smoothed(problem: Problem, log: Log, sights: Sights, begin: SSHMap | None) -
     return found
 
 
-def smoothed_map(problem: Problem, log: Log, begin: SSHMap | None = None) -> SSHMap | None:
-    """Make a map of a trace by smoothing, see `smoothed`.
+def visits_apart(problem: Problem) -> tuple[list[int], list[int], Poses]:
+    """Return dstates and places for `smoothed` in which no two visits are to one place."""
+    labels = [*range(len(problem.trace))]
+    places = numbered(visits_by_turns(problem.trace, problem.theory))
+    return labels, places, Poses(problem.trace, labels, places)
 
-    Two parts that no displacement or closure connects are joined only where a known link leads from
-    one to the other. None if the map breaks an axiom.
+
+def smoothed_map(
+    problem: Problem, log: Log, begin: tuple[Sequence[int], Sequence[int], Poses] | None = None
+) -> SSHMap | None:
+    """Make a map of a trace by smoothing, see `smoothed`, whose last arguments are `begin`.
+
+    Without them, all visits are apart. Two parts that no displacement or closure connects are
+    joined only where a known link leads from one to the other. None if the map breaks an axiom.
     """
     bare = problem.theory.replace(displacement="none", weigh="count")
     sights = Sights(problem.trace, bare)
-    whole, *parts = smoothed(problem, log, sights, begin)
+    whole, *parts = smoothed(problem, log, sights, *(begin or visits_apart(problem)))
     for part in parts:
         led = (
             (whole.links.get((whole.labels[t - 1], log.actions[t - 1])), label)
