@@ -39,6 +39,9 @@ def holds(edges: tuple[GraphMove, ...]) -> bool:
         for f in edges:
             if f.source == e.target and f.action == OPPOSITE.get(e.action) and f.target != e.source:
                 return False
+            arrive_alike = (e.target, e.action) == (f.target, f.action) and e.action in OPPOSITE
+            if arrive_alike and e.source != f.source:
+                return False
     for direction in "neu":
         graph = nx.DiGraph()
         for e in edges:

@@ -39,8 +39,9 @@ def run_repair(options: argparse.Namespace) -> int:
 
     A language model, a person or a program made a graph of places and of the moves between them.
     Find every smallest set of edges to drop, or to turn into another action, after which the axioms
-    hold: one action leads to one place, the opposite action leads back, and going north only never
-    leads around. The edges that all smallest repairs blame are wrong, if any so small set is.
+    hold: one action leads to one place, the opposite action leads back and only there, and going
+    north only never leads around. The edges that all smallest repairs blame are wrong, if any so
+    small set is.
 
     Exit codes: 0 done; 10 with --strict, if a limit ended the search.
     """

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -148,6 +148,14 @@ def repair(
     return found
 
 
+def _wrong_in(model: clingo.Model) -> tuple[int, ...]:
+    return tuple(sorted(symbol.arguments[0].number for symbol in model.symbols(shown=True)))
+
+
+def _turned_in(model: clingo.Model) -> list[clingo.Symbol]:
+    return [symbol for symbol in model.symbols(atoms=True) if symbol.name == "turned"]
+
+
 class _GraphAxioms:
     """A graph in clingo.
 
@@ -157,7 +165,6 @@ class _GraphAxioms:
 
     def __init__(self, moves: tuple[GraphMove, ...], axioms: Sequence[str], watch: Watch) -> None:
         self.moves, self.bounds, self._axioms = moves, [0], axioms
-        self._labels = sorted({move.action for move in moves})
         self._asker = Asker(watch)
         self._asker.control = control = Control(["--opt-strategy=usc", "--project=project"])
         for name in axioms:
@@ -207,12 +214,16 @@ class _GraphAxioms:
 
     def _turns(self, wrong: tuple[int, ...]) -> tuple[tuple[str, ...], ...]:
         """For each edge of a repair, find the actions with which it is right."""
+        kept = [(_wrong(e), e in wrong) for e in range(len(self.moves))]
 
-        def is_right(edge: int, action: str) -> bool:
-            made = [(_turned(e, a), (e, a) == (edge, action)) for e in wrong for a in self._labels]
-            return self._holds([*made, *((_wrong(e), e in wrong) for e in range(len(self.moves)))])
+        def actions(edge: int) -> Iterator[str]:
+            made = [(clingo.Function("mended", [clingo.Number(e)]), e == edge) for e in wrong]
+            while found := self._answer([*kept, *made], read=_turned_in):
+                turned = next(t for t in found if t.arguments[0].number == edge)
+                made.append((turned, False))
+                yield turned.arguments[1].string
 
-        return tuple(tuple(a for a in self._labels if is_right(e, a)) for e in wrong)
+        return tuple(tuple(sorted(actions(edge))) for edge in wrong)
 
     def _clashes(self) -> Iterator[tuple[tuple[int, ...], tuple[str, ...]]]:
         """Find clashes without a common edge, until the edges that are in none do not clash."""
@@ -238,20 +249,19 @@ class _GraphAxioms:
         return tuple(name for name, one in found if one._clash(range(len(some))))
 
     def _holds(self, assumptions: list[tuple[clingo.Symbol, bool]], mode: str = "ignore") -> bool:
-        answers = self._asker.answers(_wrong_in, mode, 1, assumptions=assumptions)
-        return any(True for _ in answers)
+        return self._answer(assumptions, mode) is not None
+
+    def _answer(
+        self,
+        assumptions: list[tuple[clingo.Symbol, bool]],
+        mode: str = "ignore",
+        read: Callable[[clingo.Model], Any] = _wrong_in,
+    ) -> Any:
+        return next(self._asker.answers(read, mode, 1, assumptions=assumptions), None)
 
 
 def _wrong(edge: int) -> clingo.Symbol:
     return clingo.Function("wrong", [clingo.Number(edge)])
-
-
-def _turned(edge: int, action: str) -> clingo.Symbol:
-    return clingo.Function("turned", [clingo.Number(edge), clingo.String(action)])
-
-
-def _wrong_in(model: clingo.Model) -> tuple[int, ...]:
-    return tuple(sorted(symbol.arguments[0].number for symbol in model.symbols(shown=True)))
 
 
 def read_moves(file: str) -> tuple[GraphMove, ...]:
