@@ -33,7 +33,6 @@ from worlds import rectangle
 import ssh_abduction
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.checker.claims import check_bound
-from ssh_abduction.cli import main
 from ssh_abduction.cli import outcome as ending
 from ssh_abduction.explain import explain, explain_pair, explain_trace
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
@@ -43,7 +42,6 @@ from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.solver.asp.own_rules import EXAMPLE
 from ssh_abduction.solver.candidates import Candidates
-from ssh_abduction.solver.steps.certificate import noise_in
 from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.settle import settle
 
@@ -358,78 +356,6 @@ def is_running(process: int) -> bool:
         return False
     status = Path(f"/proc/{process}/stat")
     return not status.exists() or status.read_text().rpartition(")")[2].split()[0] != "Z"
-
-
-VIEWS = [number % 4 for number in range(201)]
-ACTIONS = [number % 2 for number in range(200)]
-
-
-# Circuits of corridors. Several places have one view, and the actions there differ.
-CORRIDORS = [0, 1, 2, 1, 0, 2, 0, 1, 1, 3] * 20
-DONE = ([0, 1, 0, 0, 1, 1, 0, 1, 0, 1] * 20)[:-1]
-
-
-def with_view(step: int) -> tuple[list[int], list[int]]:
-    """Circuits with one wrong view."""
-    return [*VIEWS[:step], (VIEWS[step] + 1) % 4, *VIEWS[step + 1 :]], ACTIONS
-
-
-@pytest.mark.parametrize(
-    ("views", "actions", "step"),
-    [
-        (VIEWS, ACTIONS, None),
-        (CORRIDORS, DONE, None),
-        ([*CORRIDORS[:120], 9, *CORRIDORS[121:]], DONE, 120),
-        (*with_view(200), 200),
-        (*with_view(120), 120),
-        (*with_view(30), 30),
-        (*with_view(5), None),
-        (
-            VIEWS[:120] + VIEWS[121:],
-            ACTIONS[:120] + ACTIONS[121:],
-            120,
-        ),  # a step left out of the log
-        (
-            VIEWS[:120] + VIEWS[119:],
-            ACTIONS[:120] + ACTIONS[119:],
-            120,
-        ),  # a step that is there twice
-        (list(range(30)), [0] * 29, None),  # all views are new
-        ([0] * 40 + [1], [0] * 40, None),  # a long corridor, and its end
-    ],
-)
-def test_noise_is_distinguished_from_circuits_and_new_places(
-    views: list[int], actions: list[int], step: int | None
-) -> None:
-    noise = noise_in(views, actions)
-    assert (noise and noise.step) == step
-
-
-def test_noise_warning_names_the_step(noisy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    main(["solve", str(noisy), "--json", "--theory=causal"])
-    out, err = capsys.readouterr()
-    last = len(Trace.load(noisy)) - 1
-    (warning,) = json.loads(out)["warnings"]
-    assert err == f"ssh-abduction: warning: {warning}\n"
-    assert warning.startswith(f"{noisy}:{last + 2}: view ")
-    assert (
-        f"looks like noise at step {last}: it forces {last} of the {last + 1} steps up to there to "
-        "be different dstates" in warning
-    )
-
-
-def test_noise_is_reported_if_listing_is_stopped() -> None:
-    trace = rectangle(80)
-    flawed = replace(trace, steps=trace.steps[:40] + trace.steps[41:])
-    search = Search(flawed, Theory.causal())
-    list(search)
-    assert search.status is Status.OPTIMAL
-    # as if the limit ended the listing while clingo gets more steps
-    search.parts.prefixes.engine._labels.size = 0
-    search.parts.known.complete, search.parts.known.stopped = False, "time limit"
-    noise = search.solution().noise
-    assert noise
-    assert noise.step == 40
 
 
 def test_certificate_is_checked_along_the_trace() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import aces
 import numpy as np
 import pytest
-from worlds import TOURS, drive, rectangle
+from worlds import TOURS, drive
 
 import ssh_abduction
 from simulator.errors import SimulatorError
@@ -79,13 +79,6 @@ def in_metres() -> tuple[Trace, Solution]:
     return trace, solve(trace, Theory.causal())
 
 
-def noisy() -> Trace:
-    circuits = rectangle(40)
-    return circuits.with_views(
-        [view if t != 33 else "v0" for t, view in enumerate(map(str, circuits.views))]
-    )
-
-
 SOLVED: dict[str, Callable[[], tuple[Trace, Solution]]] = {
     "several maps": lambda: (ACES, aces.solution()),
     "one map": lambda: (RECTANGLE, solve(RECTANGLE)),
@@ -102,7 +95,6 @@ SOLVED: dict[str, Callable[[], tuple[Trace, Solution]]] = {
     "no proof": lambda: (ACES, solve(ACES, time_limit=1e-4)),
     "no map": lambda: (IMPOSSIBLE, solve(IMPOSSIBLE)),
     "nothing yet": lambda: (IMPOSSIBLE, solve(IMPOSSIBLE, time_limit=1e-9)),
-    "noise": lambda: ((trace := noisy()), solve(trace, Theory.causal())),
 }
 
 

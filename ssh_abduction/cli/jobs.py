@@ -52,8 +52,7 @@ class FileAnswer:
 
 def warn_of(answer: FileAnswer, path: str) -> None:
     """Print the warnings of an answer, each with the name of its file."""
-    where = f"{named(path)}:"
-    warn(text if text.startswith(where) else f"{where} {text}" for text in answer.warnings)
+    warn(f"{named(path)}: {text}" for text in answer.warnings)
 
 
 class FileQuestion(Protocol):

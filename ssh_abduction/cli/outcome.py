@@ -51,9 +51,6 @@ from ssh_abduction.solver import (
 )
 from ssh_abduction.solver import ending as written_ending
 
-# After Ctrl-C, only traces of at most this many steps get warnings. 40,000 steps would take 2 s.
-SOON = 10_000
-
 Given: TypeAlias = tuple[SSHMap, Cost | None]
 
 # It may take this many seconds of processor time to explain a clash, even if a limit is over.
@@ -129,13 +126,7 @@ class Warnings:
 
     def of(self, solution: Solution) -> list[str]:
         """List the warnings about a solution of the search."""
-        return [*self.at_once(solution), *self.second_opinion(solution)]
-
-    def at_once(self, solution: Solution) -> list[str]:
-        """List the warnings that need no further search."""
-        if solution.stopped == "interrupted" and len(self._search.trace) > SOON:
-            return []
-        return [*solution.warnings]
+        return [*solution.warnings, *self.second_opinion(solution)]
 
     def second_opinion(self, solution: Solution) -> list[str]:
         """Warn if the runner-up's views give another map, if there is time to solve it."""

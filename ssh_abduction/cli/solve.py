@@ -165,7 +165,7 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
             options.json = False  # the JSON is complete: a later error must not follow it
             outcome.save_solution(solution, options.output)
             # Warn here, as the guard may end the process after finish().
-            outcome.warn(found.at_once(solution))
+            outcome.warn(solution.warnings)
 
         guard.finish(outcome.exit_code(solution), printed.end(solution, explanation), save)
         outcome.warn(found.second_opinion(solution))

@@ -46,7 +46,7 @@ from ssh_abduction.solver.solution.recorded import (
 )
 from ssh_abduction.solver.solution.sharing import Backbone, Sharing
 from ssh_abduction.solver.solution.weighed import Weighed
-from ssh_abduction.solver.steps.certificate import LEAST, Certificate, Noise
+from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status, cost_as_counted
 from ssh_abduction.theory.joins import Join, joins_by_minimality, joins_in_words
 from ssh_abduction.theory.theory import Theory
@@ -309,22 +309,10 @@ class Solution(MapSequence):
     def warnings(self) -> tuple[str, ...]:
         """Sentences about what is suspicious in the trace, or in corrections of a person.
 
-        They are about a step that looks like noise, about the noise or the units of the odometry,
-        about drives that a corrected gateway keeps apart, and about names that are not used.
+        They are about the noise or the units of the odometry, about drives that a corrected gateway
+        keeps apart, and about names that are not used.
         """
-        noise = [self.noise.sentence(self.trace)] if self.noise and self.trace else []
-        return (*noise, *self.support.warnings)
-
-    @property
-    def noise(self) -> Noise | None:
-        """The step that looks like noise; None if there is no such step, or the map is small.
-
-        Because of this step alone, most steps before it are dstates of their own. It is computed
-        at the first use. In a solution that was read from a file it is None.
-        """
-        few = self.cost is not None and self.cost.dstates <= LEAST
-        basis = self.support.basis
-        return None if few or self.status is Status.UNSATISFIABLE or not basis else basis.noise
+        return self.support.warnings
 
     @property
     def count(self) -> int:
