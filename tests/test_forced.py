@@ -8,16 +8,21 @@ from contextlib import contextmanager
 from typing import NamedTuple
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 import together
 import truth
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import traces
+from test_weighing import cheapest_with_faults
 
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.map_parts import DState
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.costs import beams, forced
-from ssh_abduction.solver.costs.forced import Forcing
+from ssh_abduction.solver.costs.forced import Forcing, Visits, _Joined
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.steps.log import Log
@@ -126,7 +131,52 @@ def test_forcing_tries_single_missing_joins_to_raise_the_bound() -> None:
     assert without <= max(forcing.bounds(cost)) <= cost
 
 
-def test_forced_bound_is_off_if_faults_are_allowed() -> None:
+def test_forced_bound_is_off_if_faults_other_than_views_are_allowed() -> None:
     known = truth.random_walk(3, 8, 0, truth.Noise(Odometry(**FINE)))
     assert Forcing.holds_for(settle(known.trace))
     assert not Forcing.holds_for(settle(known.trace, Theory(misread=2.0)))
+    assert Forcing.holds_for(settle(known.trace, Theory(misread=2.0, star="none")))
+    assert not Forcing.holds_for(settle(known.trace, Theory(slipped=2.0, star="none")))
+
+
+@settings(max_examples=10)
+@given(st.data())
+def test_forced_bound_holds_if_views_may_be_misread(data: st.DataObject) -> None:
+    given = traces(max_steps=3).filter(lambda trace: trace.has_displacements)
+    trace = data.draw(given, label="trace")
+    theory = Theory(
+        level=data.draw(st.sampled_from(["causal", "topological"]), label="level"),
+        misread=data.draw(st.sampled_from([0.2, 0.6, 1.0]), label="misread"),
+        boundary="none",
+        star="none",
+        reject=1e-300,
+        weigh="cost",
+    )
+    if not Forcing.holds_for(settle(trace, theory)):
+        return
+    nats, _ = cheapest_with_faults(trace, theory)
+    maps = solve(trace, theory, time_limit=100).maps
+    for ssh_map in maps[:1]:
+        forcing = forcing_of(trace, theory, ssh_map)
+        forcing.force(nats + 1e-3)
+        assert forcing.low <= nats + EQUAL
+        assert max([0.0, *forcing.bounds(2 * nats)]) <= nats + EQUAL
+
+
+def test_a_view_that_is_misread_twice_costs_twice() -> None:
+    visits = Visits(
+        visit=np.arange(6),
+        direction=np.zeros(6, dtype=int),
+        seen=np.array([0, 1, 0, 2, 0, 3]),
+        place=np.arange(6),
+        links=np.zeros((5, 3), dtype=int),
+        apart=np.zeros((1, 6, 6), dtype=bool),
+        away=np.zeros((6, 6), dtype=bool),
+        price=np.full(6, 2.0),
+    )
+    classes = _Joined(visits, np.array([0, 1, 0, 2, 0, 3]))
+    # Three classes of a visit each, and one of three visits.
+    assert classes.counts == (1, 4, 1)
+    assert classes.excused.tolist() == [0.0, 2.0, 4.0, 6.0, 12.0]
+    mixed = _Joined(visits, np.array([0, 0, 0, 1, 0, 2]))
+    assert mixed.spoilt == 2.0  # of four views of the first dstate, one differs

@@ -12,6 +12,11 @@ Only joins of the best known map are tried. If F gets no further join, assume th
 certain join, and find what all cheap maps without this join have. If no map without it costs less
 than T, F gets it. This is a branch and bound with few branches: one of the two sides always ends.
 
+*Misread views.* If views may be misread, only evidence makes visits apart. Take k classes of visits
+with a view each, such that any two are apart or differ in their views. If a map has fewer dstates
+than k, it misreads all views of some classes, one for each dstate less. A class of several visits
+costs several views then. The bound is the least over the number of dstates.
+
 *Counts.* Two visits that cannot be at one place are apart. If the same action leads from two visits
 to visits that are apart, these two are apart, too (`steps/chart.py`). Visits that are at one place
 by F are apart from the same visits. A clique of dstates, or of places, is a lower bound on their
@@ -37,6 +42,7 @@ from ssh_abduction.solver.steps.apart import apart_classes, apart_matrix, clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.prior import Array
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
@@ -75,6 +81,8 @@ class Visits:
             direction 0 of I is direction R of J.
         away: The flag [I, J] says that visits I and J are at different places by evidence; None
             with frames, where `apart` says it.
+        price: The nats that it costs to misread the view of each visit; None if no view may be
+            misread. If there are prices, views make no visits apart in `apart`.
     """
 
     visit: Ints
@@ -84,6 +92,7 @@ class Visits:
     links: Ints
     apart: Flags
     away: Flags | None
+    price: Array | None = None
 
     @classmethod
     def of(cls, problem: Problem, log: Log, ssh_map: SSHMap) -> Visits:
@@ -91,7 +100,13 @@ class Visits:
         chart = (
             Chart.framed(problem.trace, log) if row("visits").holds_for(problem.theory) else None
         )
-        return cls._of_steps(log, ssh_map) if chart is None else cls._framed(chart, ssh_map)
+        if chart is not None:
+            return cls._framed(chart, ssh_map)
+        visits, theory = cls._of_steps(log, ssh_map, bool(problem.theory.misread)), problem.theory
+        if not theory.misread:
+            return visits
+        price = [FAULT / 10 * theory.fault_tenths("misread", one) for one in problem.trace.steps]
+        return replace(visits, price=np.array(price))
 
     @classmethod
     def _framed(cls, chart: FramedChart, ssh_map: SSHMap) -> Visits:
@@ -112,10 +127,11 @@ class Visits:
         return cls(visit, (slot + turned[visit]) % 4, seen, place, links, apart, None)
 
     @classmethod
-    def _of_steps(cls, log: Log, ssh_map: SSHMap) -> Visits:
+    def _of_steps(cls, log: Log, ssh_map: SSHMap, misreads: bool) -> Visits:
         steps, none = len(log.seen), np.zeros(len(log.seen), dtype=int)
         links = np.stack([none[1:], np.array(log.actions, dtype=int), none[1:]], 1)
-        apart = Chart.of_steps(log, steps).apart()[None]
+        chart = Chart.of_steps(log, steps)
+        apart = (replace(chart, seen=tuple(none.tolist())) if misreads else chart).apart()[None]
         place = np.array(ssh_map.dstate_at)
         away = apart_matrix(log.pairs.elsewhere, steps)
         return cls(np.arange(steps), none, np.array(log.seen), place, links, apart, away)
@@ -202,7 +218,10 @@ class _Joined:
     Attributes:
         apart: The flag [R, A, B] says that classes A and B are apart, as in `Visits`.
         fails: Whether no map has these classes.
-        counts: The least numbers of dstates and places, unless `fails`.
+        counts: The least numbers of dstates (at all, and if no view of theirs is misread) and of
+            places, unless `fails`.
+        spoilt: The nats of views that are misread in each map with these classes.
+        excused: The nats that misreading all views of 0, 1, 2, … classes costs at least.
     """
 
     def __init__(self, visits: Visits, of: Ints) -> None:
@@ -223,11 +242,26 @@ class _Joined:
         a, x = nodes.T
         self._node = {(a, x): node for node, (a, x) in enumerate(nodes.tolist())}
         apart = self.apart[(x - x[:, None]) % self._turns, a[:, None], a]
-        self._dstates = _Cliques(apart | (a[:, None] == a) & (x[:, None] != x))
+        apart |= (a[:, None] == a) & (x[:, None] != x)
+        self._hard = self._dstates = _Cliques(apart)
+        self.spoilt, self.excused = 0.0, np.zeros(1)
+        if visits.price is not None:
+            shown = np.zeros((len(nodes), int(visits.seen.max()) + 1))
+            np.add.at(shown, (of, visits.seen), visits.price)
+            of_views = np.unique(np.stack([of, visits.seen]), axis=1)[0]
+            # Of two classes with a view each, and not the same one, one is misread in full if they
+            # are one dstate.
+            single = np.bincount(of_views) == 1
+            view = np.where(single, shown.argmax(axis=1), -1)
+            differ = (view[:, None] != view) & single[:, None] & single
+            self._dstates = _Cliques(apart | differ)
+            whole = shown.sum(axis=1)
+            self.spoilt = float((whole - shown.max(axis=1)).sum())
+            self.excused = np.cumsum([0.0, *np.sort(whole[single])])
         self._has_frames = visits.away is None
         apart = self.apart if visits.away is None else apart_classes(visits.away[None], of)
         self._places = _Cliques(np.logical_and.reduce(apart))
-        self.counts = self._dstates.size, self._places.size
+        self.counts = self._hard.size, self._dstates.size, self._places.size
 
     def _close(self) -> None:
         """Flag two classes as apart if one action leads from them to classes that are apart."""
@@ -240,8 +274,8 @@ class _Joined:
                 e, f = np.nonzero(then)
                 self.apart[(out[f] - out[e]) % self._turns, a[e], a[f]] = True
 
-    def counts_lacking(self, a: int, b: int) -> tuple[int, int] | None:
-        """Return the least numbers of dstates and places without a join; None if none lacks it."""
+    def counts_lacking(self, a: int, b: int) -> tuple[int, int, int] | None:
+        """Return what `counts` has for maps without a join; None if no map lacks it."""
         added = self._lack(a, b)
         fails = any(not r and c == d for r, c, d in added)
         node = self._node
@@ -257,9 +291,9 @@ class _Joined:
             self.apart[r, c, d] = self.apart[-r % self._turns, d, c] = False
         if fails:
             return None
-        return self._dstates.size_with(nodes), self._places.size_with(
-            places if self._has_frames else []
-        )
+        shown = self._dstates.size_with(nodes)
+        hard = shown if self._hard is self._dstates else self._hard.size_with(nodes)
+        return hard, shown, self._places.size_with(places if self._has_frames else [])
 
     def _lack(self, a: int, b: int) -> list[tuple[int, int, int]]:
         """Flag two classes as apart, and all that are apart if they are. Return the new flags."""
@@ -310,6 +344,8 @@ class Forcing:
     def holds_for(problem: Problem) -> bool:
         """Whether the bound holds for a theory, and the trace is not too long for it."""
         theory = problem.theory
+        if theory.misread and theory.star == "none":
+            theory = theory.replace(misread=0.0)
         is_known = row("visits").holds_for(theory) or row("clique").holds_for(theory)
         return is_known and not theory.has_faults and len(problem.trace) <= LONGEST
 
@@ -349,10 +385,20 @@ class Forcing:
         places = [*firsts(zip(at, steps, strict=True)).values()]
         return self._prior.least(dstates[1:], places[1:])
 
-    def _price(self, counts: tuple[int, int], least: tuple[Array, Array]) -> float:
-        """Return what at least this many dstates and places cost. `least` is that of `_least`."""
-        found = {"dstates": max(counts[0], self._dstates), "places": counts[1]}
-        return self._prior.at_least(found, least)
+    def _price(
+        self, counts: tuple[int, int, int], classes: _Joined, least: tuple[Array, Array]
+    ) -> float:
+        """Return what at least this many dstates and places cost, and views that are misread.
+
+        `counts` is as in `_Joined`, and `least` that of `_least`.
+        """
+        hard, shown, places = counts
+        hard = max(hard, self._dstates)
+        return classes.spoilt + min(
+            self._prior.at_least({"dstates": some, "places": places}, least)
+            + float(classes.excused[max(shown - some, 0)])
+            for some in range(hard, max(shown, hard) + 1)
+        )
 
     def _forced(self, visits: Visits, joins: Ints, most: float, branches: int) -> bool:
         """Add joins that every map of a cost below `most` has. Return whether there is no such map.
@@ -388,7 +434,7 @@ class Forcing:
                 return joins, math.inf, []
             misfit = self._misfit.of_returns(visits.returns(joins)) / 2
             least = self._least(joins)
-            low = self._price(classes.counts, least) + misfit
+            low = self._price(classes.counts, classes, least) + misfit
             if low >= most:
                 return joins, low, []
             # Of each two classes that may join, try one pair of visits.
@@ -402,7 +448,9 @@ class Forcing:
             for (a, b), pair in left.items():
                 look_at_clock()
                 counts = classes.counts_lacking(a, b)
-                worth[pair] = math.inf if counts is None else self._price(counts, least) + misfit
+                worth[pair] = misfit + (
+                    math.inf if counts is None else self._price(counts, classes, least)
+                )
             forced = [pair for pair, nats in worth.items() if nats >= most]
             if not forced:
                 return joins, low, sorted(worth, key=lambda pair: -worth[pair])
