@@ -31,7 +31,8 @@ from table import OURS, WITHOUT
 
 from ssh_abduction import Solution, Theory, Trace
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import Search, Status
+from ssh_abduction.solution import Status
+from ssh_abduction.solver import Search
 from ssh_abduction.solver.asp import limits
 from ssh_abduction.solver.asp.limits import peak_memory
 from ssh_abduction.theory import Speedups

@@ -42,7 +42,8 @@ from fault_peers import PEERS
 from scipy.optimize import linear_sum_assignment
 
 from ssh_abduction import SSHMap, Theory
-from ssh_abduction.solver import Progress, Search, Status
+from ssh_abduction.solution import Progress, Status
+from ssh_abduction.solver import Search
 from ssh_abduction.solver.asp import limits
 
 OURS, TOLD = "ssh-abduction", "ssh-abduction, told the kind"

@@ -33,7 +33,7 @@ from ssh_abduction import Trace
 from ssh_abduction.building.derive import with_building
 from ssh_abduction.building.directions import Guide
 from ssh_abduction.output.roads import place_of_steps
-from ssh_abduction.solver import Solution
+from ssh_abduction.solution import Solution
 
 CELL, STRIDE = 0.1, 0.2  # metres of a cell of the plan, and of a stride
 BODY = 0.2  # metres: half the width of the follower

@@ -24,7 +24,7 @@ import ssh_abduction.checker.displacements
 import ssh_abduction.solver.geometry.fit
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data import Odometry
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.theory.evidence import displacement
 
 # The functions of geometry that other parts call.

@@ -35,7 +35,7 @@ from simulator.rounds import Building
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.building.derive import with_building
 from ssh_abduction.output.roads import place_of_steps
-from ssh_abduction.solver import Solution
+from ssh_abduction.solution import Solution
 
 
 def judged(

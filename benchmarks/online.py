@@ -23,7 +23,7 @@ from instances import maze
 
 from ssh_abduction import OnlineMapper, solve
 from ssh_abduction.data import Odometry
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 
 CHECKPOINTS = (10, 20, 30, 40, 60, 100, 300, 1000, 4000)
 ANEW = 20.0  # seconds

@@ -34,7 +34,8 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.solver import Solution, solve
+from ssh_abduction.solution import Solution
+from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory
 
 # The paper's robot has no odometry that would distinguish places.

@@ -46,7 +46,7 @@ from instances import Walk
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace
 from ssh_abduction.online.keeper import ExtendedMap
-from ssh_abduction.solver import Cost
+from ssh_abduction.solution import Cost
 from ssh_abduction.solver.asp import facts
 
 COLUMNS = (

@@ -37,7 +37,8 @@ from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import NUMBERS, Pose
-from ssh_abduction.solver import Status, find_backbone
+from ssh_abduction.solution import Status
+from ssh_abduction.solver import find_backbone
 
 ROOT = Path(__file__).parent.parent
 # The default noise: 5 % along the way, 0.5 % across it, and 0.002 rad of heading per metre.

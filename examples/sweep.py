@@ -38,7 +38,7 @@ from typing import Any
 from ssh_abduction import Trace
 from ssh_abduction.cli import main as shell
 from ssh_abduction.evaluation import evaluate_visits
-from ssh_abduction.solver import Solution
+from ssh_abduction.solution import Solution
 
 Row = dict[str, Any]
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals import compare as compare
     from ssh_abduction.rivals import next_experiment as next_experiment
     from ssh_abduction.robot_logs import map_log as map_log
-    from ssh_abduction.solver import Solution as Solution
+    from ssh_abduction.solution import Solution as Solution
     from ssh_abduction.solver import solve as solve
     from ssh_abduction.theory import Theory as Theory
 

@@ -24,7 +24,7 @@ from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.robot_logs.log_maps import BARE
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 

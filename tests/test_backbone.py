@@ -26,16 +26,11 @@ from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, Odometry, SolverError
 from ssh_abduction.rivals import difference
-from ssh_abduction.solver import (
-    Search,
-    Solution,
-    Start,
-    Status,
-    find_backbone,
-)
+from ssh_abduction.solution import Solution, Status
+from ssh_abduction.solution.result import summary_of
+from ssh_abduction.solution.sharing import Backbone, Shared
+from ssh_abduction.solver import Search, Start, find_backbone
 from ssh_abduction.solver import search as search_module
-from ssh_abduction.solver.solution.result import summary_of
-from ssh_abduction.solver.solution.sharing import Backbone, Shared
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.readable import StepEngine

@@ -24,7 +24,8 @@ from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.runtime.clock import heeding
-from ssh_abduction.solver import Search, Status
+from ssh_abduction.solution import Status
+from ssh_abduction.solver import Search
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.solver.sources.metric.completing import completed

@@ -55,7 +55,8 @@ from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.online import Chances
 from ssh_abduction.rivals import Listing, difference
-from ssh_abduction.solver import Level, Search
+from ssh_abduction.solution import Level
+from ssh_abduction.solver import Search
 from ssh_abduction.theory import Speedups
 
 SHIPPED = Path(inspect.getfile(World)).parent / "worlds" / "notched-rectangle.json"

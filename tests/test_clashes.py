@@ -10,7 +10,8 @@ import pytest
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main, outcome
 from ssh_abduction.explain.axioms import Interrupted
-from ssh_abduction.solver import Search, Status, candidates
+from ssh_abduction.solution import Status
+from ssh_abduction.solver import Search, candidates
 from ssh_abduction.solver.search import clash_in
 from ssh_abduction.theory.settle import settle
 

@@ -16,7 +16,8 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import each_heeding, heeding, look_at_clock
-from ssh_abduction.solver import Status, candidates, search
+from ssh_abduction.solution import Status
+from ssh_abduction.solver import candidates, search
 from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.geometry import ranking
 from ssh_abduction.solver.geometry.fit import fit

@@ -35,11 +35,11 @@ from ssh_abduction.page.content import content_of
 from ssh_abduction.rivals import Comparison, Listing, difference, shared_sides
 from ssh_abduction.rivals.listing import PairInMap
 from ssh_abduction.rivals.questions import Matter, Question, deciding, independent
+from ssh_abduction.solution.sharing import Backbone, Sharing
+from ssh_abduction.solution.weighed import Rival, Weighed
 from ssh_abduction.solver import find_backbone
 from ssh_abduction.solver import search as searching
 from ssh_abduction.solver.parts import Priced
-from ssh_abduction.solver.solution.sharing import Backbone, Sharing
-from ssh_abduction.solver.solution.weighed import Rival, Weighed
 
 FREE_PLACES = Theory(star="none", prefer=("dstates", "places", "paths"))
 

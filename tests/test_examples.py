@@ -16,7 +16,7 @@ import pytest
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

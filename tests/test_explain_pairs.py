@@ -22,7 +22,8 @@ from ssh_abduction.explain.pair_reasons import explain_pair
 from ssh_abduction.explain.verdict import Derivation, Link, PairExplanation, Side, Verdict
 from ssh_abduction.rivals import Listing
 from ssh_abduction.rivals.listing import PairInMap
-from ssh_abduction.solver import Cost, Search, Solution, Start, Status
+from ssh_abduction.solution import Cost, Solution, Status
+from ssh_abduction.solver import Search, Start
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.theory.encodings import axioms
 from ssh_abduction.theory.settle import settle

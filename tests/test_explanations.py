@@ -19,7 +19,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Odometry, TraceError
 from ssh_abduction.explain.no_map import explain, why_apart
 from ssh_abduction.robot_logs.log_maps import BARE
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.theory.evidence import evidence_of, pairs_of
 from ssh_abduction.theory.pairs import pairs_in
 from ssh_abduction.theory.settle import settle

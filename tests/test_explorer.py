@@ -15,7 +15,7 @@ from ssh_abduction import Explorer, Theory, solve
 from ssh_abduction.data import Action, Step, TheoryError, TraceError
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.online import Exploration
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 
 TURNS = {"right": 1, "around": 2, "left": 3}
 STREET = streets(("a", "E", "b"))

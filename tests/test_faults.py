@@ -22,7 +22,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Step
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.solver.sources.exact import choosing, faulty
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.theory import Speedups

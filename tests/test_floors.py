@@ -26,7 +26,7 @@ from ssh_abduction.online import route
 from ssh_abduction.output import to_dot, to_networkx, to_svg
 from ssh_abduction.output.export import export_map
 from ssh_abduction.output.layout import drawable_poses, layout
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.solver.asp.facts import program
 from ssh_abduction.theory.evidence import Equality, Floors
 from ssh_abduction.theory.settle import settle

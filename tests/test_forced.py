@@ -21,10 +21,10 @@ from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.map_parts import DState
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solution.weighed import Weighed
 from ssh_abduction.solver.costs import beams, forced
 from ssh_abduction.solver.costs.forced import Forcing, Visits, _Joined
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.solution.weighed import Weighed
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 

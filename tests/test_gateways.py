@@ -27,7 +27,7 @@ from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.maps import maps_of
 from ssh_abduction.data.star import Frame, Gateway, Star
 from ssh_abduction.data.trace import Action, Step
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.solver.sources.exact import prefixes
 from ssh_abduction.solver.steps import frames
 from ssh_abduction.theory.settle import settle

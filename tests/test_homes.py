@@ -9,7 +9,7 @@ import pytest
 from turns import stepwise
 
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.solver.sources.exact import choosing
 from ssh_abduction.solver.steps.apart import pairwise_distinct
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups

@@ -23,7 +23,7 @@ from ssh_abduction.data import MapError, SSHMap
 from ssh_abduction.page.content import content_of
 from ssh_abduction.rivals import Listing
 from ssh_abduction.robot_logs import log_report
-from ssh_abduction.solver.solution.weighed import Rival, Weighed
+from ssh_abduction.solution.weighed import Rival, Weighed
 from ssh_abduction.theory.joins import Join, joins_by_minimality, joins_in_words
 from ssh_abduction.theory.settle import settle
 

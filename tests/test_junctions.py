@@ -26,7 +26,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.evaluation import evaluate
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 
 SHIPPED = {
     "triangle": (12, 3, 3),

@@ -17,7 +17,7 @@ from onto import walks
 from ssh_abduction import Solution, Theory, Trace, check, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import Action
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.solver import onto as added_drives
 
 

@@ -37,7 +37,8 @@ from ssh_abduction.cli import outcome as ending
 from ssh_abduction.explain import explain, explain_pair, explain_trace
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
 from ssh_abduction.runtime import workers
-from ssh_abduction.solver import Search, Status, check_rules, find_backbone
+from ssh_abduction.solution import Status
+from ssh_abduction.solver import Search, check_rules, find_backbone
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.solver.asp.own_rules import EXAMPLE

@@ -32,7 +32,7 @@ from ssh_abduction.page.html import ground_in, view_page
 from ssh_abduction.robot_logs.log_ground import GRAIN, ground_of, laid_over
 from ssh_abduction.robot_logs.log_maps import LogMap, map_log
 from ssh_abduction.robot_logs.log_report import report
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 
 
 @pytest.fixture(scope="module")

@@ -47,7 +47,8 @@ from ssh_abduction.robot_logs.log_maps import (
     work_for,
 )
 from ssh_abduction.runtime import workers
-from ssh_abduction.solver import Solution, Status, solve
+from ssh_abduction.solution import Solution, Status
+from ssh_abduction.solver import solve
 
 SCANS = 110
 REAL = Path(__file__).parents[2] / "shared" / "data" / "logs"

@@ -37,7 +37,8 @@ from ssh_abduction.page.html import ground_in
 from ssh_abduction.robot_logs import log_maps, log_report
 from ssh_abduction.robot_logs.log_ground import ASIDE, laid_over
 from ssh_abduction.robot_logs.log_maps import BARE, map_log
-from ssh_abduction.solver import Solution, solve
+from ssh_abduction.solution import Solution
+from ssh_abduction.solver import solve
 from ssh_abduction.solver.sources.metric.joint_drives import Joining
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle

@@ -17,7 +17,8 @@ from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action
 from ssh_abduction.explain.no_map import explain
-from ssh_abduction.solver import Search, Status
+from ssh_abduction.solution import Status
+from ssh_abduction.solver import Search
 from ssh_abduction.solver.mending import Mending
 from ssh_abduction.solver.search import clash_in, late_clash
 from ssh_abduction.solver.sources.symbolic.sketch import mended_sketch

@@ -21,7 +21,7 @@ from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, Odometry, Step, TheoryError, TraceError
 from ssh_abduction.online.keeper import MapKeeper
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import Speedups
 

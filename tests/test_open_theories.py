@@ -27,7 +27,8 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import TheoryError
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.online.keeper import ExtendedMap
-from ssh_abduction.solver import Search, Status
+from ssh_abduction.solution import Status
+from ssh_abduction.solver import Search
 from ssh_abduction.solver.board import InternalError
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.solver.sources.exact.engine import Task

@@ -21,7 +21,7 @@ from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker import check
 from ssh_abduction.checker.evidence import Edges
 from ssh_abduction.data.maps import DState
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.solver.sources.symbolic.sketch import first_contradiction, sketches_of
 from ssh_abduction.theory.evidence import Equality, Planar

@@ -22,8 +22,8 @@ from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.claims import check_bound
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
+from ssh_abduction.solution.recorded import Support
 from ssh_abduction.solver import Search
-from ssh_abduction.solver.solution.recorded import Support
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.log import Log
 

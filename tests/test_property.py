@@ -14,7 +14,7 @@ from turns import STEPWISE, stepwise
 from ssh_abduction import solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.theory.fields import Count
 from ssh_abduction.theory.theory import Theory

@@ -26,7 +26,8 @@ from ssh_abduction.cli import main, parser
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output import to_svg
 from ssh_abduction.robot_logs import log_maps
-from ssh_abduction.solver import Solution, Status, solve
+from ssh_abduction.solution import Solution, Status
+from ssh_abduction.solver import solve
 from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.theory import Theory
 

@@ -22,7 +22,7 @@ from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief
 from ssh_abduction.online.keeper import ExtendedMap
 from ssh_abduction.online.recovery import shares_of_rivals
-from ssh_abduction.solver import Solution, Status
+from ssh_abduction.solution import Solution, Status
 from ssh_abduction.theory.encodings import Rules
 
 BOTH = Theory.causal().replace(misread=1.5, slipped=3)

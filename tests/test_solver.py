@@ -33,7 +33,9 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.solver import Progress, Search, Status
+from ssh_abduction.solution import Progress, Status
+from ssh_abduction.solution.values import Found
+from ssh_abduction.solver import Search
 from ssh_abduction.solver import search as search_module
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.sources.exact import labels_first, prefixes, readable
@@ -42,7 +44,6 @@ from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.solver.steps.faults import links_of
 from ssh_abduction.solver.steps.log import Log
-from ssh_abduction.solver.values import Found
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.settle import Problem, settle
 

@@ -10,7 +10,7 @@ from worlds import TOURS, drive, rectangle, written
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import Solution, Status
+from ssh_abduction.solution import Solution, Status
 
 P0 = Theory.causal()
 P1 = Theory(

@@ -21,7 +21,7 @@ from ssh_abduction.data.errors import MapError, TraceError
 from ssh_abduction.output import to_dot, to_graphml, to_svg
 from ssh_abduction.rivals.comparison import compare
 from ssh_abduction.rivals.explore import next_experiment
-from ssh_abduction.solver import Status
+from ssh_abduction.solution import Status
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import TABLE
 

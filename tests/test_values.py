@@ -46,7 +46,8 @@ from ssh_abduction.data import (
 )
 from ssh_abduction.learning.learner import LearnerError
 from ssh_abduction.robot_logs import log_report
-from ssh_abduction.solver import Certificate, Progress, Search, Status
+from ssh_abduction.solution import Certificate, Progress, Status
+from ssh_abduction.solver import Search
 from ssh_abduction.solver.board import InternalError
 from ssh_abduction.theory import Speedups
 
@@ -308,7 +309,7 @@ def test_solution_survives_a_round_trip(kind: str, tmp_path: Path) -> None:
 def test_values_load_without_a_solver() -> None:
     program = (
         "import sys; from ssh_abduction import Solution, SSHMap, Theory, Trace; "
-        "from ssh_abduction.solver import Backbone, Certificate, Cost, Progress, Status; "
+        "from ssh_abduction.solution import Backbone, Certificate, Cost, Progress, Status; "
         "print([name for name in ('clingo', 'networkx', 'numpy') if name in sys.modules])"
     )
     shown = subprocess.run(

@@ -28,15 +28,16 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Closure, MapError, Odometry, SolverError, TheoryError, together
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.schema import FieldReader
-from ssh_abduction.solver import Search, Status
+from ssh_abduction.solution import Status
+from ssh_abduction.solution.values import Found
+from ssh_abduction.solution.weighed import Rival, Weighed
+from ssh_abduction.solver import Search
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.costs import beams, weighing
 from ssh_abduction.solver.costs.estimating import estimated, rivals_of
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import fit
 from ssh_abduction.solver.geometry.poses import Poses
-from ssh_abduction.solver.solution.weighed import Rival, Weighed
-from ssh_abduction.solver.values import Found
 from ssh_abduction.theory import prior as prior_module
 from ssh_abduction.theory.prior import _area as area
 from ssh_abduction.theory.settle import settle

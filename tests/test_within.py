@@ -20,7 +20,7 @@ from ssh_abduction.checker.claims import false_claims
 from ssh_abduction.cli import main
 from ssh_abduction.data import SolverError
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import Cost, Status
+from ssh_abduction.solution import Cost, Status
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sources.exact import prefixes
 from ssh_abduction.theory.encodings import Rules

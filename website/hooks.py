@@ -50,20 +50,11 @@ THEMES: dict[str, tuple[str, ...]] = {
         "output.to_dot",
     ),
     "Package solver": tuple(
-        f"solver.{name}"
-        for name in (
-            "Search",
-            "Status",
-            "Cost",
-            "Bound",
-            "Certificate",
-            "Level",
-            "Progress",
-            "Backbone",
-            "find_backbone",
-            "find_regions",
-            "with_regions",
-        )
+        f"solver.{name}" for name in ("Search", "find_backbone", "find_regions", "with_regions")
+    ),
+    "Package solution": tuple(
+        f"solution.{name}"
+        for name in ("Status", "Cost", "Bound", "Certificate", "Level", "Progress", "Backbone")
     ),
     "Other packages": (
         "theory.Speedups",

@@ -19,7 +19,8 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.rivals.listing import DrivePair, Listing, joins_of_drives
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solver import Watch, check_limit, stretches
+from ssh_abduction.solution import stretches
+from ssh_abduction.solver import Watch, check_limit
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

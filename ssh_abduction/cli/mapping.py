@@ -44,7 +44,8 @@ from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.runtime import workers
 from ssh_abduction.runtime.loggers import begin_stage, stages
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solver import Solution, Stop, check_limit
+from ssh_abduction.solution import Solution, Stop
+from ssh_abduction.solver import check_limit
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

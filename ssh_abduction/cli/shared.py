@@ -23,7 +23,7 @@ from ssh_abduction.data.schema import only_known
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
 from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.solver import trace_in
+from ssh_abduction.solution import trace_in
 from ssh_abduction.theory.fields import CHOICES
 from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
 

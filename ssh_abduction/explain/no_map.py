@@ -32,13 +32,11 @@ from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
+from ssh_abduction.solution import Progress, Status, Stop
 from ssh_abduction.solver import (
     LimitError,
-    Progress,
     Search,
     Start,
-    Status,
-    Stop,
     Watch,
     check_limit,
     check_rules,

@@ -25,7 +25,8 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.schema import PlainData
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import LimitedQuestion, QuestionLimits
-from ssh_abduction.solver import Judging, Stop, with_regions
+from ssh_abduction.solution import Stop
+from ssh_abduction.solver import Judging, with_regions
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # The side of a path on which a place is known to lie; "on" if it is on the path.

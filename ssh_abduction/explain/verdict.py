@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.no_map import ClashingAxiom, Explanation, clashes_of, steps_listed
-from ssh_abduction.solver import Cost, Stop
+from ssh_abduction.solution import Cost, Stop
 from ssh_abduction.theory.theory import Theory
 
 # If an inference has more reasons than IN_A_LINE, each gets a line of its own.

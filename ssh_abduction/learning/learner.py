@@ -33,7 +33,8 @@ from ssh_abduction.data.words import counted
 from ssh_abduction.learning.runner_up import RunnerUpWarning, second_map
 from ssh_abduction.learning.traces import Traces
 from ssh_abduction.runtime.loggers import log_of
-from ssh_abduction.solver import Solution, Status, solve
+from ssh_abduction.solution import Solution, Status
+from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 __all__ = [

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 from ssh_abduction.data.errors import TraceError, said_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, View
-from ssh_abduction.solver import Solution, Status, solve
+from ssh_abduction.solution import Solution, Status
+from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory
 
 FIELD = "runner_up"

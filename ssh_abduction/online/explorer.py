@@ -56,7 +56,8 @@ from ssh_abduction.online.mapper import OnlineMapper
 from ssh_abduction.rivals.explore import next_experiment
 from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.rivals.tour import next_tour
-from ssh_abduction.solver import Solution, Status, check_limit, find_backbone, solve
+from ssh_abduction.solution import Solution, Status
+from ssh_abduction.solver import check_limit, find_backbone, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # If nothing is left to do but the map is not proven minimal, solve the trace with a time limit that

@@ -19,17 +19,19 @@ from ssh_abduction.checker.checker import unchecked
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import DState, Fault, SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solver import (
+from ssh_abduction.solution import (
     Cost,
     Effort,
-    Judging,
-    Search,
     Seconds,
-    Sketch,
     Solution,
-    Start,
     Status,
     Stop,
+)
+from ssh_abduction.solver import (
+    Judging,
+    Search,
+    Sketch,
+    Start,
     observation,
     sketch_beyond,
 )

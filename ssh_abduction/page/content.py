@@ -44,7 +44,7 @@ from ssh_abduction.output.roads import undecided_places
 from ssh_abduction.output.scene import axes
 from ssh_abduction.rivals.comparison import Choice, compare
 from ssh_abduction.rivals.listing import DrivePair, Listing, Maps, joins_of_drives
-from ssh_abduction.solver import probability_in_words
+from ssh_abduction.solution import probability_in_words
 
 DRAWING = 3.0  # processor seconds for the drawings of all maps except the first
 DRAWN = 10_000  # dstates of all drawings together; more would make the page too large

@@ -47,7 +47,7 @@ from ssh_abduction.rivals.questions import (
     options_of,
     questions_of,
 )
-from ssh_abduction.solver import Backbone, Shared, Sharing
+from ssh_abduction.solution import Backbone, Shared, Sharing
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,7 +45,7 @@ from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.words import counted, noun_of
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.rivals.questions import NONE, Table
-from ssh_abduction.solver import Sort, stretches
+from ssh_abduction.solution import Sort, stretches
 
 Steps: TypeAlias = tuple[int, ...]
 Link: TypeAlias = tuple[int, str, int]

@@ -76,7 +76,8 @@ from ssh_abduction.rivals.machines import (
     machine_of,
     with_ends,
 )
-from ssh_abduction.solver import LimitError, Solution, Stop, Watch, check_limit
+from ssh_abduction.solution import Solution, Stop
+from ssh_abduction.solver import LimitError, Watch, check_limit
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 

@@ -38,7 +38,7 @@ from ssh_abduction.data.maps import ID_LENGTH, SSHMap, checked_maps, maps_of
 from ssh_abduction.data.schema import PlainData
 from ssh_abduction.data.trace import View
 from ssh_abduction.data.words import counted
-from ssh_abduction.solver import (
+from ssh_abduction.solution import (
     Backbone,
     Solution,
     Status,

@@ -19,7 +19,7 @@ from ssh_abduction.data.words import counted
 from ssh_abduction.output.roads import place_of_steps
 from ssh_abduction.page.content import Section
 from ssh_abduction.rivals.listing import Listing, joins_of_drives
-from ssh_abduction.solver import Solution, Status
+from ssh_abduction.solution import Solution, Status
 
 OF_LOG = "The log"  # the title of the section that does not depend on the map
 

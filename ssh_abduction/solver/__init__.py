@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp.control import new_control as new_control
     from ssh_abduction.solver.asp.limits import WAITING as WAITING
     from ssh_abduction.solver.asp.limits import LimitError as LimitError
-    from ssh_abduction.solver.asp.limits import Stop as Stop
     from ssh_abduction.solver.asp.limits import Watch as Watch
     from ssh_abduction.solver.asp.limits import check_limit as check_limit
     from ssh_abduction.solver.asp.limits import in_process as in_process
@@ -39,39 +38,10 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.parts import Limits as Limits
     from ssh_abduction.solver.parts import Start as Start
     from ssh_abduction.solver.search import Search as Search
-    from ssh_abduction.solver.solution.recorded import drives_in as drives_in
-    from ssh_abduction.solver.solution.recorded import trace_in as trace_in
-    from ssh_abduction.solver.solution.result import Solution as Solution
-    from ssh_abduction.solver.solution.result import ending as ending
-    from ssh_abduction.solver.solution.result import opening as opening
-    from ssh_abduction.solver.solution.result import summary_of as summary_of
-    from ssh_abduction.solver.solution.result import verdict_of as verdict_of
-    from ssh_abduction.solver.solution.result import written_map as written_map
-    from ssh_abduction.solver.solution.sharing import SORTS as SORTS
-    from ssh_abduction.solver.solution.sharing import Backbone as Backbone
-    from ssh_abduction.solver.solution.sharing import Shared as Shared
-    from ssh_abduction.solver.solution.sharing import Sharing as Sharing
-    from ssh_abduction.solver.solution.sharing import Sort as Sort
-    from ssh_abduction.solver.solution.sharing import key_of as key_of
-    from ssh_abduction.solver.solution.sharing import sorts_of as sorts_of
-    from ssh_abduction.solver.solution.sharing import stretches as stretches
-    from ssh_abduction.solver.solution.weighed import EQUAL as EQUAL
-    from ssh_abduction.solver.solution.weighed import Weighed as Weighed
-    from ssh_abduction.solver.solution.weighed import probability_in_words as probability_in_words
     from ssh_abduction.solver.sources.exact.choosing import preload_engine as preload_engine
     from ssh_abduction.solver.sources.symbolic.sketch import Sketch as Sketch
     from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond as sketch_beyond
     from ssh_abduction.solver.sources.symbolic.sketch import sketches_of as sketches_of
-    from ssh_abduction.solver.steps.certificate import RESTS_ON as RESTS_ON
-    from ssh_abduction.solver.steps.certificate import Certificate as Certificate
     from ssh_abduction.solver.steps.log import observation as observation
-    from ssh_abduction.solver.values import Bound as Bound
-    from ssh_abduction.solver.values import Cost as Cost
-    from ssh_abduction.solver.values import Effort as Effort
-    from ssh_abduction.solver.values import Level as Level
-    from ssh_abduction.solver.values import Progress as Progress
-    from ssh_abduction.solver.values import Seconds as Seconds
-    from ssh_abduction.solver.values import Status as Status
-    from ssh_abduction.solver.values import cost_as_counted as cost_as_counted
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -18,6 +18,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import STARVED, heeding
 from ssh_abduction.runtime.loggers import log_of
+from ssh_abduction.solution.values import Found
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, Watch, processor_clock
 from ssh_abduction.solver.board import Judging, Known, projected
@@ -31,7 +32,6 @@ from ssh_abduction.solver.sources.symbolic.sketch import (
     sketches_of,
 )
 from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
-from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory

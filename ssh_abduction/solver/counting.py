@@ -11,6 +11,7 @@ from collections.abc import Generator, Iterator
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.loggers import log_of
+from ssh_abduction.solution.values import Found, Status
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.parts import Parts, Priced
 from ssh_abduction.solver.schedule import Source, turn
@@ -23,7 +24,6 @@ from ssh_abduction.solver.sources.exact.choosing import (
     takes_all,
 )
 from ssh_abduction.solver.sources.exact.readable import StepEngine
-from ssh_abduction.solver.values import Found, Status
 from ssh_abduction.theory.speedups import row
 
 TYPE_CHECKING = False

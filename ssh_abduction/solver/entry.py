@@ -36,13 +36,13 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.runtime.clock import counting
 from ssh_abduction.runtime.loggers import log_of
+from ssh_abduction.solution.result import Solution
+from ssh_abduction.solution.sharing import Backbone
+from ssh_abduction.solution.values import Progress
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.onto import Solving, joint_with, solve_onto
 from ssh_abduction.solver.parts import Limits, Start
 from ssh_abduction.solver.search import Search
-from ssh_abduction.solver.solution.result import Solution
-from ssh_abduction.solver.solution.sharing import Backbone
-from ssh_abduction.solver.values import Progress
 from ssh_abduction.theory.evidence.of_steps import are_alike
 from ssh_abduction.theory.speedups import ALL, Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory

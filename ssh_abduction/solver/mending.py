@@ -30,6 +30,7 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
+from ssh_abduction.solution.values import Found
 from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.faulty import FaultyEngine
@@ -37,7 +38,6 @@ from ssh_abduction.solver.sources.metric.wrong_displacements import wrong_displa
 from ssh_abduction.solver.sources.symbolic.merging import Merging
 from ssh_abduction.solver.sources.symbolic.sketch import mended_sketch
 from ssh_abduction.solver.steps.faults import with_faults
-from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 

@@ -39,19 +39,19 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.step import Action, Step
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding
-from ssh_abduction.solver.asp.limits import EARLY, LimitError, Stop, Watch
+from ssh_abduction.solution.recorded import Support
+from ssh_abduction.solution.result import Solution
+from ssh_abduction.solution.values import Bound, Cost, Effort, Level, Seconds, Status, Stop
+from ssh_abduction.solution.weighed import IMPROBABLE, Rival, Weighed
+from ssh_abduction.solver.asp.limits import EARLY, LimitError, Watch
 from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.costs.estimating import may_join_more, rival_of, rivals_of
 from ssh_abduction.solver.derived_regions import Deriving
 from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning
 from ssh_abduction.solver.schedule import turn
-from ssh_abduction.solver.solution.recorded import Support
-from ssh_abduction.solver.solution.result import Solution
-from ssh_abduction.solver.solution.weighed import IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE
 from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.solver.sources.symbolic.sketch import first_contradiction, sketch_beyond
-from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status
 from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory, checked_theory

@@ -13,20 +13,9 @@ from ssh_abduction.data.errors import SolverError, brief, is_whole
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
 from ssh_abduction.runtime.loggers import PROGRESS, log_progress
-from ssh_abduction.solver.asp.limits import Stop, Watch, check_limit
-from ssh_abduction.solver.asp.own_rules import never_true
-from ssh_abduction.solver.board import Judging, Known
-from ssh_abduction.solver.candidates import Candidates
-from ssh_abduction.solver.geometry.ranking import in_order, noise_warning, units_warning
-from ssh_abduction.solver.solution.recorded import Support
-from ssh_abduction.solver.solution.result import Solution
-from ssh_abduction.solver.sources.exact import prefixes
-from ssh_abduction.solver.sources.exact.choosing import NearMinimal, may_name, new_engine
-from ssh_abduction.solver.sources.exact.engine import Engine, GrowingEngine, Task
-from ssh_abduction.solver.sources.exact.prefixes import Prefixes, Rivals
-from ssh_abduction.solver.sources.exact.readable import StepEngine
-from ssh_abduction.solver.steps.certificate import Basis
-from ssh_abduction.solver.values import (
+from ssh_abduction.solution.recorded import Support
+from ssh_abduction.solution.result import Solution
+from ssh_abduction.solution.values import (
     Bound,
     Cost,
     Effort,
@@ -35,8 +24,20 @@ from ssh_abduction.solver.values import (
     Progress,
     Seconds,
     Status,
+    Stop,
     cost_as_counted,
 )
+from ssh_abduction.solver.asp.limits import Watch, check_limit
+from ssh_abduction.solver.asp.own_rules import never_true
+from ssh_abduction.solver.board import Judging, Known
+from ssh_abduction.solver.candidates import Candidates
+from ssh_abduction.solver.geometry.ranking import in_order, noise_warning, units_warning
+from ssh_abduction.solver.sources.exact import prefixes
+from ssh_abduction.solver.sources.exact.choosing import NearMinimal, may_name, new_engine
+from ssh_abduction.solver.sources.exact.engine import Engine, GrowingEngine, Task
+from ssh_abduction.solver.sources.exact.prefixes import Prefixes, Rivals
+from ssh_abduction.solver.sources.exact.readable import StepEngine
+from ssh_abduction.solver.steps.clique_basis import CliqueBasis
 from ssh_abduction.theory.evidence import said_by
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups, row
@@ -247,7 +248,7 @@ class Answer:
         self._first: SSHMap | None = None
         self._last: tuple[SSHMap, tuple[int, ...]] | None = None
         # The data for a certificate of the whole trace, if the search was stopped.
-        self._basis: Basis | None = None
+        self._basis: CliqueBasis | None = None
 
     @property
     def cost(self) -> Cost | None:
@@ -337,11 +338,11 @@ class Answer:
             begin += level.count
         return ordered
 
-    def _basis_of(self, size: int) -> Basis | None:
+    def _basis_of(self, size: int) -> CliqueBasis | None:
         """Collect the data for a certificate; None if the theory lacks an axiom that it needs."""
         task = self._parts.task
         if not row("clique").holds_for(task.theory):
             return None
         views = tuple(numbered(task.trace.views[: max(size, 1)]))
         actions = tuple(task.log.actions[: len(views) - 1])
-        return Basis(views, actions, self._parts.known.bound.dstates or 0)
+        return CliqueBasis(views, actions, self._parts.known.bound.dstates or 0)

@@ -35,7 +35,10 @@ from ssh_abduction.runtime.clock import (
 )
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.runtime.threads import one_thread
-from ssh_abduction.solver.asp.limits import EARLY, LimitError, StageTimeError, Stop, Watch
+from ssh_abduction.solution.result import Solution
+from ssh_abduction.solution.sharing import Backbone
+from ssh_abduction.solution.values import Bound, Cost, Grounding, Progress, Status, Stop
+from ssh_abduction.solver.asp.limits import EARLY, LimitError, StageTimeError, Watch
 from ssh_abduction.solver.asp.own_rules import check_rules
 from ssh_abduction.solver.board import projected
 from ssh_abduction.solver.candidates import has_quick_map
@@ -43,10 +46,7 @@ from ssh_abduction.solver.counting import Counting
 from ssh_abduction.solver.geometry.ranking import Ranking
 from ssh_abduction.solver.parts import Answer, Limits, Parts, Priced, Start
 from ssh_abduction.solver.schedule import Source, turn
-from ssh_abduction.solver.solution.result import Solution
-from ssh_abduction.solver.solution.sharing import Backbone
 from ssh_abduction.solver.sources.exact.choosing import FEW_STEPS
-from ssh_abduction.solver.values import Bound, Cost, Grounding, Progress, Status
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups
 from ssh_abduction.theory.theory import Theory

@@ -8,10 +8,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Literal, TypeAlias, TypeVar
+from typing import TypeVar
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
 from ssh_abduction.runtime.clock import counting, counts_work, now, work_done
+from ssh_abduction.solution.values import Stop
 
 # A search that has found no map of the whole trace ends when this share of the time limit is left.
 # The rest of the time is for making a map without a search.
@@ -25,9 +26,6 @@ WAITING = 4.0
 MOST_CONFLICTS = 2**31 - 1
 
 Result = TypeVar("Result")
-Stop: TypeAlias = Literal[
-    "work limit", "time limit", "memory limit", "interrupted", "maps limit", "no proof"
-]
 # Reasons that end a search before it has done what it could. More of the same may give more.
 EARLY: tuple[Stop, ...] = ("work limit", "time limit", "interrupted")
 

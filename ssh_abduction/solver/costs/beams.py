@@ -16,13 +16,13 @@ from contextlib import suppress
 from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solution.values import Status
+from ssh_abduction.solution.weighed import EQUAL
 from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.schedule import Source, turn
-from ssh_abduction.solver.solution.weighed import EQUAL
 from ssh_abduction.solver.sources.metric.beam import Beam
-from ssh_abduction.solver.values import Status
 from ssh_abduction.theory.prior import spreads_of
 
 # The numbers of hypotheses of the beams, in their order.

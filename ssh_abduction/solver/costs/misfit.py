@@ -28,10 +28,10 @@ from typing import TypeAlias
 
 from ssh_abduction.data.groups import NodeClasses, minimal_part, numbered
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solution.values import Cost
 from ssh_abduction.solver.geometry.equations import Aliases, Equations, visits_by_turns
 from ssh_abduction.solver.geometry.fit import Explaining
 from ssh_abduction.solver.geometry.poses import Poses
-from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.fields import FAULT

@@ -38,6 +38,8 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.loggers import log_of
+from ssh_abduction.solution.values import Cost, Found, Status
+from ssh_abduction.solution.weighed import EQUAL, IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.costs.beams import Beams
@@ -56,13 +58,11 @@ from ssh_abduction.solver.costs.forced import Forcing
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.parts import Parts, Priced
 from ssh_abduction.solver.schedule import Source, turn
-from ssh_abduction.solver.solution.weighed import EQUAL, IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.sources.exact.choosing import READABLE, labelling_engine
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
 from ssh_abduction.solver.sources.metric.wrong_displacements import search_jumps
 from ssh_abduction.solver.steps.faults import with_more_faults
-from ssh_abduction.solver.values import Cost, Found, Status
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.prior import spreads_of

@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solution.values import Status
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.board import Judging, Known
 from ssh_abduction.solver.sources.exact import prefixes
 from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Engine, Task
 from ssh_abduction.solver.sources.exact.readable import StepEngine
-from ssh_abduction.solver.values import Status
 from ssh_abduction.theory.fields import Count
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory

@@ -33,6 +33,7 @@ from ssh_abduction.data.groups import first_index_of, gathered, minimal_part, nu
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.solution.values import Found
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, Control, mapped
 from ssh_abduction.solver.asp.facts import places_in_order, read_atom
@@ -40,7 +41,6 @@ from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.steps.apart import pairwise_distinct
 from ssh_abduction.solver.steps.chart import Chart, FramedChart, Link
 from ssh_abduction.solver.steps.faults import links_of, view_at
-from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.theory import Theory
 

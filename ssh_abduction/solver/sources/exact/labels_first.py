@@ -41,6 +41,7 @@ from itertools import chain, islice
 
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solution.values import Found
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import Watch
@@ -48,7 +49,6 @@ from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Task, in_fixed_or
 from ssh_abduction.solver.sources.exact.fitting import Fitting
 from ssh_abduction.solver.sources.exact.names import NamedLabels
 from ssh_abduction.solver.sources.exact.visit_labels import VisitLabels
-from ssh_abduction.solver.values import Found
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups

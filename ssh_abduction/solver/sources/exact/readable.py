@@ -11,11 +11,11 @@ from typing import Any
 
 import clingo
 
+from ssh_abduction.solution.values import Found
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import number_symbols
 from ssh_abduction.solver.sources.exact.engine import Task, in_fixed_order
-from ssh_abduction.solver.values import Found
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.fields import Count

@@ -29,7 +29,7 @@ import numpy as np
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.solution.weighed import EQUAL
+from ssh_abduction.solution.weighed import EQUAL
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares
 

@@ -11,8 +11,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 from ssh_abduction.data.words import counted
 from ssh_abduction.theory.speedups import CAUSAL
@@ -52,27 +51,8 @@ class Certificate:
         return {"clique": list(self.clique), "refuted": list(self.refuted)}
 
 
-@dataclass(frozen=True)
-class Basis:
-    """The data for a certificate, which is made when it is first used.
+class Basis(Protocol):
+    """What a solver keeps to make a certificate when it is first used."""
 
-    Making a certificate takes as long as solving a short trace.
-
-    Attributes:
-        views: The view of each of the first steps of the trace, as a number.
-        actions: The action after each of these steps but the last, as a number.
-        bound: The proven lower bound on dstates; 0 if none is proven.
-    """
-
-    views: tuple[int, ...]
-    actions: tuple[int, ...]
-    bound: int
-
-    @cached_property
-    def certificate(self) -> Certificate:
-        """The certificate."""
-        # Imported here, as loading numpy takes longer than solving a short trace.
-        from ssh_abduction.solver.steps.apart import Continuations
-
-        clique = tuple(Continuations(self.views, self.actions).clique())
-        return Certificate(clique, tuple(range(len(clique), self.bound)))
+    @property
+    def certificate(self) -> Certificate: ...

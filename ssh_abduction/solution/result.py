@@ -34,8 +34,8 @@ from ssh_abduction.data.schema import FieldReader, plain
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.output import cards
-from ssh_abduction.solver.asp.limits import Stop
-from ssh_abduction.solver.solution.recorded import (
+from ssh_abduction.solution.certificate import Certificate
+from ssh_abduction.solution.recorded import (
     Support,
     bound_in,
     cost_in,
@@ -44,10 +44,18 @@ from ssh_abduction.solver.solution.recorded import (
     theory_in,
     trace_in,
 )
-from ssh_abduction.solver.solution.sharing import Backbone, Sharing
-from ssh_abduction.solver.solution.weighed import Weighed
-from ssh_abduction.solver.steps.certificate import Certificate
-from ssh_abduction.solver.values import Bound, Cost, Effort, Level, Seconds, Status, cost_as_counted
+from ssh_abduction.solution.sharing import Backbone, Sharing
+from ssh_abduction.solution.values import (
+    Bound,
+    Cost,
+    Effort,
+    Level,
+    Seconds,
+    Status,
+    Stop,
+    cost_as_counted,
+)
+from ssh_abduction.solution.weighed import Weighed
 from ssh_abduction.theory.joins import Join, joins_by_minimality, joins_in_words
 from ssh_abduction.theory.theory import Theory
 

@@ -16,9 +16,9 @@ from ssh_abduction.data.drives import Drive, named_steps
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.data.trace import Trace, read_trace
-from ssh_abduction.solver.solution.weighed import Weighed
-from ssh_abduction.solver.steps.certificate import Basis, Certificate
-from ssh_abduction.solver.values import Bound, Cost, Effort, Grounding, Level, Seconds
+from ssh_abduction.solution.certificate import Basis, Certificate
+from ssh_abduction.solution.values import Bound, Cost, Effort, Grounding, Level, Seconds
+from ssh_abduction.solution.weighed import Weighed
 from ssh_abduction.theory.fields import COUNTS
 from ssh_abduction.theory.joins import Join
 from ssh_abduction.theory.theory import Theory

@@ -1,1 +1,0 @@
-"""The answer for one trace as plain values, their JSON and their words."""
