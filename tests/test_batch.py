@@ -171,13 +171,13 @@ def test_batch_prints_one_line_a_trace_in_order(
     out, err = capsys.readouterr()
     tee, broken, quick, missing, impossible = out.splitlines()
     assert without_seconds(tee) == (
-        "tee.jsonl: optimal: 10 dstates, 4 places, 2 paths; 1 minimal map; _ s, 12 of 12 "
-        "steps given to clingo"
+        "tee.jsonl: 4 places. Proven minimal, the only such map. "
+        "optimal: 10 dstates, 4 places, 2 paths; 1 minimal map; _ s, 12 of 12 steps given to clingo"
     )
     assert broken.startswith(
         "broken.jsonl: error: broken.jsonl:2: line: expected JSON, got broken JSON"
     )
-    assert quick.startswith("quick.jsonl: optimal: 8 dstates, 4 places, 4 paths; 1 minimal map;")
+    assert quick.startswith("quick.jsonl: 4 places. Proven minimal, the only such map. optimal: 8 ")
     assert missing.startswith("missing.jsonl: error: missing.jsonl: expected a readable trace file")
     assert impossible.startswith(
         "impossible.jsonl: unsatisfiable: no map satisfies the axioms: in steps 2 to 5 these clash:"
@@ -189,10 +189,10 @@ def test_batch_prints_one_line_a_trace_in_order(
 def test_batch_line_equals_the_output_of_a_single_trace(
     traces: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # A single trace with a map has the verdict in its first line.
-    for line, words in ((0, ["impossible.jsonl"]), (1, ["slow.jsonl", "--time-limit", "1e-9"])):
+    # A single trace with a map has the verdict in its first line, and the rest in its second.
+    for lines, words in ((1, ["impossible.jsonl"]), (2, ["slow.jsonl", "--time-limit", "1e-9"])):
         code = main(["solve", *words])
-        alone = capsys.readouterr().out.splitlines()[line]
+        alone = " ".join(capsys.readouterr().out.splitlines()[:lines])
         assert main(["solve", *words, "--jobs", "1"]) == code
         assert without_seconds(capsys.readouterr().out) == without_seconds(f"{words[0]}: {alone}\n")
 
@@ -394,7 +394,7 @@ def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler:
         assert sorted(lines) == [*range(len(paths))]
         for number, path in enumerate(paths):
             assert lines[number].startswith(
-                f"{path}: {'error: process: expected' if 'deadly' in path else 'optimal'}"
+                f"{path}: {'error: process: expected' if 'deadly' in path else '4 places'}"
             )
 
 
@@ -564,7 +564,7 @@ def test_ctrl_c_ends_the_processes_and_prints_their_maps(
         out, err = process.communicate(timeout=100)
     assert process.returncode == 130
     lines = [first, *out.splitlines()]
-    assert first.startswith("quick.jsonl: optimal")
+    assert first.startswith("quick.jsonl: 4 places")
     unfinished = len(paths) - sum("(interrupted)" not in line for line in lines)
     assert err == f"ssh-abduction: interrupted: {unfinished} of 5 traces not finished\n"
     assert re.match(r"slow.jsonl: \w+.*\(interrupted\)", lines[1])
@@ -604,8 +604,8 @@ def test_progress_bar_is_shown_on_a_terminal(seen: bool, traces: Path) -> None:
     text = shown.decode()
     assert "3/3" in text
     whole = (
-        "quick.jsonl: optimal: 8 dstates, 4 places, 4 paths; 1 minimal map; _ s, 9 of 9 steps "
-        "given to clingo"
+        "quick.jsonl: 4 places. Proven minimal, the only such map. optimal: 8 dstates, 4 places, "
+        "4 paths; 1 minimal map; _ s, 9 of 9 steps given to clingo"
     )
     assert (f"\x1b[2K{whole}" in without_seconds(text)) == seen  # where the bar was wiped away
     assert (whole in without_seconds(results)) == (not seen)

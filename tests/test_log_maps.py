@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from coarse import every_second_beam
 from coarse import hall as drive_through_hall
+from scipy.spatial import cKDTree
 from test_plans import DOORS, MIDDLES, plan_of, xml
 from visited import Truth
 
@@ -254,6 +255,34 @@ def test_log_without_motion_or_walls_or_width_is_refused() -> None:
         import_log(RobotLog(tuple(onward), source="corridor.log"), math.nan)
     with pytest.raises(LogError, match=r"got 'a\.log'; read one with read_log"):
         map_log("a.log")  # type: ignore[arg-type]
+
+
+def test_recording_has_the_scans_on_the_walls(runs: Path, tmp_path: Path) -> None:
+    reader = pytest.importorskip("rerun.chunk").RrdReader
+    file = tmp_path / "hall.rrd"
+    assert main(["export", str(runs / "hall"), "--to", "rerun", "-o", str(file)]) == 0
+    points: dict[str, list[Any]] = {}
+    for chunk in reader(file).store().stream():
+        batch = chunk.to_record_batch()
+        for name in {"Points3D:positions", "Arrows3D:origins"} & {*batch.schema.names}:
+            points.setdefault(chunk.entity_path, []).extend(batch.column(name).to_pylist())
+    steps = len(Trace.load(runs / "hall" / "trace.jsonl"))
+    assert (len(points["/robot"]), len(points["/scan"])) == (steps, steps)
+    walls, seen = (
+        np.array([p[:2] for row in points[name] for p in row]) for name in ("/walls", "/scan")
+    )
+    away = cKDTree(walls).query(seen)[0]
+    assert np.quantile(away, 0.9) < 0.3
+
+
+def test_recording_needs_a_file_and_the_folder_of_a_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = str(tmp_path / "maps.json")
+    assert main(["solve", "examples/notched-rectangle.jsonl", "-o", maps]) == 0
+    for words, said in ((["-o", str(tmp_path / "x.rrd")], "expected the folder"), ([], "name a")):
+        assert main(["export", maps, "--to", "rerun", *words]) == 1
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("without_processes")

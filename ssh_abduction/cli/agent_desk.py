@@ -397,7 +397,7 @@ def _check_folder(folder: Path) -> None:
             f"{named(folder)}: expected a folder that map wrote or that live saves to, got {got}; "
             "map a log with -o, and name that folder"
         )
-    for name in (MAPS, "trace.jsonl", "run.json", FILE, "page.html", "report.html"):
+    for name in (MAPS, "trace.jsonl", "run.json", FILE, "page.html"):
         if (folder / name).resolve().parent != folder.resolve():
             raise MapError(
                 f"{named(folder / name)}: expected a file of the folder, got a link; copy it"

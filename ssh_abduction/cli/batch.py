@@ -189,7 +189,8 @@ class SolveQuestion(jobs.FileQuestion):
             end = outcome.answer_ending(solution, explanation, len(written), found)
             line = json_line({"trace": path, **head, "maps": written, **end})
         else:
-            line = f"{named(path)}: {headline(solution, explanation)}"
+            verdict = "" if solution.cost is None else f"{solution.verdict} "
+            line = f"{named(path)}: {verdict}{headline(solution, explanation)}"
         return jobs.FileAnswer(number, line, outcome.exit_code(solution), tuple(found))
 
     @property

@@ -372,6 +372,7 @@ FORMATS = {
     "dot": (".dot", ".gv"),
     "svg": (".svg",),
     "networkx-json": (".json",),
+    "rerun": (".rrd",),
 }
 
 
@@ -380,7 +381,8 @@ FORMATS = {
         "maps": shared.MAPS_SAID,
         f"--to {{{','.join(FORMATS)}}}!": (
             "the format to write: nav2 and tmap2 are for programs that drive a robot, osm has the "
-            "rooms and doors of a robot's log, svg is a picture, and the others are graphs"
+            "rooms and doors of a robot's log, svg is a picture, rerun is a recording of a log for "
+            "the viewer of that name, and the others are graphs"
         ),
         **shared.ONE_MAP,
         "--trace TRACE": (
@@ -409,11 +411,12 @@ FORMATS = {
     }
 )
 def run_export(options: argparse.Namespace) -> int:
-    """Write a map for Nav2, tmap2, OpenStreetMap, GraphML, DOT or networkx.
+    """Write a map for Nav2, tmap2, OpenStreetMap, GraphML, DOT, networkx or rerun.
 
     Write a map in the format of another program: a route graph for Nav2 (GeoJSON), a topological
     map for LCAS's topological_navigation (tmap2, YAML), an area graph of rooms and doors (osm,
-    OpenStreetMap XML), GraphML, Graphviz DOT, SVG, or JSON for networkx.
+    OpenStreetMap XML), GraphML, Graphviz DOT, SVG, JSON for networkx, or a recording of the walls,
+    the track, the scans and the map for the viewer of rerun.
 
     Positions are in metres from the first dstate if the map has poses. Otherwise they come from a
     layout, and a warning says so. docs/reference/formats.md describes each format.
@@ -425,6 +428,8 @@ def run_export(options: argparse.Namespace) -> int:
     chosen = listing.maps[listing.number(options.map)]
     if options.to == "osm":
         chosen = _built(options, listing, chosen)
+    if options.to == "rerun":
+        return _recorded(options, chosen)
     if options.frame_of is not None or options.origin is not None:
         chosen = _framed(options, listing, chosen)
     how: dict[str, Any] = {"level": options.level, "hide_undecided": options.hide_undecided}
@@ -436,6 +441,27 @@ def run_export(options: argparse.Namespace) -> int:
     else:
         write_map(options.output, text.removesuffix("\n"))
     warn(export_doubts(chosen, options.to, **how))
+    return 0
+
+
+def _recorded(options: argparse.Namespace, ssh_map: SSHMap) -> int:
+    """Write a recording for the viewer of rerun."""
+    from ssh_abduction.page.recording import save_recording
+
+    if options.output == "-":
+        raise AbductionError("-o: expected a file for rerun, got standard output; name a .rrd file")
+    trace = shared.mapped_trace(options.maps, options.trace)
+    ground = _ground(options, trace)
+    if trace is None or ground is None or not ground.seen:
+        raise AbductionError(
+            f"{named(options.maps)}: expected the folder that map wrote for a log, got maps "
+            "without its page.html, which has the walls; map the log, and name its folder"
+        )
+    for name in ("frame_of", "origin"):
+        if getattr(options, name) is not None:
+            flag = f"--{name.replace('_', '-')}"
+            raise AbductionError(f"{flag}: expected none with rerun; leave it out")
+    save_recording(options.output, trace.name or "ssh-abduction", ssh_map, trace, ground)
     return 0
 
 
