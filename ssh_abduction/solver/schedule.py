@@ -94,13 +94,13 @@ WEIGHED = (
         "After a long way, poses that fit all closures are better than a beam.",
         until=0.3,
     ),
+    SourceTurn("beam of 1", "up to 2,000 steps", "It finds most true maps.", until=0.7),
     SourceTurn(
         "joint drives",
         "several drives",
-        "Joining the maps of single drives is cheaper than a beam over all drives.",
+        "Joined maps of single drives show whether a narrow beam over all drives missed one.",
         until=0.5,
     ),
-    SourceTurn("beam of 1", "up to 2,000 steps", "It finds most true maps.", until=0.7),
     SourceTurn(
         "false closures",
         "traces with closures",

@@ -105,8 +105,8 @@ class Beams:
 
         return [
             Source(turn("smoothing"), lambda: True, self._smooth),
-            Source(turn("joint drives"), lambda: several, self._join),
             *map(beam, widths[:1]),
+            Source(turn("joint drives"), lambda: several, self._join),
             Source(
                 turn("false closures"),
                 lambda: bool(self._parts.task.trace.closures),
