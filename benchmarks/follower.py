@@ -39,6 +39,7 @@ CELL, STRIDE = 0.1, 0.2  # metres of a cell of the plan, and of a stride
 BODY = 0.2  # metres: half the width of the follower
 VIEW = 6.0  # metres that the follower looks along its way and to the sides
 ARRIVED = 3.0  # metres from the goal
+ASLANT = 0.5  # the sine of the least angle to its wall at which a door is seen as one
 NTH = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 
 
@@ -100,29 +101,45 @@ class Follower:
                 self.bearing += math.pi
             elif turn := re.match(r"turn (half |sharp )?(left|right)", said):
                 degrees = {None: 90, "half ": 45, "sharp ": 135}[turn[1]]
-                self.turn(degrees, turn[2], "door" in onward.split("past")[0])
-            elif said.startswith("go ") and (go := re.match(r"go (\d+) m", said)):
-                doors = re.search(r"through (the|\d+) door", said)
-                count = 0 if doors is None else 1 if doors[1] == "the" else int(doors[1])
-                nth = re.search(r"to the (\w+) opening on the (left|right)", said)
-                self.go(float(go[1]), count, nth and (nth[1], nth[2]))
+                go = re.match(r"go (\d+) m .*through", onward)
+                self.turn(degrees, turn[2], go and float(go[1]))
+            elif said.startswith("go "):
+                self.walk(said)
 
-    def go(self, metres: float, doors: int, nth: Any) -> None:
-        """Go on for some metres, through some doors, and to the nth opening on one side."""
-        gone, self.trail = 0.0, [self.at.copy()]
-        self.looked = [self.bearing]
+    def walk(self, said: str) -> None:
+        """Go as far as a sentence says."""
+        metres, nth = 0.0, re.search(r"to the (\w+) opening on the (left|right)", said)
+        for part in said.split(", "):
+            if far := re.match(r"(?:go )?(\d+) m", part):
+                metres = float(far[1])
+            elif doors := re.match(r"through (the|\d+) door", part):
+                self.go_through(metres, 1 if doors[1] == "the" else int(doors[1]))
+                metres = 0.0
+        if metres:
+            self.go(metres, nth and (nth[1], nth[2]))
+
+    def go_through(self, metres: float, doors: int) -> None:
+        """Go on for some metres and through some doors."""
+        gone, self.trail, self.looked = 0.0, [self.at.copy()], [self.bearing]
         passed: set[int] = set()
-        look_out = 2.0 if nth else 0.0  # The distance is rounded, so an opening may come later.
-        while gone < metres + look_out:
-            if len(passed) < doors and (door := self.door_ahead(passed, metres - gone)) is not None:
+        while len(passed) < doors:
+            if (door := self.door_ahead(passed, metres - gone)) is not None:
                 gone += self.pass_door(door)
                 passed.add(door)
-                continue
-            if not self.stride():
-                if gone > metres - 2.0 or not self.look_around():
-                    break  # This is far enough, or there is no other way.
-                continue
-            gone += STRIDE
+            elif gone > metres + VIEW or not (self.stride() or self.look_around()):
+                break
+            else:
+                gone += STRIDE
+
+    def go(self, metres: float, nth: Any) -> None:
+        """Go on for some metres, and to the nth opening on one side."""
+        gone, self.trail, self.looked = 0.0, [self.at.copy()], [self.bearing]
+        look_out = 2.0 if nth else 0.0  # The distance is rounded, so an opening may come later.
+        while gone < metres + look_out:
+            if self.stride():
+                gone += STRIDE
+            elif gone > metres - 2.0 or not self.look_around():
+                break  # This is far enough, or there is no other way.
         if nth:  # Go back to the opening.
             back = self.opening(metres, *nth)
             self.at, self.bearing = self.trail[back].copy(), self.looked[back]
@@ -160,10 +177,10 @@ class Follower:
         for k, opening in enumerate(self.world.building.openings):
             off = np.array(opening.middle) - self.at
             far, bend = float(np.hypot(*off)), self.bend(off)
-            aslant = abs(math.sin(opening.along - self.bearing)) < math.sin(math.radians(45))
-            ahead = far < max(metres, 1.0) + 1 and abs(bend) < math.radians(60) and not aslant
+            aslant = abs(math.sin(opening.along - self.bearing)) < ASLANT
+            ahead = far < max(metres + 1, VIEW) and abs(bend) < math.radians(60) and not aslant
             if k not in passed and ahead and self.world.sees(self.at, opening.middle):
-                found.append((abs(bend) + 0.1 * far, k))
+                found.append((abs(bend) + 0.1 * abs(far - max(metres, 0.0)), k))
         return min(found)[1] if found else None
 
     def pass_door(self, door: int) -> float:
@@ -192,7 +209,7 @@ class Follower:
         """
         trail = np.array(self.trail)
         far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(trail, axis=0).T))])
-        found = list(self.openings(trail, far, 1 if side == "left" else -1))
+        found = self.openings(trail, far, 1 if side == "left" else -1)
         number = NTH.index(nth) if nth in NTH else int(re.sub(r"\D", "", nth)) - 1
         fits = max(1.5, 0.1 * metres)
         if number < len(found) and abs(found[number] - metres) <= fits:
@@ -202,11 +219,11 @@ class Follower:
             stop = stop if abs(stop - metres) <= fits else min(metres, far[-1])
         return int(np.abs(far - stop).argmin())
 
-    def openings(self, trail: Any, far: Any, side: int) -> Any:
-        """Yield how far along the trail the openings on one side are: doors, and side ways."""
+    def openings(self, trail: Any, far: Any, side: int) -> list[float]:
+        """List how far along the trail the openings on one side are: doors, and other ways."""
         ahead = np.gradient(trail, axis=0) if len(trail) > 1 else np.zeros_like(trail)
         way = np.arctan2(ahead[:, 1], ahead[:, 0])
-        seen = []
+        seen: list[float] = []
         for opening in self.world.building.openings:
             off = np.array(opening.middle) - trail
             k = int(np.hypot(*off.T).argmin())
@@ -216,26 +233,30 @@ class Follower:
         depth = np.array(
             [self.world.ray(p, b + side * math.pi / 2) for p, b in zip(trail, way, strict=True)]
         )
+        ways = []
         usual = ndimage.median_filter(depth, 31, mode="nearest")
         parts, count = ndimage.label(depth > usual + 1.0)
-        seen += [float(far[parts == part].mean()) for part in range(1, count + 1)]
-        last = 0.0  # What is beside the beginning is not passed.
-        for s in sorted(seen):
-            if s > last + 1.0:
-                yield s
-                last = s
+        for part in range(1, count + 1):
+            inside = far[parts == part]
+            if not any(inside[0] - 1 < door < inside[-1] + 1 for door in seen):
+                ways.append(float(inside.mean()))
+        # What is beside the beginning is not passed.
+        return sorted(s for s in [*seen, *ways] if s > 1.0)
 
-    def turn(self, degrees: float, side: str, to_door: bool) -> None:
-        """Turn to one side: to the door that is in sight there, or else along the free way."""
+    def turn(self, degrees: float, side: str, to_door: float | None) -> None:
+        """Turn to one side: to the door that is in sight there, or else along the free way.
+
+        If words tell of a door next, it is about `to_door` metres away.
+        """
         sign, most = 1 if side == "left" else -1, math.radians(45)
         doors = []
         for opening in self.world.building.openings:
             off = np.array(opening.middle) - self.at
             far, error = float(np.hypot(*off)), sign * self.bend(off) - math.radians(degrees)
-            aslant = abs(math.sin(opening.along - math.atan2(off[1], off[0]))) < math.sin(most)
-            near = far < (2 * VIEW if to_door else VIEW) and abs(error) < most and not aslant
+            aslant = abs(math.sin(opening.along - math.atan2(off[1], off[0]))) < ASLANT
+            near = far < (to_door or 0.0) + VIEW and abs(error) < most and not aslant
             if near and self.world.sees(self.at, opening.middle):
-                doors.append((abs(error) + 0.1 * far, error))
+                doors.append((abs(error) + 0.1 * abs(far - (to_door or 0.0)), error))
         errors = np.radians(np.arange(-30, 31, 10))
         ways = self.bearing + sign * (math.radians(degrees) + errors)
         rays = [self.world.ray(self.at, way, 4.0) for way in ways]

@@ -425,14 +425,14 @@ def test_routes_are_told_in_words() -> None:
     assert directions_to(named, trace, [0], [5]) == (
         "go 10 m along main street, past a door on your left, to the first opening on the right",
         "turn right",
-        "go 6 m on, through the door, to place 5 (kitchen)",
+        "go 3 m on, through the door, 3 m on, to place 5 (kitchen)",
     )
     assert directions_to(named, trace, [4], [5]) == (
-        "go 6 m on, through the door, to the first opening on the left",
+        "go 3 m on, through the door, 3 m on, to the first opening on the left",
         "turn left into main street",
         "go 5 m along main street, to the first opening on the right",
         "turn right",
-        "go 6 m on, through the door, to place 5 (kitchen)",
+        "go 3 m on, through the door, 3 m on, to place 5 (kitchen)",
     )
     assert directions_to(named, trace, [0], [0, 3]) == (
         "there is nothing to do: the start is at the goal",
@@ -442,14 +442,15 @@ def test_routes_are_told_in_words() -> None:
 
 
 def test_words_follow_bends_of_the_way_and_not_its_places() -> None:
-    """A zigzag through a hall is one leg, and a bend in the open is no opening."""
+    """A zigzag through a hall is one leg. Only walls make a bend that is told."""
     points = [(4.0 * k, 0.5 * (-1) ** k) for k in range(5)] + [(20.0, 4.5)]
-    ssh_map, trace = drive(points, [*range(6)], width=9.0)
-    assert directions_to(with_building(ssh_map, trace), trace, [0], [5]) == (
-        "go 16 m on",
-        "turn half left",
-        "go 6 m on, to place 5",
-    )
+    ssh_map, trace = drive(points, [*range(6)], width=7.8)
+    words = directions_to(with_building(ssh_map, trace), trace, [0], [5])
+    assert words == ("go 21 m on, to place 5",)
+    points[-1] = (16.0, 6.5)
+    ssh_map, trace = drive(points, [*range(6)], width=2.0)
+    *_, turn, last = directions_to(with_building(ssh_map, trace), trace, [0], [5])
+    assert (turn, last) == ("turn left into corridor 1", "go 6 m along corridor 1, to place 5")
 
 
 def test_a_turn_into_a_door_is_told_before_the_door() -> None:
@@ -460,7 +461,7 @@ def test_a_turn_into_a_door_is_told_before_the_door() -> None:
     assert directions_to(with_building(ssh_map, trace), trace, [0], [2]) == (
         "go 8 m along corridor 0, to the first opening on the left",
         "turn left",
-        "go 2 m on, through the door, to place 2",
+        "go 1 m on, through the door, to place 2",
     )
 
 

@@ -8,26 +8,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import networkx as nx
 import numpy as np
 
-from perception.places.passages import STEP, WIDE
+from perception.places.passages import STEP, WIDE, resampled
 from ssh_abduction.building.edges import FloorPlan, PlanEdge
+from ssh_abduction.building.free_space import Sight
+from ssh_abduction.building.rooms import LONG
 from ssh_abduction.building.straight_paths import leaving
 from ssh_abduction.building.travels import Array
+from ssh_abduction.data.building import Corridor
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 
 # A bend of less than AHEAD degrees goes straight on, and one of more than BACK turns around. A bend
-# of less than HALF degrees is half a turn, and one of more than SHARP is sharp.
-AHEAD, HALF, SHARP, BACK = 30, 60, 120, 150
-# A course is straight while it stays within WOBBLE metres of a line. Two bends to one side that are
-# less than CLOSE metres apart are one corner.
-WOBBLE, CLOSE = 1.2, 2.0
+# of less than HALF degrees is half a turn, and one of more than SHARP is sharp. A person who comes
+# to a door within ASLANT degrees sees it ahead.
+AHEAD, ASLANT, HALF, SHARP, BACK = 30, 45, 60, 120, 150
+# Two bends to one side that are less than CLOSE metres apart are one corner.
+CLOSE = 2.0
+STRIDE = 2  # points of a course from one possible bend to the next
 BEFORE = 1.0  # metres before and behind a door within which a course does not bend
 # Openings of one side that are nearer than this many metres are one opening.
 ONE = 1.0
@@ -117,13 +121,14 @@ class Guide:
             turn = route.turns[k] if k < len(route.turns) else None
             yield self._leg(route, begin, end, beside, turn)
             if turn is not None:
-                onward = self._corridor(route, *route.stops[k + 1 : k + 3])
-                yield turn + (f" into {onward}" if onward else "")
+                onward = route.corridor_of(*route.stops[k + 1 : k + 3])
+                yield turn + ("" if onward is None else f" into {self._named(onward)}")
 
     def route(self, ends: Sequence[int]) -> RouteCourse:
         """Lay a way along edges, given by the ends at which they begin."""
         edges = ((self.plan.edges[e // 2], e % 2) for e in ends)
-        return RouteCourse.of([edge.turned() if turned else edge for edge, turned in edges])
+        ways = [edge.turned() if turned else edge for edge, turned in edges]
+        return RouteCourse.of(ways, self._map.corridors)
 
     def _leg(
         self,
@@ -134,11 +139,18 @@ class Guide:
         turn: str | None,
     ) -> str:
         """Say how far to go, past which doors and landmarks, and where to stop."""
-        first, last = route.metres[begin], route.metres[end]
-        where = self._corridor(route, begin, end)
-        said = [f"go {max(1, round(last - first))} m {f'along {where}' if where else 'on'}"]
-        if through := sum(begin < door <= end for door in route.doors):
-            said.append("through the door" if through == 1 else f"through {through} doors")
+        first, last = route.metres[begin], route.end_of(end)
+        corridor = route.corridor_of(begin, end)
+        where = "on" if corridor is None else f"along {self._named(corridor)}"
+        anchor, count, said = first, 0, list[str]()
+        for at in (*(route.metres[door] for door in route.doors if begin < door <= end), None):
+            if count and (at is None or at - anchor > CLOSE):
+                said.append("through the door" if count == 1 else f"through {count} doors")
+                count = 0
+            if not said or (not count and (last if at is None else at) - anchor > CLOSE):
+                far = max(1, round((last if at is None else at) - anchor))
+                said.append(f"{far} m on" if said else f"go {far} m {where}")
+            anchor, count = (anchor if at is None else at), count + (at is not None)
         side = turn.split()[-1] if turn else None
         passed = [b for b in beside if first + ONE < b.metres < last - ONE]
         for one in ("left", "right"):
@@ -154,19 +166,16 @@ class Guide:
             room = self._map.building.room_of(goal) if self._map.building else None
             within = self._map.name_of("room", room)
             said.append(f"to {self._map.called('place', goal)}{f' in {within}' * bool(within)}")
+        elif anchor > first and last - anchor <= CLOSE:
+            pass  # The person turns behind the door.
         elif side in ("left", "right") and route.opens(begin, end, ("left", "right").index(side)):
-            count = sum(b.side == side for b in passed)
+            count = sum(b.side == side and b.metres > anchor + ONE for b in passed)
             nth = NTH[count] if count < len(NTH) else f"{count + 1}th"
             said.append(f"to the {nth} opening on the {side}")
         return ", ".join(said)
 
-    def _corridor(self, route: RouteCourse, begin: int, end: int) -> str | None:
-        """Name the corridor that has both ends of an edge with its middle in a leg, if any."""
-        for corridor in self._map.corridors:
-            for (p, one), (q, other) in pairwise(route.places):
-                if begin < (one + other) / 2 < end and {p, q} <= {*corridor.order}:
-                    return self._map.name_of("corridor", corridor.id) or f"corridor {corridor.id}"
-        return None
+    def _named(self, corridor: Corridor) -> str:
+        return self._map.name_of("corridor", corridor.id) or f"corridor {corridor.id}"
 
 
 @dataclass(frozen=True)
@@ -179,38 +188,107 @@ class RouteCourse:
     stops: tuple[int, ...]  # the first point, those at which it bends, and the last one
     turns: tuple[str, ...]  # what to do at each bend
     bearing: float  # of the first leg, in radians
+    course: Array  # (n, 2) metres
     widths: Array  # (n, 2) metres to the walls on the left and right
+    corridors: Sequence[Corridor] = ()
 
     @classmethod
-    def of(cls, edges: Sequence[PlanEdge]) -> RouteCourse:
-        """Find the bends along edges. The course is straight within a metre of a door."""
+    def of(cls, edges: Sequence[PlanEdge], corridors: Sequence[Corridor] = ()) -> RouteCourse:
+        """Find the bends along edges.
+
+        The way is straight within a metre of a door, and parallel to the corridor that it is in.
+        """
         course = np.concatenate([edge.course for edge in edges])
         ends = [int(n) for n in np.cumsum([len(edge.course) for edge in edges])]
         begins = [0, *ends[:-1]]
         doors = [b + gap.at for b, edge in zip(begins, edges, strict=True) for gap in edge.doors]
+        places = (edges[0].ends[0], 0), *zip((e.ends[1] for e in edges), ends, strict=True)
         near = round(BEFORE / STEP)
         last, sides = len(course) - 1, {at + off for at in doors for off in (-near, near)}
-        parts = pairwise([0, *sorted(at for at in sides if 0 < at < last), last])
-        bends = [0, *(begin + k for begin, end in parts for k in _bends(course[begin : end + 1]))]
-        legs = np.diff(course[bends], axis=0)
-        metres = np.interp(np.arange(len(course)), bends, np.cumsum([0.0, *np.hypot(*legs.T)]))
-        bearing = np.degrees(np.arctan2(legs[:, 1], legs[:, 0]))
-        turn = (np.diff(bearing) + 180) % 360 - 180
-        kept: list[tuple[int, float]] = []
-        for at, degrees in zip(bends[1:-1], turn, strict=True):
-            before = kept[-1] if kept else (0, 0.0)
-            is_one = before[1] * degrees > 0 and abs(before[1] + degrees) <= SHARP
-            is_one = is_one and not any(before[0] < door < at for door in doors)
-            if is_one and metres[at] - metres[before[0]] < CLOSE:
-                kept[-1] = before[0], before[1] + degrees  # two halves of one corner
-            else:
-                kept.append((at, degrees))
-        kept = [(at, degrees) for at, degrees in kept if abs(degrees) >= AHEAD]
-        places = (edges[0].ends[0], 0), *zip((e.ends[1] for e in edges), ends, strict=True)
-        stops = 0, *(at for at, _ in kept), len(course) - 1
-        turns = tuple(_turn(degrees) for _, degrees in kept)
+        sight, bends = Sight(edges), [0]
+        for begin, end in pairwise([0, *sorted(at for at in sides if 0 < at < last), last]):
+            bends += (begin + k for k in _bends(course[begin : end + 1], sight))
         widths = np.concatenate([edge.widths for edge in edges])
-        return cls(places, tuple(doors), metres, stops, turns, math.radians(bearing[0]), widths)
+        metres = np.zeros(len(course))
+        found = cls(places, tuple(doors), metres, (), (), 0.0, course, widths, corridors)
+        legs = [found._straight(begin, end) for begin, end in pairwise(bends)]
+        for (begin, end), leg in zip(pairwise(bends), legs, strict=True):
+            length = float(np.hypot(*leg))
+            part = (course[begin : end + 1] - course[begin]) @ leg / max(length, STEP)
+            metres[begin : end + 1] = metres[begin] + np.clip(part, 0.0, length)
+            metres[end] = metres[begin] + length
+        kept = found._bends(bends, near)
+        return replace(
+            found,
+            stops=(0, *kept, last),
+            turns=tuple(map(_turn, kept.values())),
+            bearing=math.radians(found._bearing(0, next(iter(kept), last))),
+        )
+
+    def _bends(self, bends: Sequence[int], near: int) -> dict[int, float]:
+        """Leave out the bends that need no words, the least first. Returns those that stay.
+
+        A person comes out of a door straight, and looks from a bend to the next one. Two bends to
+        one side that are close together are one.
+        """
+        out, to = ({door + off for door in self.doors} for off in (near, -near))
+        kept = list(bends)
+        while True:
+            turn, spare = dict[int, float](), dict[int, float]()
+            for before, at, after in zip(kept, kept[1:], kept[2:], strict=False):
+                start = at - 2 * near if at in out else before
+                bend = self._bearing(at, after) - self._bearing(start, at)
+                turn[at] = (bend + 180) % 360 - 180
+                limit = ASLANT if at in to else AHEAD
+                if abs(turn[at]) < limit:
+                    spare[at] = abs(turn[at]) / limit
+            if not spare:
+                break
+            kept.remove(min(spare, key=lambda at: spare[at]))
+        for one, other in pairwise(list(turn)):
+            both = turn[one] + turn[other] if one in turn else math.inf
+            is_one = turn.get(one, 0.0) * turn[other] > 0 and abs(both) <= SHARP
+            is_one = is_one and not any(one < door < other for door in self.doors)
+            if is_one and self.metres[other] - self.metres[one] < CLOSE:
+                turn[one] = both
+                del turn[other]
+        return turn
+
+    def _bearing(self, begin: int, end: int) -> float:
+        """The bearing from one point to another, in degrees."""
+        return math.degrees(math.atan2(*self._straight(begin, end)[::-1]))
+
+    def beside(self, at: int, point: Array) -> float:
+        """How far along the route a point is, beside the leg that has the course's point `at`."""
+        begin, end = next(leg for leg in pairwise(self.stops) if at <= leg[1])
+        ahead = self._straight(begin, end)
+        off = (point - self.course[begin]) @ ahead / max(float(np.hypot(*ahead)), STEP)
+        return float(self.metres[begin] + max(0.0, off))
+
+    def end_of(self, end: int) -> float:
+        """How far along the route a leg ends: at its last point, or beside the door there."""
+        door = next((at for at in self.doors if end < at <= end + 2 * round(BEFORE / STEP)), end)
+        return max(float(self.metres[end]), self.beside(end, self.course[door]))
+
+    def corridor_of(self, begin: int, end: int) -> Corridor | None:
+        """Find the corridor that has both ends of an edge with its middle in a leg, if any."""
+        for corridor in self.corridors:
+            for (p, one), (q, other) in pairwise(self.places):
+                if begin < (one + other) / 2 < end and {p, q} <= {*corridor.order}:
+                    return corridor
+        return None
+
+    def _straight(self, begin: int, end: int) -> Array:
+        """The way from one point to another, (2,) metres: as far as it leads along its corridor."""
+        leg: Array = self.course[end] - self.course[begin]
+        corridor = self.corridor_of(begin, end)
+        if corridor is None:
+            return leg
+        line = resampled(np.array(corridor.line), STEP)
+        some = sorted(int(np.hypot(*(line - p).T).argmin()) for p in self.course[[begin, end]])
+        more = round(LONG / 2 / STEP)
+        ahead = line[min(some[1] + more, len(line) - 1)] - line[max(some[0] - more, 0)]
+        return np.asarray(ahead * (leg @ ahead) / (ahead @ ahead))
 
     def opens(self, begin: int, end: int, side: int) -> bool:
         """Whether there is an opening on a side where a leg ends, and not one wide hall."""
@@ -219,14 +297,26 @@ class RouteCourse:
         return not np.median(leg) >= WIDE or not there.max(initial=0.0) >= WIDE
 
 
-def _bends(course: Array) -> Iterator[int]:
-    """Yield the points after the first one at which a simplified course has corners."""
-    from skimage.measure import approximate_polygon
+def _bends(course: Array, sight: Sight) -> Iterator[int]:
+    """Yield the points after the first one at which the way has corners, and the last one.
 
-    at = 0
-    for corner in approximate_polygon(course, WOBBLE)[1:] if len(course) > 2 else course[1:]:
-        at += 1 + int(np.hypot(*(course[at + 1 :] - corner).T).argmin())
-        yield at
+    It has the fewest straight legs that are free, and of those ways it is the shortest.
+    """
+    chosen = np.unique([*range(0, len(course), STRIDE), len(course) - 1])
+    points = course[chosen]
+    best, before = [(0, 0.0)] + [(len(points), math.inf)] * (len(points) - 1), [0] * len(points)
+    for k, point in enumerate(points[:-1]):
+        seen = sight.from_point(point, points[k + 1 :])
+        seen[0] = True  # The robot drove there.
+        for j in k + 1 + np.flatnonzero(seen):
+            by_way = best[k][0] + 1, best[k][1] + math.dist(point, points[j])
+            if by_way < best[j]:
+                best[j], before[j] = by_way, k
+    found, k = [], len(points) - 1
+    while k:
+        found.append(int(chosen[k]))
+        k = before[k]
+    yield from reversed(found)
 
 
 def _turn(degrees: float) -> str:
@@ -255,7 +345,10 @@ def _beside(plan: FloorPlan, ends: Sequence[int], route: RouteCourse) -> Iterato
                 if other.ends[k] == place and x not in own:
                     turn = (leaving(plan, 2 * x + k).bearing - ahead) % math.tau
                     side = "left" if turn < (back - ahead) % math.tau else "right"
-                    yield SideOpening(float(route.metres[end]), side, bool(other.doors))
+                    out = other.turned() if k else other
+                    door = out.course[out.doors[0].at] if out.doors else out.course[0]
+                    metres = route.beside(min(end, len(route.course) - 1), door)
+                    yield SideOpening(metres, side, bool(other.doors))
 
 
 def _merged(beside: Sequence[SideOpening]) -> list[SideOpening]:

@@ -15,8 +15,8 @@ import networkx as nx
 import numpy as np
 from scipy import ndimage
 
-from perception.places.passages import directions
 from ssh_abduction.building.edges import FloorPlan
+from ssh_abduction.building.free_space import GRID, drawn, strips_of
 from ssh_abduction.building.straight_paths import PairedWay, branches, chain_points
 from ssh_abduction.building.travels import Array
 from ssh_abduction.data.building import Corridor, MapDoor, MapRoom, WayOut
@@ -34,7 +34,7 @@ SHORT, SQUARE, END, WIDEST = 2.0, 1.3, 2.0, 30
 # The robot never drove through some openings. Leave out those of them that are less than BESIDE
 # metres from an opening that it drove through.
 BESIDE = 1.2
-GRID, SPIKE = 0.1, 0.6  # metres: a cell in which outlines are drawn, and the least width of a room
+SPIKE = 0.6  # metres: the least width of a room
 Part = tuple[int, int]  # the first and the last point of a part of a way
 
 
@@ -215,28 +215,18 @@ def _outlines(plan: FloorPlan, room: dict[int, int]) -> dict[int, tuple[tuple[fl
     Edges are cut at their doors. Free space that is narrower than SPIKE metres, such as the view
     through a door, is left out.
     """
-    from skimage.draw import polygon
     from skimage.measure import approximate_polygon, find_contours
 
     strips: dict[int, list[Array]] = {}
     for edge in plan.edges:
-        ahead = directions(edge.course)
-        left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
-        wide = ndimage.median_filter(edge.widths, (3, 1))
-        sides = edge.course + wide[:, [0]] * left, edge.course - wide[:, [1]] * left
         stops = [0, *(gap.at for gap in edge.doors), len(edge.course) - 1]
         for end, begin, stop in ((edge.ends[0], *stops[:2]), (edge.ends[1], *stops[-2:])):
-            for k in range(begin, stop):
-                corners = [sides[0][k], sides[0][k + 1], sides[1][k + 1], sides[1][k]]
-                if np.isfinite(corners).all():
-                    strips.setdefault(room[end], []).append(np.array(corners))
+            strips.setdefault(room[end], []).extend(strips_of(edge, begin, stop))
     found = {}
-    for number, quads in strips.items():
-        corner = np.concatenate(quads).min(axis=0) - 2 * GRID
-        size = np.ceil((np.concatenate(quads).max(axis=0) - corner) / GRID).astype(int) + 3
-        free = np.zeros(size, dtype=bool)
-        for quad in quads:
-            free[polygon(*((quad - corner) / GRID).T, size)] = True
+    for number, some in strips.items():
+        if not some:
+            continue
+        free, corner = drawn(some)
         free = ndimage.binary_opening(free, iterations=round(SPIKE / GRID / 2))
         rings = find_contours(np.pad(free, 1).astype(float), 0.5)
         if rings:
