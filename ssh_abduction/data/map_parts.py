@@ -423,8 +423,8 @@ def write_map(path: str | os.PathLike[str], text: str, what: str = "map") -> Non
     save_file(a_path("path", path, MapError), f"{text}\n".encode(), what, MapError)
 
 
-def read_json(path: str | os.PathLike[str]) -> Any:
-    """Read the JSON value in a file of maps; "-" means standard input.
+def read_json(path: str | os.PathLike[str], what: str = "file of maps") -> Any:
+    """Read the JSON value in a file of maps, or of what `what` says; "-" means standard input.
 
     Raises:
         MapError: If the file cannot be read or does not hold exactly one JSON value. The error
@@ -432,7 +432,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     """
     path = a_path("path", path, MapError)
     source = source_of(path)
-    with opened_file(path, "a readable file of maps", MapError) as file:
+    with opened_file(path, f"a readable {what}", MapError) as file:
         text = file.read(LARGEST + 1)
     fewer = "list fewer (solve --maps)"
     if len(text) > LARGEST:

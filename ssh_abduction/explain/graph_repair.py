@@ -280,7 +280,7 @@ def read_moves(file: str) -> tuple[GraphMove, ...]:
     if Path(file).suffix.lower() in (".graphml", ".xml"):
         data = _of_graphml(file)
     else:
-        data = read_json(file)
+        data = read_json(file, "graph")
     edges: Any = data
     if isinstance(data, dict):
         edges = next((data[key] for key in ("edges", "links", "moves") if key in data), None)
