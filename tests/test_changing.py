@@ -11,9 +11,10 @@ from ssh_abduction import Theory
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.costs.changing import improved
+from ssh_abduction.solver.costs.changing import Changing
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.sources.metric.completing import completed
+from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 
 
@@ -40,6 +41,7 @@ def test_changes_join_a_visit_that_a_map_keeps_apart(seed: int, star: str) -> No
         found[nats := misfit.nats_of(ssh_map)] = ssh_map
         return nats
 
-    improved(problem, misfit, begin, add, 3.0)
+    log = Log(known.trace, problem.theory, problem.pairs)
+    Changing(problem, log, misfit, add, 3.0).improve(begin)
     assert truth.is_true(found[min(found)], known)
     assert min(found) < misfit.nats_of(begin) - 2

@@ -35,6 +35,7 @@ from ssh_abduction.solver.geometry.equations import Equations
 from ssh_abduction.solver.geometry.fit import Explaining, poses_of
 from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.sources.metric.beam import Beam
+from ssh_abduction.solver.sources.metric.overlay import smoothed_map
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.settle import settle
@@ -248,6 +249,24 @@ def test_true_map_of_a_repeated_wing_explains_the_false_closures(seed: int) -> N
     noise = drive.trace.closures[0].covariance
     alias = FAULT + float(np.log(problem.prior.wide).sum() - np.linalg.slogdet(noise)[1]) / 2
     assert counted.of_course(dstates, places) <= min(larger, square + 2 * alias)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_explanation_of_the_closures_leads_to_the_true_map(seed: int) -> None:
+    """The places of visits that are apart are merged under each explanation of the closures."""
+    drive = wings(seed)
+    problem = settle(drive.trace, Theory.topological())
+    misfit, log = Misfit(problem), Log(drive.trace, problem.theory, problem.pairs)
+    doubted, costs = set[int](), [math.inf]
+    for aliases, begin in misfit.explained():
+        doubted |= {i for i, alias in enumerate(aliases) if alias}
+        if {i for i, alias in enumerate(aliases) if alias} == drive.false:
+            found = smoothed_map(problem, log, begin)
+            assert found is not None
+            costs.append(misfit.nats_of(found))
+    assert doubted == {*range(len(drive.trace.closures))}
+    dstates, places = truth.partition(drive.known.dstates), truth.partition(drive.known.places)
+    assert min(costs) < misfit.nats_of_course(dstates, places) + 5
 
 
 def test_jacobian_of_aliases_equals_finite_differences() -> None:

@@ -94,18 +94,18 @@ WEIGHED = (
         "After a long way, poses that fit all closures are better than a beam.",
         until=0.3,
     ),
+    SourceTurn(
+        "false closures",
+        "traces with closures; logs of robots only if their map does not fit",
+        "If closures are false, beams have to know which ones.",
+        share=0.3,
+    ),
     SourceTurn("beam of 1", "up to 2,000 steps", "It finds most true maps.", until=0.7),
     SourceTurn(
         "joint drives",
         "several drives",
         "Joined maps of single drives show whether a narrow beam over all drives missed one.",
         until=0.5,
-    ),
-    SourceTurn(
-        "false closures",
-        "traces with closures",
-        "If closures are false, later beams have to know which ones.",
-        share=0.3,
     ),
     SourceTurn(
         "beam of 4",
@@ -140,7 +140,7 @@ WEIGHED = (
     SourceTurn(
         "local changes",
         "displacements, no faults but misread views without stars",
-        "A map that a beam has missed mostly differs from the best one in one visit.",
+        "A map that a beam has missed mostly differs in one visit, and what follows from it.",
         share=0.3,
     ),
     SourceTurn(

@@ -4,8 +4,8 @@ Places are first merged at poses that fit all closures (`sources/metric/overlay.
 way this is better than a beam of hypotheses, which goes through the trace once. Then come beams,
 narrow ones first. The places of the best map of a broad beam are merged in the same way.
 
-A narrow beam believes all closures, and another one believes none. Each later beam believes those
-that the best map believes (`geometry/fit.py`).
+Closures may be false. Places are merged under several explanations of the closures
+(`geometry/fit.py`), before any beam. A beam believes the closures that the best map believes.
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ from contextlib import suppress
 from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solution.values import Status
 from ssh_abduction.solution.weighed import EQUAL
 from ssh_abduction.solver.asp.limits import StageTimeError
-from ssh_abduction.solver.geometry.poses import Poses
+from ssh_abduction.solver.costs.estimating import dstates_and_places
+from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.sources.metric.beam import Beam
@@ -27,8 +29,8 @@ from ssh_abduction.theory.prior import spreads_of
 
 # The numbers of hypotheses of the beams, in their order.
 WIDTHS = (1, 4, 16)
-# The number of hypotheses of the beams that sort closures.
-NARROW = 4
+# A map costs at most TRIED nats more than the best one, if its closures may be explained better.
+TRIED = 20.0
 # A beam of this width or more nearly always ends with the map of least cost.
 BROAD = 4
 
@@ -44,19 +46,18 @@ class Beams:
     def __init__(
         self,
         parts: Parts,
+        misfit: Misfit,
         add: Callable[[SSHMap], float],
-        has_map: Callable[[], bool],
+        best: Callable[[], float],
         believed: Callable[[], Set[int]],
-        beginning: Callable[[SSHMap], tuple[list[int], list[int], Poses]],
     ) -> None:
         """Prepare the guesses.
 
-        `add` returns the cost of a map in nats, and keeps the map if this cost is small. `has_map`
-        says whether a map is known, and `believed` which closures the best map believes.
-        `beginning` is `Misfit.beginning`.
+        `add` returns the cost of a map in nats, and keeps the map if this cost is small. `best`
+        returns the cost of the best map, and `believed` which closures it believes.
         """
-        self._beginning = beginning
-        self._parts, self._add, self._has_map, self._believed = parts, add, has_map, believed
+        self._parts, self._misfit, self._add = parts, misfit, add
+        self._nats, self._believed = best, believed
         # The cost of the best map of smoothing or a broad beam, and the estimate of it by a beam.
         self._best = math.inf, math.inf
         self.broken = -math.inf
@@ -105,13 +106,9 @@ class Beams:
 
         return [
             Source(turn("smoothing"), lambda: True, self._smooth),
+            Source(turn("false closures"), self._doubts_closures, self._sort_closures),
             *map(beam, widths[:1]),
             Source(turn("joint drives"), lambda: several, self._join),
-            Source(
-                turn("false closures"),
-                lambda: bool(self._parts.task.trace.closures),
-                self._sort_closures,
-            ),
             *map(beam, widths[1:]),
             Source(
                 turn("beam without axioms"),
@@ -133,15 +130,24 @@ class Beams:
             self._take(nats, -math.inf, joining.broken)
 
     def _sort_closures(self) -> None:
-        """Map the trace without closures, and then with those that the best map believes."""
-        closures = self._parts.task.trace.closures
-        believed: Set[int] = frozenset()
-        tried = {frozenset(range(len(closures)))}
-        while believed not in tried:
-            tried.add(frozenset(believed))
-            if beam := self._parts.candidates.beam(NARROW, believed):
-                self._maps_of(beam)
-            believed = self._believed()
+        """Merge places under several explanations of the closures."""
+        candidates, misfit = self._parts.candidates, self._misfit
+        for aliases, begin in misfit.explained():
+            look_at_clock()
+            found = candidates.smoothed(begin)
+            if found is None:
+                continue
+            course = dstates_and_places(found)
+            if misfit.nats_of_course(*course, aliases=aliases) < self._nats() + TRIED:
+                self._add(found)
+                if (merged := candidates.smoothed(misfit.beginning(found))) is not None:
+                    self._add(merged)
+
+    def _doubts_closures(self) -> bool:
+        """Whether closures may be false. Those of a log are trusted until its map does not fit."""
+        trace = self._parts.task.trace
+        trusts = spreads_of(trace).any() and len(self._believed()) == len(trace.closures)
+        return bool(trace.closures) and not trusts
 
     def _is_time_for(self, width: int, last: int, left: float) -> bool:
         """Whether to search with this beam. If only one of both has time, the last one goes first.
@@ -162,7 +168,7 @@ class Beams:
             if not self._ended:
                 parts.candidates.go_on(beam)
         if self._first == math.inf:
-            if not self._has_map() and clashes():
+            if self._nats() == math.inf and not parts.known.best and clashes():
                 parts.known.status = Status.UNSATISFIABLE
             self._first = parts.watch.elapsed() - began
 
@@ -186,7 +192,7 @@ class Beams:
         found = {self._add(one): one for one in candidates.maps_of(beam)}
         with suppress(StageTimeError):
             best = found[min(found)] if found else None
-            if best and (merged := candidates.smoothed(self._beginning(best))) is not None:
+            if best and (merged := candidates.smoothed(self._misfit.beginning(best))) is not None:
                 found[self._add(merged)] = merged
         return min(found, default=math.inf)
 

@@ -1,131 +1,136 @@
-"""Try local changes of the best map: one visit at another place, or two places that are one.
+"""Try local changes of the best map: some visits at another place, and what follows from it.
 
 A beam goes through the trace once and drops hypotheses, so it may miss a cheaper map that differs
-little from the best one. Each visit is moved to each other place that its displacements do not
-exclude. Its dstates become those of this place that face the same way and show the same, and what
-an action leads to from both becomes one, too. The poses of the map without this visit at its place
-say how far the visit is from the other places.
+little from the best one. A change takes some visits away from their place: none, one, or one and
+all later ones at that place. The poses of the map without these visits say how far they are from
+each other place. Each place that the displacements do not exclude is joined with theirs, or they
+stay at a new place. A join changes the poses and what the map shows, so other joins may save nats
+now. They follow at once (`Overlay.merge_all`). So one change may reassign a whole loop.
+
+The closures of a changed map are first explained as those of the best map. Only if it costs little
+more, the best explanation is sought, which takes longer.
+
+Reference:
+    Shaw 1998, "Using constraint programming and local search methods to solve vehicle routing
+    problems" (large neighbourhoods).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
-from itertools import groupby
+from itertools import chain, groupby
 
-import numpy as np
-
-from ssh_abduction.data.groups import NodeClasses, numbered
+from ssh_abduction.data.groups import gathered, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.costs.estimating import Course
+from ssh_abduction.solver.costs.estimating import Course, dstates_and_places
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.sources.metric.completing import completed
-from ssh_abduction.solver.steps.faults import with_faults
-from ssh_abduction.theory.fields import ONE_WAY
+from ssh_abduction.solver.geometry.equations import Aliases
+from ssh_abduction.solver.sources.metric.hypothesis import Hypothesis, parts_of
+from ssh_abduction.solver.sources.metric.overlay import Overlay
+from ssh_abduction.solver.sources.metric.sights import Sights
+from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import Problem
 
 
-def improved(
-    problem: Problem, misfit: Misfit, best: SSHMap, add: Callable[[SSHMap], float], within: float
-) -> None:
-    """Change a map, and then the cheapest map found, until no change is cheaper.
+class Changing:
+    """Changes a map until no change is cheaper."""
 
-    `add` keeps a map if it obeys the axioms, and returns its cost in nats; infinite if it breaks
-    them. Maps that cost at least `within` nats more than the best one are not tried.
-    """
-    tried: set[Course] = set()
-    nats, cheaper = misfit.nats_of(best), True
-    while cheaper:
-        cheaper = False
-        for dstates, places in _changes(problem, misfit, best):
-            if (dstates, places) in tried:
-                continue
-            tried.add((dstates, places))
+    def __init__(
+        self,
+        problem: Problem,
+        log: Log,
+        misfit: Misfit,
+        add: Callable[[SSHMap], float],
+        within: float,
+    ) -> None:
+        """Prepare the search.
+
+        `add` keeps a map if it obeys the axioms, and returns its cost in nats; infinite if it
+        breaks them. Maps that cost at least `within` nats more than the best one are not tried.
+        """
+        self._problem, self._log, self._misfit = problem, log, misfit
+        self._add, self._within = add, within
+        self._bare = problem.theory.replace(displacement="none", weigh="count")
+        self._sights = Sights(problem.trace, self._bare)
+        self._tried = set[Course]()
+
+    def improve(self, best: SSHMap) -> None:
+        """Change a map, and then the cheapest map found, until no change is cheaper."""
+        todo = _groups(best)
+        while todo:
+            steps, *todo = todo
             look_at_clock()
-            if misfit.nats_of_course(dstates, places) >= nats + within:
+            if (cheaper := self._cheaper(best, steps)) is not None:
+                best = cheaper
+                # Go on behind the visits that were changed.
+                todo = sorted(_groups(best), key=lambda others: others[:1] <= steps[:1])
+
+    def _cheaper(self, best: SSHMap, steps: Sequence[int]) -> SSHMap | None:
+        """Find a cheaper map that differs from a map where some steps are; None if there is none.
+
+        Without steps, places of the map are joined.
+        """
+        misfit, nats, course = self._misfit, self._misfit.nats_of(best), _course_of(best)
+        aliases = misfit.aliases_of(*course)
+        self._tried.add(course)
+        for found in self._changed(course, steps, aliases):
+            if (changed := _course_of(found)) in self._tried:
                 continue
-            of_dstate = [*dict(zip(dstates, places, strict=True)).values()]
-            facing = misfit.poses(dstates, places).gaussian()[1][-len(of_dstate) :]
-            found = completed(problem.trace, problem.theory, dstates, of_dstate, facing.tolist())
-            if found is not None and problem.theory.misread:
-                found = with_faults(found, problem.trace, problem.trace, problem.theory)
-            if found is not None and (cost := add(found)) < nats:
-                best, nats, cheaper = found, cost, True
-                break
+            self._tried.add(changed)
+            look_at_clock()
+            if misfit.nats_of_course(*changed, aliases=aliases) < nats + self._within:
+                ssh_map = found.ssh_map(self._problem.trace, self._bare, self._sights)
+                if ssh_map is not None and self._add(ssh_map) < nats:
+                    return ssh_map
+        return None
+
+    def _changed(
+        self, course: Course, steps: Sequence[int], aliases: Aliases
+    ) -> Iterator[Hypothesis]:
+        """Yield the changes of a map if some steps are elsewhere, those of nearby places first.
+
+        The aliases explain the closures.
+        """
+        of, prior = set(steps), self._problem.prior
+        labels, places = (numbered((x, t in of) for t, x in enumerate(names)) for names in course)
+        of_dstate = [*dict(zip(labels, places, strict=True)).values()]
+        fitted = self._misfit.poses(labels, places, aliases=aliases).gaussian()
+        parts = parts_of(fitted, labels, of_dstate, self._log, self._sights)
+        for part in parts:
+            if not of <= part.labels.keys():
+                continue
+            rest = [other for other in parts if other is not part]
+            overlay = Overlay(part, None, self._problem, self._sights)
+            here = part.places[part.labels[steps[0]]] if steps else None
+            if steps:
+                yield _beside([part, *rest])
+            for pair in overlay.near(here, max(map(prior.predicted, steps or part.labels))):
+                if overlay.join(pair):
+                    yield _beside([overlay.part(), *rest])
 
 
-def _changes(problem: Problem, misfit: Misfit, ssh_map: SSHMap) -> Iterator[Course]:
-    """Yield the dstates and places of changed maps, those of nearby places first."""
-    labels = ssh_map.dstate_at
-    at = [s.place if s.place is not None else s.id for s in ssh_map.dstates]
-    steps = range(len(labels))
-    visits = [[*of] for _, of in groupby(steps, key=lambda t: at[labels[t]])]
-    found: list[tuple[float, Course]] = []
-    for visit in visits:
-        look_at_clock()
-        new = {*visit}
-        dstates = numbered((labels[t], t in new) for t in steps)
-        places = numbered((at[labels[t]], t in new) for t in steps)
-        found += _moves(problem, misfit, (tuple(dstates), tuple(places)), visit)
-    for _, course in sorted(found, key=lambda pair: pair[0]):
-        yield course
+def _groups(best: SSHMap) -> list[list[int]]:
+    """List the steps of visits that a change takes away from their place: at first none."""
+    _, places = _course_of(best)
+    visits = [[*of] for _, of in groupby(range(len(places)), key=places.__getitem__)]
+    at = gathered((places[visit[0]], visit) for visit in visits)
+    later = [[*chain(*of[i:])] for of in at.values() for i in range(1, len(of) - 1)]
+    return [[], *visits, *later]
 
 
-def _moves(
-    problem: Problem, misfit: Misfit, course: Course, visit: Sequence[int]
-) -> Iterator[tuple[float, Course]]:
-    """Yield where a visit that is alone at its place may be instead, with half of the chi-square.
-
-    A visit to a new place is one of these.
-    """
-    dstates, places = course
-    yield 0.0, course
-    of_dstate = [*dict(zip(dstates, places, strict=True)).values()]
-    part, mean, covariance, _ = misfit.poses(dstates, places).gaussian()
-    here, facing = places[visit[0]], mean[2 * len({*places}) :]
-    first = {place: s for s, place in reversed([*enumerate(of_dstate)])}
-    most = problem.prior.predicted(visit[0]) + problem.prior.place[visit[0]]
-    for there, s in first.items():
-        if there == here or part[s] != part[dstates[visit[0]]]:
-            continue
-        rows = np.array([2 * here, 2 * here + 1, 2 * there, 2 * there + 1])
-        off = mean[rows[:2]] - mean[rows[2:]]
-        spread = covariance[np.ix_(rows, rows)].reshape(2, 2, 2, 2)
-        spread = spread[0, :, 0] + spread[1, :, 1] - spread[0, :, 1] - spread[1, :, 0]
-        square = float(off @ np.linalg.pinv(spread + 1e-6 * np.identity(2)) @ off)
-        if square / 2 < most:
-            yield square / 2, _joined(problem, course, of_dstate, facing.tolist(), (here, there))
+def _beside(parts: Sequence[Hypothesis]) -> Hypothesis:
+    """Put hypotheses about different steps beside each other."""
+    whole, *others = parts
+    for part in others:
+        whole = whole.beside(part)
+    return whole
 
 
-def _joined(
-    problem: Problem,
-    course: Course,
-    of_dstate: Sequence[int],
-    facing: Sequence[float],
-    pair: tuple[int, int],
-) -> Course:
-    """Join two places, their dstates that face one way and show the same, and what follows."""
-    dstates, places = course
-    views: dict[int, object] = {}
-    for s, view in zip(dstates, problem.trace.views, strict=True):
-        views[s] = view if views.get(s) is None else views[s]
-    here, there = ([s for s, p in enumerate(of_dstate) if p == place] for place in pair)
-    alike = [
-        (s, x)
-        for s in here
-        for x in there
-        if abs(math.remainder(facing[s] - facing[x], math.tau)) < ONE_WAY
-        and (problem.theory.misread or views[s] == views[x] or None in (views[s], views[x]))
-    ]
-    links = [
-        (s, action.name, x)
-        for s, action, x in zip(dstates, problem.trace.actions, dstates[1:], strict=False)
-        if not action.starts
-    ]
-    merged, at = NodeClasses[int](), NodeClasses[int]()
-    merged.merge_with_links(alike, links)
-    at.merge(*pair)
-    for s, place in enumerate(of_dstate):
-        at.merge(of_dstate[merged.of(s)], place)
-    return tuple(numbered(map(merged.of, dstates))), tuple(numbered(map(at.of, places)))
+def _course_of(found: SSHMap | Hypothesis) -> Course:
+    """Return the dstate and the place of each step, numbered by first visit."""
+    if isinstance(found, SSHMap):
+        dstates, places = dstates_and_places(found)
+        return dstates, places if found.places else dstates
+    labels = [found.labels[t] for t in sorted(found.labels)]
+    return tuple(numbered(labels)), tuple(numbered(map(found.places.__getitem__, labels)))

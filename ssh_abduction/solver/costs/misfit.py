@@ -23,7 +23,7 @@ or one at least is of an alias, and then the misfit is at least that without clo
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterable, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Sequence
 from typing import TypeAlias
 
 from ssh_abduction.data.groups import NodeClasses, minimal_part, numbered
@@ -91,18 +91,34 @@ class Misfit:
         return FAULT * Cost.of(ssh_map).faults + self.nats_of_course(*_course_of(ssh_map))
 
     def nats_of_course(
-        self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
+        self,
+        dstates: Sequence[int],
+        places: Sequence[Hashable],
+        wrong: Collection[int] = (),
+        aliases: Aliases | None = None,
     ) -> float:
-        """Return -log of the marginal likelihood if steps are at these dstates and places."""
-        prior, nats = self._prior, self._explained(dstates, places, wrong)[1]
+        """Return -log of the marginal likelihood if steps are at these dstates and places.
+
+        With `aliases`, this is an upper bound: closures are explained so, instead of best.
+        """
+        prior = self._prior
+        if aliases is None:
+            nats = self._explained(dstates, places, wrong)[1]
+            aliases = self.aliases_of(dstates, places, wrong)
+        else:
+            nats = self._explaining(_groups_of(dstates, places, wrong)).likelihood(aliases)[1]
         nats += float(prior.base[-1]) + prior.lost(wrong) + prior.shown(dstates, places)
-        return nats - self._repeated(dstates, places, wrong)
+        return nats - self._repeated(dstates, places, wrong, aliases)
 
     def _repeated(
-        self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int]
+        self,
+        dstates: Sequence[int],
+        places: Sequence[Hashable],
+        wrong: Collection[int],
+        aliases: Aliases,
     ) -> float:
         """Return the nats that views and stars save where aliases lay a part on another part."""
-        if not (aliases := self.aliases_of(dstates, places, wrong)):
+        if not any(aliases):
             return 0.0
         of_map = self._explaining(_groups_of(dstates, places, wrong))
         pairs = of_map.repeats(aliases, self._prior.near)
@@ -112,9 +128,8 @@ class Misfit:
     def aliases_of(
         self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
     ) -> Aliases:
-        """Return the alias of each closure in the best explanation; empty if all are true."""
-        aliases = self._explained(dstates, places, wrong)[2]
-        return aliases if any(aliases) else ()
+        """Return the alias of each closure in the best explanation; 0 if it is true."""
+        return self._explained(dstates, places, wrong)[2]
 
     def beginning(self, ssh_map: SSHMap) -> tuple[list[int], list[int], Poses]:
         """Return the dstates and places of a map for `smoothed`, and their equations."""
@@ -122,11 +137,22 @@ class Misfit:
         of_dstate = _of_headings(numbered(dstates), numbered(places))
         return numbered(dstates), of_dstate, self.poses(dstates, places, wrong)
 
+    def explained(self) -> Iterator[tuple[Aliases, tuple[list[int], list[int], Poses]]]:
+        """Yield explanations of the closures, with equations that keep all visits apart."""
+        steps, places = [*range(len(self.visit))], numbered(self.visit)
+        for aliases in self._explaining(_groups_of(steps, places, ())).explanations():
+            yield aliases, (steps, places, self.poses(steps, places, aliases=aliases))
+
     def poses(
-        self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
+        self,
+        dstates: Sequence[int],
+        places: Sequence[Hashable],
+        wrong: Collection[int] = (),
+        aliases: Aliases | None = None,
     ) -> Poses:
-        """Collect the equations of the best explanation of the closures."""
-        aliases = self._explained(dstates, places, wrong)[2]
+        """Collect the equations with these aliases of closures, or with the best explanation."""
+        if aliases is None:
+            aliases = self._explained(dstates, places, wrong)[2]
         return self._explaining(_groups_of(dstates, places, wrong)).poses(aliases)
 
     def _explained(

@@ -43,7 +43,7 @@ from ssh_abduction.solution.weighed import EQUAL, IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.costs.beams import Beams
-from ssh_abduction.solver.costs.changing import improved
+from ssh_abduction.solver.costs.changing import Changing
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
     Course,
@@ -126,13 +126,7 @@ class Weighing:
         self.bound = 0.0
         self.proven = False
         self.of_labels: OfLabels | None = None
-        self.beams = Beams(
-            parts,
-            self.add,
-            lambda: bool(self.candidates or parts.known.best),
-            self._believed,
-            self._misfit.beginning,
-        )
+        self.beams = Beams(parts, self._misfit, self.add, lambda: self._nats, self._believed)
         self._task = replace(parts.task, speedups=replace(parts.task.speedups, prefixes=False))
         self._forced: list[tuple[int, int]] = []  # pairs of steps at one dstate in all cheap maps
         # Faults need the readable encodings, which take too much memory for a long trace.
@@ -168,7 +162,8 @@ class Weighing:
         trusting = theory.replace(misread=0.0) if theory.star == "none" else theory
 
         def change() -> None:
-            improved(task.problem, self._misfit, self.candidates[0].map, self._add_valid, WITHIN)
+            changing = Changing(task.problem, task.log, self._misfit, self._add_valid, WITHIN)
+            changing.improve(self.candidates[0].map)
             self.beams.improved(self._nats)
 
         return Source(
@@ -428,7 +423,8 @@ class Weighing:
 
     def _with_aliases(self, rival: Rival) -> Rival:
         wrong = [step for kind, step in rival.faults if kind == "jumped"]
-        return replace(rival, aliases=self._misfit.aliases_of(rival.dstates, rival.at, wrong))
+        aliases = self._misfit.aliases_of(rival.dstates, rival.at, wrong)
+        return replace(rival, aliases=aliases if any(aliases) else ())
 
     def _excess(self) -> float:
         """Return the misfit of the returns of the best map, divided by its expected value.

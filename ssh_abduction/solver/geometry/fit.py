@@ -23,7 +23,7 @@ none agrees better than a motion that is uniform over the building, one closure 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TypeAlias
@@ -103,9 +103,13 @@ class Explaining:
         if not n or (square - self.poses(believed, ()).misfit(poses) - 3 * n) / 2 < FAULT:
             return square, nats, believed
         found = self._assigned(n)
-        other, cost = self.poses(found).likelihood(self.wide)
-        cost += FAULT * _count(found)
+        other, cost = self.likelihood(found)
         return (square, nats, believed) if nats <= cost else (other, cost, found)
+
+    def likelihood(self, aliases: Aliases) -> tuple[float, float]:
+        """Return the chi-square and the cost in nats with these aliases."""
+        square, nats = self.poses(aliases).likelihood(self.wide)
+        return square, nats + FAULT * _count(aliases)
 
     def repeats(self, aliases: Aliases, near: float) -> tuple[dict[int, int], dict[int, int]]:
         """Find the dstates, and the places, that repeat earlier ones: aliases lay one on the other.
@@ -138,13 +142,35 @@ class Explaining:
         """The number of closures."""
         return int((self.equations.scaled == 0).sum())
 
-    def _assigned(self, n: int) -> Aliases:
-        """Assign the n closures, the most surely predicted ones first."""
+    def explanations(self) -> Iterator[Aliases]:
+        """Yield explanations of the closures. Each closure is false in one of them at least.
+
+        If alike parts of a building are laid on each other, false closures agree with each other
+        as true ones do. Then the first explanation may believe the wrong ones.
+        """
+        n = self._closures
+        yield (found := self._assigned(n))
+        doubted = {i for i in range(n) if found[i]}
+        while len(doubted) < n:
+            first = min({*range(n)} - doubted)
+            yield (found := self._assigned(n, first))
+            doubted |= {first, *(i for i in range(n) if found[i])}
+
+    def _assigned(self, n: int, false: int | None = None) -> Aliases:
+        """Assign the n closures, the most surely predicted ones first.
+
+        The closure `false` is of the first alias, if it is given.
+        """
         aliases, left = np.zeros(n, dtype=int), np.arange(n)
-        free = self._free(n)
+        if false is not None:
+            aliases[false], left = 1, np.delete(left, false)
+        free, before = self._free(n), None
         while len(left):
             look_at_clock()
             poses = self.poses(aliases.tolist(), np.setdiff1d(range(n), left))
+            if before is not None:
+                poses.begin_at(before)
+            before = poses
             known = range(1, _count(aliases.tolist()) + 1)
             ways = np.array([0, *known, *(-k for k in known)])
             others = []

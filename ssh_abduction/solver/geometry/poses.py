@@ -104,6 +104,11 @@ class Poses:
         """The unknowns with the least sum of squares, and this sum."""
         return self._best()
 
+    def begin_at(self, near: Poses) -> None:
+        """Find the best unknowns only about, beginning at poses with as many unknowns, if any."""
+        if self._size == near._size:
+            self.best = self._best(near.best[0], NEARLY)
+
     def misfit(self, near: Poses | None = None) -> float:
         """Compute the least chi-square; only about, if begun at poses with the same unknowns."""
         return self._best(near.best[0], NEARLY)[1] if near else self.best[1]

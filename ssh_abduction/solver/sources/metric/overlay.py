@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssh_abduction.data.groups import firsts, gathered, numbered
 from ssh_abduction.data.maps import SSHMap
@@ -160,6 +161,29 @@ class Overlay:
         self.merge_all()
         return True
 
+    def join(self, places: tuple[int, int]) -> bool:
+        """Merge two places of the first map, and then all that coincide.
+
+        An earlier merge is undone first. Returns whether the two can be one place.
+        """
+        self._state = self._apart
+        if not self._tried([], places, most=math.inf, has_dstates=True):
+            return False
+        self.merge_all()
+        return True
+
+    def near(self, place: int | None, most: float) -> list[tuple[int, int]]:
+        """List the pairs of places that may be one, those of one place or all, the nearest first.
+
+        Half of the chi-square of their positions is less than `most` nats.
+        """
+        self._state = self._apart
+        _, squares, _ = self._differences()
+        squares[np.isinf(self._costs)] = math.inf
+        pairs = np.argwhere(squares / 2 < most).tolist()
+        own = [(p, q) for p, q in pairs if place in (None, p, q)]
+        return sorted(own, key=lambda pair: squares[pair])
+
     def merge_all(self) -> bool:
         """Merge all places that coincide. Return whether there was one."""
         first = self._state
@@ -226,6 +250,17 @@ class Overlay:
 
     def _surest(self) -> tuple[int, int] | None:
         """Find the two places that most surely coincide; None if there are none."""
+        places, squares, size = self._differences()
+        unlikely = squares + np.log(size) + 2 * self._changes[np.ix_(places, places)]
+        unlikely[squares > FAR] = math.inf
+        i, j = np.unravel_index(np.argmin(unlikely), unlikely.shape)
+        return None if math.isinf(unlikely[i, j]) else (int(places[i]), int(places[j]))
+
+    def _differences(self) -> tuple[NDArray[np.int_], Array, Array]:
+        """Return the places, and for each two the chi-square and the determinant of their offset.
+
+        The determinant is that of its covariance.
+        """
         state = self._state
         places = np.array(sorted(set(state.place)))
         at = np.stack([self._position[places], self._position[places] + 1], 1)
@@ -237,11 +272,7 @@ class Overlay:
         a, b, d = spread[..., 0, 0], spread[..., 0, 1], spread[..., 1, 1]
         size = np.maximum(a * d - b * b, BLUR**2)
         x, y = off[..., 0], off[..., 1]
-        squares = (d * x * x - 2 * b * x * y + a * y * y) / size
-        unlikely = squares + np.log(size) + 2 * self._changes[np.ix_(places, places)]
-        unlikely[squares > FAR] = math.inf
-        i, j = np.unravel_index(np.argmin(unlikely), unlikely.shape)
-        return None if math.isinf(unlikely[i, j]) else (int(places[i]), int(places[j]))
+        return places, (d * x * x - 2 * b * x * y + a * y * y) / size, size
 
     def _tried(
         self,
