@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
@@ -16,8 +17,12 @@ from perception.places.importing import import_log
 from perception.places.saved import SCANS, STATE
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_carmen
+from simulator.tours import record
+from simulator.world import World
 from ssh_abduction.cli import main
+from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.errors import MapError, TraceError
+from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.robot_logs import log_mapper
 from ssh_abduction.robot_logs.live_page import LivePage
 from ssh_abduction.robot_logs.log_mapper import (
@@ -266,7 +271,29 @@ def test_lifted_robot_has_no_position_until_closures_show_it(scans: tuple[Scan, 
     for located in (False, True):
         seen = mapper.observe(scans[10])  # another place, and the odometry starts there
         assert (seen.on_map, dict(seen.belief)) == (None, {})
-        mapper.accept(replace(found(0, 1, 2, 0), located=located))
+        mapper.accept(replace(found(0, 1, 2, 0), scans=(0, 10, 20, 31), located=located))
     assert mapper.observe(scans[10]).on_map is not None
     assert mapper.live.grown().track.breaks == (31,)
     assert mapper.finish().track.breaks == (31,)
+
+
+def test_lifted_robot_is_located_by_what_it_sees() -> None:
+    """The second drive begins elsewhere, with odometry that starts anew."""
+    scans = list(scans_of(record(World.named("cluttered"), every=0.5)))[:160]
+    mapper = OnlineLogMapper()
+    poses = [mapper.observe(scan).pose for scan in scans]
+    mapper.accept(found(0))
+    mapper.lift()
+    late = found(0, 0)  # a search that began before the robot was lifted
+    mapper.accept(late)
+    begin, way, seen = 5, 0.0, None
+    for k in range(begin, len(scans)):
+        way += math.dist(scans[k].odometry[:2], scans[max(k - 1, begin)].odometry[:2])
+        onward = displacement_between(scans[begin].odometry, scans[k].odometry)
+        seen = mapper.observe(replace(scans[k], odometry=moved((5.0, 5.0, 2.0), onward)))
+        if seen.on_map is not None:
+            break
+    assert seen is not None
+    assert seen.on_map is not None
+    assert 5 < way < 15
+    assert seen.on_map == pytest.approx(poses[k], abs=0.1)

@@ -33,7 +33,7 @@ import math
 from bisect import bisect, bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, combinations, pairwise
+from itertools import accumulate, combinations, islice, pairwise
 from statistics import median
 from typing import Any
 
@@ -43,7 +43,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
 from perception.places.distinctive import Visit, patches_of
-from perception.places.local_map import MOST, LocalScene, Match, Turned, match
+from perception.places.local_map import MOST, LocalScene, Match, Patch, Turned, match
 from perception.places.track import (
     Array,
     Track,
@@ -502,6 +502,62 @@ def closures_across_cuts(track: Track, visits: Sequence[Visit], poses: Array) ->
         replace(closing, first=some[closing.first], last=some[closing.last])
         for closing in closures_between(drives, [poses[part] for part in parts])
     ]
+
+
+class Relocation:
+    """Finds where a robot is that may be anywhere among known visits, while it drives.
+
+    It compares local maps along the new trajectory, its stations, with those of the visits. The
+    robot is located when the matches of enough stations agree, as those of two drives have to.
+
+    Args:
+        visits: The known visits, with their local maps.
+        poses: (n, 3) the poses of the visits, as `fitted_poses` returns them.
+    """
+
+    def __init__(self, visits: Sequence[Visit], poses: Array) -> None:
+        some = slice(None, None, 1 + len(visits) // MATCHED)
+        self._known = DriveScenes.of(visits[some], poses[some])
+        self._scenes, self._poses = list[LocalScene](), list[Array]()  # of the stations
+        self._found: list[VisitMatch] = []
+        self._matching: Iterator[Match | None] = iter(())
+        self._open = 0  # how many visits the last station was not matched with yet
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether the last station was not matched with all visits yet."""
+        return self._open > 0
+
+    def begin(self, patch: Patch, middle: Array) -> None:
+        """Begin the next station: the local map around `middle`, (x, y) metres on the new track."""
+        self._scenes.append(LocalScene.of(patch, middle))
+        self._poses.append(np.array([*middle, 0.0]))
+        turned = Turned.of(self._scenes[-1], TURNS)
+        self._matching = (match(scene, turned) for scene in self._known.scenes)
+        self._open = len(self._known.scenes)
+
+    def go_on(self, share: float) -> tuple[Pose, Pose] | None:
+        """Match the last station with a share of the visits.
+
+        Returns a pose on the new track, and the same in the frame of the visits; None if it is not
+        known yet where the robot is.
+        """
+        total, last = len(self._known.scenes), len(self._scenes) - 1
+        for matched in islice(self._matching, math.ceil(share * total)):
+            if matched is not None and is_reliable(matched):
+                self._found.append(VisitMatch(total - self._open, last, matched))
+            self._open -= 1
+        return None if self.is_busy else self._located()
+
+    def _located(self) -> tuple[Pose, Pose] | None:
+        known, stations = self._known, DriveScenes(self._scenes, np.array(self._poses))
+        kept = without_clashes(self._found, known, stations)
+        agreed = _largest(kept, _relations(kept, known.poses, stations.poses))
+        if not agreed:
+            return None
+        x, y, _ = here = stations.poses[-1].tolist()
+        at, turn, _ = _relations(agreed, known.poses, stations.poses).placed(here[:2])
+        return (x, y, 0.0), (*at.tolist(), turn)
 
 
 def _reliable_matches(ours: DriveScenes, theirs: DriveScenes) -> list[VisitMatch]:

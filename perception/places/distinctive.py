@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perception.places.following import Followed
-from perception.places.local_map import LocalMaps, PackedPatch, Recent
+from perception.places.local_map import LocalMaps, PackedPatch, Patch, Recent
 from perception.places.skeleton import Junction, junctions
 from perception.places.track import Array, Track
 from perception.readers.scans import RobotLog, Scan
@@ -203,6 +203,13 @@ class VisitFinder:
             self._count += 1
         return found
 
+    def around(self, behind: float) -> tuple[Patch, Array] | None:
+        """The local map around the robot's position this many metres ago, and that position.
+
+        The position is (x, y) in metres on the track. None if this part of the track is shorter.
+        """
+        return self._detector.around(behind)
+
     def expected(self) -> list[Visit]:
         """The visits that would follow if the drive ended now. Nothing is changed."""
         return copy.deepcopy(self).add(None)
@@ -242,6 +249,16 @@ class _Detector:
         for chain in list(self._open):
             self._end(chain)
         yield from self._stays.add(self._released(self._recent.end), None)
+
+    def around(self, behind: float) -> tuple[Patch, Array] | None:
+        """As `VisitFinder.around`."""
+        recent = self._recent
+        way = recent.way(recent.end - 1) - behind
+        if way < 0:
+            return None
+        scan = recent.at(way)
+        middle = recent.poses(scan, scan + 1)[0, :2]
+        return self._maps.around(scan, middle, HALF), middle
 
     @property
     def _next(self) -> int | None:

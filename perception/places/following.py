@@ -208,8 +208,9 @@ class GrowingTrack:
     """A track to which scans are added. Each needs about 100 bytes."""
 
     def __init__(self) -> None:
-        self.cuts: list[int] = []  # indices of the scans before which the motion is unknown, so far
-        self._breaks: list[int] = []
+        # Indices of the scans so far before which the motion is unknown, and of those among them at
+        # which a new trajectory begins.
+        self.cuts, self.breaks = list[int](), list[int]()
         self._rows = array("d")  # pose, covariance and share of each scan
 
     def __len__(self) -> int:
@@ -219,7 +220,7 @@ class GrowingTrack:
     def add(self, one: Followed) -> None:
         """Add the next scan."""
         self.cuts += [len(self)] if one.cut else []
-        self._breaks += [len(self)] if one.broken else []
+        self.breaks += [len(self)] if one.broken else []
         self._rows.extend((*one.pose, *one.covariance.ravel(), one.share))
 
     @property
@@ -227,7 +228,7 @@ class GrowingTrack:
         """The track up to the last scan. It is not copied: while it is in use, add no scan."""
         rows = np.asarray(self._rows).reshape(-1, ROW)
         covariances, shares = rows[:, 3:12].reshape(-1, 3, 3), rows[:, 12]
-        return Track(rows[:, :3], covariances, shares, tuple(self.cuts), tuple(self._breaks))
+        return Track(rows[:, :3], covariances, shares, tuple(self.cuts), tuple(self.breaks))
 
 
 class Follower:

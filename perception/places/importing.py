@@ -177,16 +177,24 @@ def assembled(
     with _timed(seconds, "trace"):
         if closings is None:
             closings = closures.find_closures(track, visits, 2 * WINDOW)
-        track, visits, closings = placed(track, visits, closings)
-        poses = closures.fitted_poses(track, visits, closings)
-        if across := closures.closures_across_cuts(track, visits, poses):
-            closings += across
-            poses = closures.fitted_poses(track, visits, closings)
+        track, visits, closings, poses = fitted(track, visits, closings)
         trace = to_trace(log, track, visits, closings, name)
     with _timed(seconds, "views"):
         trace = with_views(trace)
     starts = tuple(starts_of_drives(track, visits).values())
     return Imported(trace, track, width, visits, seconds, notes, starts, poses)
+
+
+def fitted(
+    track: Track, visits: Sequence[Visit], closings: Sequence[closures.VisitMatch]
+) -> tuple[Track, tuple[Visit, ...], list[closures.VisitMatch], Array]:
+    """As `placed`, with the closures across cuts of the track and the poses of the visits."""
+    track, visits, closings = placed(track, visits, closings)
+    poses = closures.fitted_poses(track, visits, closings)
+    if across := closures.closures_across_cuts(track, visits, poses):
+        closings += across
+        poses = closures.fitted_poses(track, visits, closings)
+    return track, visits, closings, poses
 
 
 def placed(

@@ -15,19 +15,30 @@ from __future__ import annotations
 import math
 import os
 import re
+from bisect import bisect
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
+import networkx as nx
 import numpy as np
 
 from perception.errors import LogError
 from perception.places import log_checks, odometers
-from perception.places.closures import ClosureFinder, fitted_poses
+from perception.places.closures import ClosureFinder, Relocation, fitted_poses
 from perception.places.distinctive import WIDTH, WINDOW, Visit, VisitFinder
 from perception.places.following import Followed, Follower, GrowingTrack
-from perception.places.importing import Grown, Imported, Tell, import_log, placed, tell_nobody
+from perception.places.importing import (
+    Grown,
+    Imported,
+    Tell,
+    fitted,
+    import_log,
+    placed,
+    tell_nobody,
+)
+from perception.places.local_map import Patch
 from perception.places.saved import Folder
 from perception.places.track import Array
 from perception.readers.scans import Damage, RobotLog, Scan, ScanTable
@@ -209,6 +220,11 @@ class LiveLog:
         self._follower.lifted = len(self) > 0
 
     @property
+    def begun(self) -> int:
+        """The first scan of the trajectory that goes on: before it, the robot was elsewhere."""
+        return len(self) if self._follower.lifted else max(self._done.breaks, default=0)
+
+    @property
     def log(self) -> RobotLog:
         """The log so far."""
         return RobotLog(self._scans, tuple(self.damaged), source=self.source)
@@ -254,6 +270,27 @@ class LiveLog:
             )
             for some in near_groups(poses[:, :2])
         ]
+
+    def relocation(self) -> Relocation | None:
+        """What finds the robot among the visits of earlier trajectories; None if there are none.
+
+        These are the largest part of the map that closures connect: only they have one frame.
+        """
+        grown = self.grown()
+        track, visits, closings, poses = fitted(grown.track, grown.visits, grown.closings)
+        linked = nx.Graph()
+        linked.add_nodes_from(part_of := [bisect(track.breaks, visit.scan) for visit in visits])
+        linked.add_edges_from((part_of[one.first], part_of[one.last]) for one in closings)
+        parts = [
+            [k for k, part in enumerate(part_of) if part in some and visits[k].scan < self.begun]
+            for some in nx.connected_components(linked)
+        ]
+        known = max(parts, key=len, default=[])
+        return Relocation([visits[k] for k in known], poses[known]) if known else None
+
+    def around(self, behind: float) -> tuple[Patch, Array] | None:
+        """As `VisitFinder.around`."""
+        return self._finder.around(behind)
 
     def finish(self, name: str | None = None) -> Imported:
         """Import the log so far. The result equals that of `import_log`.

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import LogError
+from perception.places.closures import Relocation
 from perception.places.distinctive import WIDTH, Visit
 from perception.places.importing import Grown, Imported, Tell, assembled, tell_nobody
 from perception.places.live import LiveLog, LivePlace
@@ -58,6 +59,9 @@ NEAR, DRIFT = 0.5, 0.02
 AWAY = 1.5
 # A place has moved if its middle is this many metres from where it was.
 MOVED = 1.0
+# Metres from one station to the next while it is unknown where the robot is, and how far behind the
+# robot they are.
+STATION, BEHIND = 2.0, 3.0
 LOOK = 1.0  # metres from one look at visits to come to the next
 EVERY = 1.0  # seconds from saving to saving
 POLL = 0.2  # seconds to wait for a search
@@ -281,8 +285,6 @@ class _Names:
             for number, middle in self.middles.items()
             if number in before and math.dist(before[number], middle) > MOVED
         ]
-        (ahead, left), (x, y, turn) = found.middles[-1].tolist(), found.poses[-1].tolist()
-        self.anchor = ((ahead, left, 0.0), (x, y, turn)) if found.located else None
         return events
 
 
@@ -316,6 +318,8 @@ class OnlineLogMapper:
         self._way = 0.0  # metres since the anchor
         self._last: Pose | None = None
         self._looked, self._expected = -math.inf, list[Visit]()  # the last look at visits to come
+        self._relocation: Relocation | None = None  # while it is unknown where the robot is
+        self._station = 0.0  # metres since the last station of the relocation
 
     def __len__(self) -> int:
         """The number of scans."""
@@ -328,8 +332,12 @@ class OnlineLogMapper:
         """
         an_instance("scan", scan, Scan, LogError, mend="give a Scan of perception.readers.scans")
         one, visits = self.live.add(scan)
-        self._way += math.dist(self._last[:2], one.pose[:2]) if self._last else 0.0
-        self._last = one.pose
+        far = math.dist(self._last[:2], one.pose[:2]) if self._last else 0.0
+        self._last, self._way, self._station = one.pose, self._way + far, self._station + far
+        if one.broken and len(self) > 1:
+            self._names.anchor = self._relocation = None
+        if self._names.anchor is None and self._names.middles:
+            self._relocate(far)
         on_map = self._on_map(one.pose)
         return RobotSeen(one.pose, on_map, self._belief(on_map), tuple(visits))
 
@@ -340,6 +348,20 @@ class OnlineLogMapper:
         """
         self.live.lift()
         self._names.anchor = None
+        self._relocation = self.live.relocation()
+
+    def _relocate(self, far: float) -> None:
+        """Compare what the robot sees with the known visits, after it drove `far` metres."""
+        self._relocation = self._relocation or self.live.relocation()
+        if self._relocation is None:
+            return
+        if self._relocation.is_busy:
+            self._names.anchor = self._relocation.go_on(far / STATION)
+        elif self._station > STATION and (seen := self.live.around(BEHIND)):
+            self._station = 0.0
+            self._relocation.begin(*seen)
+        if self._names.anchor is not None:
+            self._relocation, self._way = None, self._station + BEHIND
 
     def _on_map(self, pose: Pose) -> Pose | None:
         if self._names.anchor is None:
@@ -384,7 +406,11 @@ class OnlineLogMapper:
         if found is None:
             return []
         events = self._names.update(found)
-        self.said, self.sure, self._way = found.said, dict(found.sure), 0.0
+        if found.located and found.scans[-1] >= self.live.begun:
+            (ahead, left), (x, y, turn) = found.middles[-1].tolist(), found.poses[-1].tolist()
+            self._names.anchor = (ahead, left, 0.0), (x, y, turn)
+            self._relocation, self._way = None, 0.0
+        self.said, self.sure = found.said, dict(found.sure)
         return events
 
     def correct(self, kind: str, first: int, second: int) -> None:
