@@ -149,6 +149,7 @@ def _visits_of(items: Iterable[Scan | Damage], live: LiveLog) -> Iterator[Visit]
     def found() -> Iterator[Visit]:
         for scan in watched(scans(), live.tell, live.source):
             yield from live.add(scan)[1]
+        live.compare()
         yield from live.expected()
 
     return found()
@@ -192,6 +193,7 @@ class LiveLog:
         self._scans, self._done = ScanTable(), GrowingTrack()
         self._follower = Follower(odometers.LiveJumps())
         self._finder, self._closures = VisitFinder(width), ClosureFinder(2 * WINDOW)
+        self._compared = 0  # the scans over which the track was compared with the odometry
         self._folder: Folder | None = None  # where the state was saved last
 
     def __len__(self) -> int:
@@ -210,7 +212,7 @@ class LiveLog:
         if one.cut and len(self._done.cuts) <= SAID:
             self.tell(odometers.describe_cuts(self.log, self._done.track, []))
         if len(self._scans) == COMPARED:
-            self._compare()
+            self.compare()
         found = self._finder.add(one)
         self.visits += found
         return one, found
@@ -299,8 +301,7 @@ class LiveLog:
         """
         if not len(self):
             raise LogError(f"{named(self.source)}: expected scans, got none; record the laser")
-        if len(self) < COMPARED:
-            self._compare()
+        self.compare()
         return import_log(self.log, self.width, name, lambda note: self.tell([note]), self.grown())
 
     def save(self, folder: str | os.PathLike[str]) -> None:
@@ -322,9 +323,11 @@ class LiveLog:
         live.tell.notes, live.tell.kinds = notes
         return live
 
-    def _compare(self) -> None:
-        """Compare the track with the odometry over the first scans."""
-        if len(self._scans) > 1 and not self.tell.notes:
+    def compare(self) -> None:
+        """Compare the track with the odometry over the first scans, but not twice over the same."""
+        count = len(self._scans)
+        if 1 < count <= COMPARED and count != self._compared and not self.tell.notes:
+            self._compared = count
             begun = replace(self.log, scans=self._scans[:COMPARED])
             note = odometers.disagreement(begun, self._done.track)
             self.tell([note] if note else [])

@@ -599,8 +599,12 @@ class LiveSession:
         self._say, self._search, self._saved, self._failed = say, MapSearch(), 0.0, False
 
     def take(self, scan: Scan) -> RobotSeen:
-        """Add the next scan."""
-        self.seen = self.mapper.observe(scan)
+        """Add the next scan. Say when it becomes known where the robot is on the map."""
+        before, self.seen = self.seen, self.mapper.observe(scan)
+        was_on_map = before is not None and before.on_map is not None
+        if self.seen.on_map is not None and not was_on_map:
+            x, y, _ = self.seen.on_map
+            self._tell(f"the robot is located at ({x:.1f}, {y:.1f}) on the map")
         return self.seen
 
     def tick(self, wait: float = 0.0) -> bool:
@@ -625,8 +629,11 @@ class LiveSession:
 
     def happened(self, event: Event) -> None:
         """Say an event, and keep it for pages and topics."""
-        self.events.append(str(event))
-        self._say(self.events[-1])
+        self._tell(str(event))
+
+    def _tell(self, text: str) -> None:
+        self.events.append(text)
+        self._say(text)
 
     def state(self) -> dict[str, Any]:
         """The map, the robot and what was said, as plain data for a page.
