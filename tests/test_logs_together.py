@@ -18,9 +18,10 @@ import pytest
 from coarse import every_second_beam
 
 from perception.errors import LogError
-from perception.places.closures import DriveScenes, VisitMatch, agreeing_matches, without_clashes
+from perception.places.closures import VisitMatch
 from perception.places.importing import Imported, import_log, join_logs
 from perception.places.local_map import CELL, LocalScene, Match, Patch
+from perception.places.relations import DriveScenes, agreeing_matches, without_clashes
 from perception.readers.scans import RobotLog
 from perception.readers.writers import write_carmen
 from simulator.tours import record

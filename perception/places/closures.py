@@ -9,18 +9,6 @@ although it is false. It then pulls the track away from where the other closures
 closures are fitted to the track together. A closure is dropped if the fit is much better without
 it.
 
-The frames of two drives are unrelated. So each pair of their visits is matched in all rotations,
-and each reliable match says how the frames relate.
-Before that, the poses of the visits of each drive are fitted to its own closures, as a drift bends
-the track. Places look alike, so a match counts only if at least VOTES visits of the second drive
-agree on one relation, and no other relation has more than half as many. A relation that puts walls
-seen by one drive where the other one saw free space does not count.
-
-Relations of three drives form a loop. The two relations on which most visits agree say what the
-third one is. If no match of the third relation agrees with them, it is not believed.
-
-The parts of a drive before and after a cut of its track are like two drives.
-
 Reference:
     Latif et al. 2013, "Robust loop closing over time for pose graph SLAM" (closures that do not fit
     are found by a fit of the pose graph). Here the leave-one-out chi-square finds them.
@@ -31,10 +19,9 @@ from __future__ import annotations
 import copy
 import math
 from bisect import bisect, bisect_left
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import accumulate, combinations, islice, pairwise
-from statistics import median
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -43,17 +30,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
 from perception.places.distinctive import Visit, patches_of
-from perception.places.local_map import MOST, LocalScene, Match, Patch, Turned, match
+from perception.places.local_map import MOST, LocalScene, Match, Turned, match
 from perception.places.track import (
     Array,
     Track,
     at_end,
     errors_of,
-    points_moved,
-    points_turned,
     seen_from,
 )
-from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.odometry import Pose, moved
 
 # A match is reliable with at least this score and share of area that both maps observed.
@@ -439,299 +423,3 @@ def factor_of(track: Track, visits: Sequence[Visit], closings: Sequence[VisitMat
         best = np.maximum(best, fits)
     best -= (np.log(FACTORS) / CHANGE) ** 2 / 2
     return float(FACTORS[best.argmax()])
-
-
-# A match predicts where the visit of another match is. Two matches agree if this is right to within
-# NEAR metres, plus ASTRAY metres for each metre between the two visits, and if their rotations
-# differ by less than TWIST radians.
-NEAR, ASTRAY, TWIST = 0.7, 0.05, math.radians(10)
-VOTES = 3
-TURNS = [k * TURN for k in range(round(math.tau / TURN))]
-# A relation puts visits of two drives near each other. It clashes if, for most pairs of visits at
-# most BESIDE metres apart, more than the share CLASHING of the wall points of the two visits lies
-# in free space of the other one.
-BESIDE, CLASHING = 6.0, 0.1
-# Of a drive with cuts, at most this many visits are matched, as the time grows with the square.
-MATCHED = 200
-
-
-@dataclass(frozen=True, eq=False)
-class DriveScenes:
-    """The visits of a drive, prepared for matching."""
-
-    scenes: Sequence[LocalScene]  # the local map of each visit
-    poses: Array  # (n, 3) poses of the visits, as `fitted_poses` returns them
-
-    @staticmethod
-    def of(visits: Sequence[Visit], poses: Array) -> DriveScenes:
-        """Prepare the local map of each visit."""
-        pairs = zip(patches_of(visits), visits, strict=True)
-        return DriveScenes([LocalScene.of(patch, visit.middle) for patch, visit in pairs], poses)
-
-
-def closures_between(
-    drives: Sequence[Sequence[Visit]], poses: Sequence[Array]
-) -> Iterator[VisitMatch]:
-    """Yield the closures between drives, with visits numbered over all drives.
-
-    `poses` has, for each drive, the poses of its visits, as `fitted_poses` returns them.
-    """
-    parts = [*map(DriveScenes.of, drives, poses)]
-    counts = [0, *accumulate(len(visits) for visits in drives)]
-    found = {
-        (a, b): without_clashes(_reliable_matches(parts[a], parts[b]), parts[a], parts[b])
-        for a, b in combinations(range(len(drives)), 2)
-    }
-    for (a, b), agreed in agreeing_matches(poses, found).items():
-        for closing in _best_of_each_visit(agreed):
-            yield replace(closing, first=closing.first + counts[a], last=closing.last + counts[b])
-
-
-def closures_across_cuts(track: Track, visits: Sequence[Visit], poses: Array) -> list[VisitMatch]:
-    """Find the closures between visits before and after cuts of the track of one drive.
-
-    `poses` has the poses of the visits, as `fitted_poses` returns them.
-    """
-    if not track.cuts:
-        return []
-    some = range(0, len(visits), 1 + len(visits) // MATCHED)
-    cuts_before = np.searchsorted(track.cuts, [visits[k].scan for k in some], "right").tolist()
-    parts = gathered(zip(cuts_before, some, strict=True)).values()
-    drives = [[visits[k] for k in part] for part in parts]
-    return [
-        replace(closing, first=some[closing.first], last=some[closing.last])
-        for closing in closures_between(drives, [poses[part] for part in parts])
-    ]
-
-
-class Relocation:
-    """Finds where a robot is that may be anywhere among known visits, while it drives.
-
-    It compares local maps along the new trajectory, its stations, with those of the visits. The
-    robot is located when the matches of enough stations agree, as those of two drives have to.
-
-    Args:
-        visits: The known visits, with their local maps.
-        poses: (n, 3) the poses of the visits, as `fitted_poses` returns them.
-    """
-
-    def __init__(self, visits: Sequence[Visit], poses: Array) -> None:
-        some = slice(None, None, 1 + len(visits) // MATCHED)
-        self._known = DriveScenes.of(visits[some], poses[some])
-        self._scenes, self._poses = list[LocalScene](), list[Array]()  # of the stations
-        self._found: list[VisitMatch] = []
-        self._matching: Iterator[Match | None] = iter(())
-        self._open = 0  # how many visits the last station was not matched with yet
-
-    @property
-    def is_busy(self) -> bool:
-        """Whether the last station was not matched with all visits yet."""
-        return self._open > 0
-
-    def begin(self, patch: Patch, middle: Array) -> None:
-        """Begin the next station: the local map around `middle`, (x, y) metres on the new track."""
-        self._scenes.append(LocalScene.of(patch, middle))
-        self._poses.append(np.array([*middle, 0.0]))
-        turned = Turned.of(self._scenes[-1], TURNS)
-        self._matching = (match(scene, turned) for scene in self._known.scenes)
-        self._open = len(self._known.scenes)
-
-    def go_on(self, share: float) -> tuple[Pose, Pose] | None:
-        """Match the last station with a share of the visits.
-
-        Returns a pose on the new track, and the same in the frame of the visits; None if it is not
-        known yet where the robot is.
-        """
-        total, last = len(self._known.scenes), len(self._scenes) - 1
-        for matched in islice(self._matching, math.ceil(share * total)):
-            if matched is not None and is_reliable(matched):
-                self._found.append(VisitMatch(total - self._open, last, matched))
-            self._open -= 1
-        return None if self.is_busy else self._located()
-
-    def _located(self) -> tuple[Pose, Pose] | None:
-        known, stations = self._known, DriveScenes(self._scenes, np.array(self._poses))
-        kept = without_clashes(self._found, known, stations)
-        agreed = _largest(kept, _relations(kept, known.poses, stations.poses))
-        if not agreed:
-            return None
-        x, y, _ = here = stations.poses[-1].tolist()
-        at, turn, _ = _relations(agreed, known.poses, stations.poses).placed(here[:2])
-        return (x, y, 0.0), (*at.tolist(), turn)
-
-
-def _reliable_matches(ours: DriveScenes, theirs: DriveScenes) -> list[VisitMatch]:
-    """Match each visit of a drive with each visit of an earlier one, in all rotations."""
-    found: list[VisitMatch] = []
-    for j, scene in enumerate(theirs.scenes):
-        turned = Turned.of(scene, TURNS)
-        for i, other in enumerate(ours.scenes):
-            matched = match(other, turned)
-            if matched is not None and is_reliable(matched):
-                found.append(VisitMatch(i, j, matched))
-    return found
-
-
-def _best_of_each_visit(agreed: Sequence[VisitMatch]) -> list[VisitMatch]:
-    """Keep the KEPT best matches of each later visit."""
-    kept: list[VisitMatch] = []
-    for j in sorted({closing.last for closing in agreed}):
-        here = [closing for closing in agreed if closing.last == j]
-        kept += sorted(here, key=lambda closing: -closing.match.score)[:KEPT]
-    return kept
-
-
-def agreeing_matches(
-    poses: Sequence[Array], found: Mapping[tuple[int, int], Sequence[VisitMatch]]
-) -> dict[tuple[int, int], list[VisitMatch]]:
-    """Return, for each pair of drives, the matches that agree on the relation of their frames.
-
-    `poses` has the poses of the visits of each drive, as `fitted_poses` returns them.
-
-    If two better supported relations lead from one drive of a pair over a third drive to the other
-    one, some matches must agree with them. Otherwise those that do are kept, if they are enough.
-    """
-    agreed = {
-        (a, b): _largest(some, _relations(some, poses[a], poses[b]))
-        for (a, b), some in found.items()
-    }
-    frames: dict[tuple[int, int], _FrameMatches] = {}  # of the relations that are believed
-    for a, b in sorted(agreed, key=lambda pair: -_votes(agreed[pair])):
-        here = _relations(found[a, b], poses[a], poses[b])
-        ways = [
-            (frames[c, b], frames[a, c])
-            for c in range(len(poses))
-            if (c, b) in frames and (a, c) in frames
-        ]
-        if ways:
-            over, back = max(ways, key=lambda way: min(len(way[0].turns), len(way[1].turns)))
-            fits = here.fitting(over, back)
-            fitting = [one for one, fit in zip(found[a, b], fits, strict=True) if fit]
-            if not any(one in fitting for one in agreed[a, b]):
-                agreed[a, b] = fitting if _votes(fitting) >= VOTES else []
-        if agreed[a, b]:
-            frames[a, b] = _relations(agreed[a, b], poses[a], poses[b])
-            frames[b, a] = frames[a, b].inverse()
-    return agreed
-
-
-def without_clashes(
-    found: Sequence[VisitMatch], ours: DriveScenes, theirs: DriveScenes
-) -> list[VisitMatch]:
-    """Drop the matches of relations that put walls of one drive into free space of the other."""
-    sets, votes = _support(found, _relations(found, ours.poses, theirs.poses))
-    judged, kept = np.zeros(len(found), bool), np.ones(len(found), bool)
-    # Matches that agree are judged together, those on which most visits agree first.
-    for k in sorted(range(len(found)), key=lambda k: -votes[k]):
-        if votes[k] > 1 and not judged[k]:
-            agreed = [found[i] for i in np.flatnonzero(sets[k]).tolist()]
-            shares = _clashes(_relations(agreed, ours.poses, theirs.poses), ours, theirs)
-            if shares and median(shares) > CLASHING:
-                kept[sets[k] & ~judged] = False
-            judged |= sets[k]
-    return [one for one, keep in zip(found, kept, strict=True) if keep]
-
-
-def _clashes(relation: _FrameMatches, ours: DriveScenes, theirs: DriveScenes) -> list[float]:
-    """Return the share of wall points in free space for each pair of visits that are near."""
-    shares = []
-    for scene, (x, y, turned) in zip(theirs.scenes, theirs.poses, strict=True):
-        at, turn, _ = relation.placed(np.array([x, y]))
-        for other, (*middle, bent) in zip(ours.scenes, ours.poses, strict=True):
-            if math.dist(at, middle) < BESIDE:
-                shift = points_turned(-bent, (at - middle)[None])[0]
-                shares.append(other.clash(scene, turn + turned - bent, shift))
-    return [share for share in shares if share is not None]
-
-
-def _votes(matches: Sequence[VisitMatch]) -> int:
-    return len({one.last for one in matches})
-
-
-@dataclass(frozen=True, eq=False)
-class _FrameMatches:
-    """What n matches say about how two frames relate.
-
-    `turns` are rotations of the later frame, in radians. The middle of the later visit is `here` in
-    the earlier frame and `there` in its own, (n, 2) metres.
-    """
-
-    turns: Array
-    here: Array
-    there: Array
-
-    def agreeing(self, k: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Mask of the matches that agree with match k."""
-        onward = self.there - self.there[k]
-        expected = self.here[k] + points_turned(self.turns[k], onward)
-        far = np.hypot(*(self.here - expected).T)
-        twist = np.abs((self.turns - self.turns[k] + math.pi) % math.tau - math.pi)
-        return np.asarray((far < NEAR + ASTRAY * np.hypot(*onward.T)) & (twist < TWIST))
-
-    def inverse(self) -> _FrameMatches:
-        """Return what the matches say if the two drives change places."""
-        return _FrameMatches(-self.turns, self.there, self.here)
-
-    def placed(self, point: Array) -> tuple[Array, float, float]:
-        """Place a point (x, y) of the later frame in the earlier one, by the nearest match.
-
-        Returns the position in metres, the rotation of the match in radians, and how far the point
-        is from the match in metres.
-        """
-        onward = point - self.there
-        far = np.hypot(*onward.T)
-        k = int(np.argmin(far))
-        turn = float(self.turns[k])
-        return self.here[k] + points_turned(turn, onward[k : k + 1])[0], turn, float(far[k])
-
-    def fitting(self, over: _FrameMatches, back: _FrameMatches) -> list[bool]:
-        """Whether each match agrees with two relations that lead over a third drive.
-
-        `over` leads from the later frame to the frame of the third drive, and `back` from there to
-        the earlier frame. Each is taken at its match that is nearest.
-        """
-        found = []
-        for turn, here, at in zip(self.turns, self.here, self.there, strict=True):
-            point, reach, twist = at, 2 * NEAR, turn
-            for relation in (over, back):
-                point, turned, far = relation.placed(point)
-                reach += ASTRAY * far
-                twist -= turned
-            twist = abs((twist + math.pi) % math.tau - math.pi)
-            found.append(bool(math.dist(point, here) < reach and twist < 2 * TWIST))
-        return found
-
-
-def _relations(found: Sequence[VisitMatch], first: Array, last: Array) -> _FrameMatches:
-    """Collect what matches between the visits of two drives say about their frames.
-
-    `first` and `last` have the poses of the visits of each drive, (n, 3).
-    """
-    at, there = first[[one.first for one in found]], last[[one.last for one in found]]
-    seen = [points_moved(pose, one.match.shift) for pose, one in zip(at, found, strict=True)]
-    turns = np.array([one.match.turn for one in found]) + at[:, 2] - there[:, 2]
-    return _FrameMatches(turns, np.array(seen).reshape(-1, 2), there[:, :2])
-
-
-def _largest(found: Sequence[VisitMatch], relations: _FrameMatches) -> list[VisitMatch]:
-    """Find the relation of the frames on which most matches agree, and list these matches.
-
-    The list is empty if too few visits agree, or if another relation has more than half as many.
-    """
-    sets, votes = _support(found, relations)
-    most = max(votes, default=0)
-    if most < VOTES:
-        return []
-    best = sets[votes.index(most)]
-    if max((votes[k] for k in np.flatnonzero(~best)), default=0) > most / 2:
-        return []
-    return [found[k] for k in np.flatnonzero(best).tolist()]
-
-
-def _support(
-    found: Sequence[VisitMatch], relations: _FrameMatches
-) -> tuple[list[np.ndarray[tuple[int], np.dtype[np.bool_]]], list[int]]:
-    """For each match, return which matches agree with it, and how many later visits these have."""
-    visits = np.array([one.last for one in found], int)
-    sets = [relations.agreeing(k) for k in range(len(found))]
-    return sets, [len(np.unique(visits[mask])) for mask in sets]

@@ -29,7 +29,7 @@ import numpy as np
 
 from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning, LogError
-from perception.places import closures, following, log_checks, odometers
+from perception.places import closures, following, log_checks, odometers, relations
 from perception.places.distinctive import WIDTH, WINDOW, Visit, find_visits
 from perception.places.partings import with_partings
 from perception.places.tracing import closure_of, starts_of_drives, to_trace
@@ -177,7 +177,7 @@ def assembled(
     with _timed(seconds, "trace"):
         if closings is None:
             closings = closures.find_closures(track, visits, 2 * WINDOW)
-        track, visits, closings, poses = fitted(track, visits, closings)
+        track, visits, closings, poses = with_poses(track, visits, closings)
         trace = to_trace(log, track, visits, closings, name)
     with _timed(seconds, "views"):
         trace = with_views(trace)
@@ -185,13 +185,13 @@ def assembled(
     return Imported(trace, track, width, visits, seconds, notes, starts, poses)
 
 
-def fitted(
+def with_poses(
     track: Track, visits: Sequence[Visit], closings: Sequence[closures.VisitMatch]
 ) -> tuple[Track, tuple[Visit, ...], list[closures.VisitMatch], Array]:
     """As `placed`, with the closures across cuts of the track and the poses of the visits."""
     track, visits, closings = placed(track, visits, closings)
     poses = closures.fitted_poses(track, visits, closings)
-    if across := closures.closures_across_cuts(track, visits, poses):
+    if across := relations.closures_across_cuts(track, visits, poses):
         closings += across
         poses = closures.fitted_poses(track, visits, closings)
     return track, visits, closings, poses
@@ -310,7 +310,7 @@ def join_logs(logs: Sequence[RobotLog], parts: Sequence[Imported]) -> tuple[Robo
     begin = time.process_time()
     arrivals = _arrivals(trace, track, visits)
     drives = [part.visits for part in parts], [part.poses for part in parts]
-    closings = closures.closures_between(*drives)
+    closings = relations.closures_between(*drives)
     found = [closure_of(closing, arrivals) for closing in closings]
     seconds = {
         stage: round(math.fsum(part.seconds[stage] for part in parts), 3)

@@ -26,19 +26,20 @@ import numpy as np
 
 from perception.errors import LogError
 from perception.places import log_checks, odometers
-from perception.places.closures import ClosureFinder, Relocation, fitted_poses
+from perception.places.closures import ClosureFinder, fitted_poses
 from perception.places.distinctive import WIDTH, WINDOW, Visit, VisitFinder
 from perception.places.following import Followed, Follower, GrowingTrack
 from perception.places.importing import (
     Grown,
     Imported,
     Tell,
-    fitted,
     import_log,
     placed,
     tell_nobody,
+    with_poses,
 )
 from perception.places.local_map import Patch
+from perception.places.relations import Relocation
 from perception.places.saved import Folder
 from perception.places.track import Array
 from perception.readers.scans import Damage, RobotLog, Scan, ScanTable
@@ -279,7 +280,7 @@ class LiveLog:
         These are the largest part of the map that closures connect: only they have one frame.
         """
         grown = self.grown()
-        track, visits, closings, poses = fitted(grown.track, grown.visits, grown.closings)
+        track, visits, closings, poses = with_poses(grown.track, grown.visits, grown.closings)
         linked = nx.Graph()
         linked.add_nodes_from(part_of := [bisect(track.breaks, visit.scan) for visit in visits])
         linked.add_edges_from((part_of[one.first], part_of[one.last]) for one in closings)

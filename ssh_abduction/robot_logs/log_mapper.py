@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 
 from perception.errors import LogError
-from perception.places.closures import Relocation
 from perception.places.distinctive import WIDTH, Visit
 from perception.places.importing import Grown, Imported, Tell, assembled, tell_nobody
 from perception.places.live import LiveLog, LivePlace
+from perception.places.relations import Relocation
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.checks import an_instance, one_of
 from ssh_abduction.data.errors import named
