@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,13 @@ import pytest
 
 from perception.places.passages import STEP, doors_in, openings_in, resampled
 from ssh_abduction import SSHMap, Trace
-from ssh_abduction.building.derive import with_building
+from ssh_abduction.building.derive import buildings_of, with_building
 from ssh_abduction.building.derived_paths import PRICE, best_pairings, chains_of, sides_of
 from ssh_abduction.building.directions import directions_to
 from ssh_abduction.building.telling import told
 from ssh_abduction.checker.buildings import faults_of_corridors, faults_of_paths
 from ssh_abduction.checker.checker import check
+from ssh_abduction.cli import main
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import DState, Fit, MapPath, Name, Pose, Region
 from ssh_abduction.data.trace import Action, Step
@@ -403,6 +405,24 @@ def test_all_best_pairings_are_listed() -> None:
     found, gaps = best_pairings(ends, {(1, 2): 0.5, (1, 4): 0.5, (2, 4): 4.5}, (), most=0)
     assert found == (((1, 2),), ((1, 4),))
     assert gaps == (0.0, 0.0)
+
+
+def test_all_best_buildings_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A way on forks evenly, so either branch may be its path."""
+    points = [(-8.0, 0.0), (0.0, 0.0), (8.0, 2.0), (8.0, -2.0)]
+    ssh_map, trace = drive(points, [0, 1, 2, 1, 3])
+    found = [*buildings_of(ssh_map, trace)]
+    assert found[0] == with_building(ssh_map, trace)
+    assert [orders(each) for each in found] in (
+        [{(0, 1, 2), (1, 3)}, {(0, 1, 3), (1, 2)}],
+        [{(0, 1, 3), (1, 2)}, {(0, 1, 2), (1, 3)}],
+    )
+    assert all(path.sure == 0.5 for each in found for path in each.paths if len(path.order) == 3)
+    trace.save(tmp_path / "trace.jsonl")
+    ssh_map.save(tmp_path / "map.json")
+    arguments = ["show", str(tmp_path / "map.json"), "--paths", "--trace"]
+    assert main([*arguments, str(tmp_path / "trace.jsonl")]) == 0
+    assert capsys.readouterr().out.count("or, equally good:") == 1
 
 
 def test_edges_of_other_directions_are_not_on_one_path() -> None:

@@ -7,6 +7,7 @@ and its trace, after the search for maps.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 from ssh_abduction.building.edges import FloorPlan
@@ -52,27 +53,45 @@ def with_building(ssh_map: SSHMap, trace: Trace) -> SSHMap:
     Reference:
         Kuipers 2000, "The Spatial Semantic Hierarchy": places, paths and regions.
     """
+    return next(buildings_of(ssh_map, trace))
+
+
+def buildings_of(ssh_map: SSHMap, trace: Trace, most: int = 0) -> Iterator[SSHMap]:
+    """Yield the map with each of its buildings of least cost: `with_building` returns the first.
+
+    They differ where ends of edges can be paired into paths in several equally good ways.
+
+    Args:
+        ssh_map: A map of the trace.
+        trace: The trace.
+        most: How many buildings to list at most; 0 for all.
+
+    Raises:
+        MapError: The map is not of the trace.
+    """
     checked_map(ssh_map)
     check_of_trace([ssh_map], checked_trace(trace), "map", views=False)
     if not ssh_map.places or not ssh_map.fit or not ssh_map.fit.poses:
         note = NO_POSES if ssh_map.places else NO_PLACES
-        return replace(ssh_map, building=Indoors(notes=(note,)), paths=_theory_paths(ssh_map))
+        yield replace(ssh_map, building=Indoors(notes=(note,)), paths=_theory_paths(ssh_map))
+        return
     plan = FloorPlan.of(ssh_map, trace)
     junctions = gathered((name, p) for p, name in plan.name.items()).values()
     listed = tuple(tuple(sorted(some)) for some in junctions if len(some) > 1)
     if not plan.edges:
         empty = Indoors(junctions=listed, notes=(NO_TRAVEL,))
-        return replace(ssh_map, building=empty, paths=_theory_paths(ssh_map))
+        yield replace(ssh_map, building=empty, paths=_theory_paths(ssh_map))
+        return
     room = room_of_places(plan)
     doors = with_doors(plan, room, ssh_map) if plan.measured else ()
-    ways = ways_of(plan)
-    paths = paths_of(plan, ways)
-    corridors = corridors_of(plan, ways, paths)
-    rooms = rooms_of(plan, room, doors, corridors) if plan.measured else ()
     scanned = any("course" in step.extra for step in trace.steps)
     notes = () if plan.measured else (NO_WIDTHS if scanned else NO_SCANS,)
-    building = Indoors(corridors, rooms, doors, listed, notes)
-    return replace(ssh_map, building=building, paths=_theory_paths(ssh_map) or paths)
+    for ways in ways_of(plan, most):
+        paths = paths_of(plan, ways)
+        corridors = corridors_of(plan, ways, paths)
+        rooms = rooms_of(plan, room, doors, corridors) if plan.measured else ()
+        building = Indoors(corridors, rooms, doors, listed, notes)
+        yield replace(ssh_map, building=building, paths=_theory_paths(ssh_map) or paths)
 
 
 def _theory_paths(ssh_map: SSHMap) -> tuple[MapPath, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -89,15 +89,28 @@ class PairedWay:
         return np.concatenate([edge.widths.sum(axis=1) for edge in self.edges])
 
 
-def ways_of(plan: FloorPlan) -> list[PairedWay]:
-    """Find the paths of a plan, the longest first."""
+def ways_of(plan: FloorPlan, most: int = 0) -> Iterator[list[PairedWay]]:
+    """Yield the paths of a plan, the longest first, for each pairing of least cost.
+
+    There are at most `most`, or all for 0.
+    """
     ends = [(2 * x + k, x, edge.ends[k]) for x, edge in enumerate(plan.edges) for k in (0, 1)]
-    (pairing,), gaps = best_pairings(ends, joints(plan), other_directions(plan))
+    costs, apart = joints(plan), [*other_directions(plan)]
+    (best,), gaps = best_pairings(ends, costs, apart)
+    gap_of = dict(zip(map(tuple, chains_of(ends, best)), gaps, strict=True))
+    yield _ways(plan, gap_of)
+    for other in best_pairings(ends, costs, apart, most)[0]:
+        if other != best:  # It costs the same, so paths that only one has are unsure.
+            yield _ways(plan, {c: gap_of.get(c, 0.0) for c in map(tuple, chains_of(ends, other))})
+
+
+def _ways(plan: FloorPlan, gap_of: Mapping[tuple[int, ...], float]) -> list[PairedWay]:
+    """Make the paths of chains of ends, each with its gap."""
     found = []
-    for chain, gap in zip(chains_of(ends, pairing), gaps, strict=True):
+    for chain, gap in gap_of.items():
         edges = [plan.edges[e // 2] for e in chain]
         turned = [x.turned() if e % 2 else x for e, x in zip(chain, edges, strict=True)]
-        found.append(PairedWay(tuple(turned), tuple(chain), gap))
+        found.append(PairedWay(tuple(turned), chain, gap))
     return sorted(found, key=lambda way: (-round(sum(e.length for e in way.edges), 2), way.ends))
 
 

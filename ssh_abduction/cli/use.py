@@ -328,10 +328,16 @@ def run_show(options: argparse.Namespace) -> int:
     """
     listing = shared.listing_of(options.maps)
     if options.paths:
-        from ssh_abduction.building.telling import told  # loads numpy
+        from ssh_abduction.building.derive import buildings_of  # loads numpy
+        from ssh_abduction.building.telling import told
 
         ssh_map = _built(options, listing, listing.maps[listing.number(options.map or "1")])
-        print("\n".join(map(printable, told(ssh_map))))
+        lines = [*told(ssh_map)]
+        print("\n".join(map(printable, lines)))
+        trace = shared.mapped_trace(options.maps, options.trace)
+        for other in [*buildings_of(ssh_map, trace, OTHERS)][1:] if trace else ():
+            print("  or, equally good:")
+            print("\n".join(printable(line) for line in told(other) if line not in lines))
         return 0
     if options.map is not None:
         print(_with_regions(listing.maps[listing.number(options.map)]))
@@ -362,6 +368,8 @@ def _with_regions(ssh_map: SSHMap) -> str:
     return "\n".join([describe(ssh_map), *regions])
 
 
+# The most buildings that `show --paths` lists.
+OTHERS = 10
 # The formats of ssh_abduction.output.export, whose import of networkx would delay all verbs, with
 # the endings of their files.
 FORMATS = {
