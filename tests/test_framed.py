@@ -25,21 +25,12 @@ from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts import number_symbols
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.sources.exact import (
-    choosing,
-    engine,
-    fitting,
-    labels_first,
-)
+from ssh_abduction.solver.sources.exact import choosing, engine, fitting, labels_first
 from ssh_abduction.solver.sources.exact import visit_labels as same
 from ssh_abduction.solver.sources.exact.fitting import Fitting
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes
-from ssh_abduction.solver.sources.exact.visit_labels import (
-    VisitLabels,
-    VisitProgram,
-    batch_facts,
-)
+from ssh_abduction.solver.sources.exact.visit_labels import VisitLabels, VisitProgram, batch_facts
 from ssh_abduction.solver.sources.symbolic.merging import merged
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log

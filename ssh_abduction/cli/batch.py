@@ -27,12 +27,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime import workers
 from ssh_abduction.runtime.program import SIGNALLED
-from ssh_abduction.solution import (
-    Solution,
-    Stop,
-    opening,
-    written_map,
-)
+from ssh_abduction.solution import Solution, Stop, opening, written_map
 from ssh_abduction.solver import Search, Start
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory

@@ -35,13 +35,7 @@ from ssh_abduction.explain.place_reasons import PlaceExplanation, PlaceQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.rivals.listing import Listing, PairInMap
 from ssh_abduction.runtime.program import interrupted_code
-from ssh_abduction.solution import (
-    RESTS_ON,
-    Sharing,
-    Solution,
-    Stop,
-    summary_of,
-)
+from ssh_abduction.solution import RESTS_ON, Sharing, Solution, Stop, summary_of
 from ssh_abduction.solver import Ranking
 from ssh_abduction.theory.fields import AUTO
 from ssh_abduction.theory.settle import settle

@@ -38,20 +38,9 @@ from ssh_abduction.runtime import program
 from ssh_abduction.runtime.clock import POLL, STARVED, counting
 from ssh_abduction.runtime.loggers import PACKAGE, PROGRESS
 from ssh_abduction.runtime.workers import end_all
-from ssh_abduction.solution import (
-    Cost,
-    Solution,
-    Status,
-    Stop,
-)
+from ssh_abduction.solution import Cost, Solution, Status, Stop
 from ssh_abduction.solution import ending as written_ending
-from ssh_abduction.solver import (
-    WAITING,
-    Search,
-    Watch,
-    processor_clock,
-    resident_memory,
-)
+from ssh_abduction.solver import WAITING, Search, Watch, processor_clock, resident_memory
 
 Given: TypeAlias = tuple[SSHMap, Cost | None]
 

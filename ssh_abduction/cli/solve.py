@@ -30,13 +30,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.loggers import begin_stage, stages
-from ssh_abduction.solution import (
-    Solution,
-    Status,
-    Stop,
-    opening,
-    written_map,
-)
+from ssh_abduction.solution import Solution, Status, Stop, opening, written_map
 from ssh_abduction.solver import Search, Start, solve
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 

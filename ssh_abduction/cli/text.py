@@ -20,13 +20,7 @@ from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.output.cards import table_of_dstates
 from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.solution import (
-    Backbone,
-    Solution,
-    Status,
-    stretches,
-    summary_of,
-)
+from ssh_abduction.solution import Backbone, Solution, Status, stretches, summary_of
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Choice, Comparison

@@ -33,14 +33,7 @@ from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
 from ssh_abduction.solution import Progress, Status, Stop
-from ssh_abduction.solver import (
-    LimitError,
-    Search,
-    Start,
-    Watch,
-    check_limit,
-    check_rules,
-)
+from ssh_abduction.solver import LimitError, Search, Start, Watch, check_limit, check_rules
 from ssh_abduction.theory.settle import displacement_of, settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 

@@ -41,12 +41,7 @@ from ssh_abduction.explain.no_map import (
 )
 from ssh_abduction.explain.place_reasons import changes_in_words
 from ssh_abduction.explain.verdict import Derivation, PairExplanation, Side, Verdict
-from ssh_abduction.solution import (
-    EQUAL,
-    Cost,
-    Status,
-    Stop,
-)
+from ssh_abduction.solution import EQUAL, Cost, Status, Stop
 from ssh_abduction.solver import Judging, facts
 from ssh_abduction.theory.fields import EXCUSED
 from ssh_abduction.theory.settle import Problem, displacement_of

@@ -19,22 +19,8 @@ from ssh_abduction.checker.checker import unchecked
 from ssh_abduction.data.groups import firsts, gathered
 from ssh_abduction.data.maps import DState, Fault, SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.solution import (
-    Cost,
-    Effort,
-    Seconds,
-    Solution,
-    Status,
-    Stop,
-)
-from ssh_abduction.solver import (
-    Judging,
-    Search,
-    Sketch,
-    Start,
-    observation,
-    sketch_beyond,
-)
+from ssh_abduction.solution import Cost, Effort, Seconds, Solution, Status, Stop
+from ssh_abduction.solver import Judging, Search, Sketch, Start, observation, sketch_beyond
 from ssh_abduction.theory.evidence import said_by
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.settle import Problem

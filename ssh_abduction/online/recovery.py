@@ -53,14 +53,7 @@ from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.online.keeper import ExtendedMap, Keeper, Seen, StepOptions
 from ssh_abduction.online.localiser import Belief, Chances, Localiser
-from ssh_abduction.solution import (
-    Bound,
-    Effort,
-    Seconds,
-    Solution,
-    Stop,
-    cost_as_counted,
-)
+from ssh_abduction.solution import Bound, Effort, Seconds, Solution, Stop, cost_as_counted
 from ssh_abduction.solver import observation, solve
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory

@@ -59,13 +59,7 @@ from ssh_abduction.data.groups import indices_of, minimal_part
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.words import noun_of
-from ssh_abduction.solution import (
-    SORTS,
-    Sort,
-    key_of,
-    sorts_of,
-    stretches,
-)
+from ssh_abduction.solution import SORTS, Sort, key_of, sorts_of, stretches
 
 Matter: TypeAlias = Literal["faults", "dstates", "places", "paths", "courses"]
 

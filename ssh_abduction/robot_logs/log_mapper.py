@@ -43,12 +43,7 @@ from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_ground import ground_of
 from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solution import Solution
-from ssh_abduction.solver import (
-    LimitError,
-    Watch,
-    in_process,
-    solve,
-)
+from ssh_abduction.solver import LimitError, Watch, in_process, solve
 
 NAMES = "drive.names"
 FORMAT, VERSION, MOST = "ssh-live-names", 2, 2**26
