@@ -24,9 +24,9 @@ Reference:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations, pairwise, permutations
+from itertools import combinations, pairwise
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -77,7 +77,7 @@ _Anchors: TypeAlias = dict[_Pair, list[_Anchor]]
 
 # The width of the beam that maps each drive alone.
 ALONE = 4
-# If a drive stays apart, try this many other maps of it. List this many other ways to join drives.
+# List this many other ways to join drives.
 OTHERS = 2
 # Two dstates may coincide if their headings differ by less than this many radians, and their
 # positions by less than this share of a usual travel.
@@ -119,9 +119,10 @@ class Joining:
         first = sum(len(part.labels) for part in standing)
         drives = [drive for drive in drives_of(self._problem.trace) if drive.first >= first]
         found = [self._alone(drive) for drive in drives]
-        if not all(found):
+        known = [part for part in found if part is not None]
+        if len(known) < len(found):
             return
-        alone = [*standing, *self._connected([part for part, *_ in found])]
+        alone = [*standing, *self._connected(known)]
         anchors = {
             (first, second): self._anchors(first, second)
             for first, second in combinations(alone, 2)
@@ -130,9 +131,6 @@ class Joining:
         starts = sorted(anchors, key=lambda pair: anchors[pair][:1], reverse=True)[:STARTS]
         joined = [self._all_joined(alone, dict(anchors), start) for start in starts]
         best = min(joined, key=_nats_of, default=alone)
-        others = {part: rest for part, *rest in found}
-        while mended := [*self._joined_by_others(best, others)]:
-            best = min(mended, key=_nats_of)
         if len(best) < len(alone):
             yield from self._beside(alone)
         # Rivals of the best map: two more pieces joined, and drives laid in other ways.
@@ -180,20 +178,6 @@ class Joining:
             pair = max(anchors, key=lambda pair: anchors[pair][:1], default=start)
         return parts
 
-    def _joined_by_others(
-        self, parts: Sequence[Hypothesis], others: Mapping[Hypothesis, Sequence[Hypothesis]]
-    ) -> Iterator[list[Hypothesis]]:
-        """Yield ways to join a drive that is apart, if another map of it is taken.
-
-        `others` has the other maps of each drive that cost little more. One of them may be the true
-        one, which the drive alone does not tell.
-        """
-        for part, second in permutations(parts, 2):
-            most = _nats_of([part, second])
-            for other in others.get(part, ()):
-                if (both := self._joined(second, other, most)) is not None:
-                    yield [*(kept for kept in parts if kept not in (part, second)), both]
-
     def _beside(self, parts: Sequence[Hypothesis]) -> Iterator[SSHMap]:
         """Yield a map with these parts as separate pieces, unless it breaks an axiom."""
         whole = parts[0]
@@ -202,23 +186,19 @@ class Joining:
         if ssh_map := self._map(whole):
             yield ssh_map
 
-    def _alone(self, drive: Drive) -> list[Hypothesis]:
-        """Map a drive alone. Return its cheapest maps, the best first; none if none is found.
-
-        Without stars there is one, as so many ways to join maps would make some look good by
-        chance.
-        """
+    def _alone(self, drive: Drive) -> Hypothesis | None:
+        """Map a drive alone. Return its cheapest map; None if none is found."""
         trace = self._problem.trace[drive.first : drive.stop]
         theory = self._problem.theory.of_steps(drive.first, len(trace))
         theory = replace(theory, several_drives=False, changed=0.0)
         problem = Problem.of(trace, theory)
         beam = Beam(problem, Log(trace, theory, problem.pairs), ALONE)
         if next(beam.maps(), None) is None:
-            return []
-        found = beam.hypotheses[: 1 if theory.star == "none" else 1 + OTHERS]
+            return None
+        best = beam.hypotheses[0]
         if beam.refuses:
-            self.broken += found[0].nats - beam.nats_without_axioms()
-        return [self._of_drive(one, drive.first) for one in found]
+            self.broken += best.nats - beam.nats_without_axioms()
+        return self._of_drive(best, drive.first)
 
     def _of_drive(self, found: Hypothesis, first: int) -> Hypothesis:
         """Return a hypothesis about a drive alone as one about the steps of the whole trace."""
