@@ -16,7 +16,7 @@ import numpy as np
 
 from perception.places.passages import STEP, WIDE, resampled
 from ssh_abduction.building.edges import FloorPlan, PlanEdge
-from ssh_abduction.building.free_space import Sight
+from ssh_abduction.building.free_space import FreeView
 from ssh_abduction.building.rooms import LONG
 from ssh_abduction.building.straight_paths import leaving
 from ssh_abduction.building.travels import Array
@@ -205,7 +205,7 @@ class RouteCourse:
         places = (edges[0].ends[0], 0), *zip((e.ends[1] for e in edges), ends, strict=True)
         near = round(BEFORE / STEP)
         last, sides = len(course) - 1, {at + off for at in doors for off in (-near, near)}
-        sight, bends = Sight(edges), [0]
+        sight, bends = FreeView(edges), [0]
         for begin, end in pairwise([0, *sorted(at for at in sides if 0 < at < last), last]):
             bends += (begin + k for k in _bends(course[begin : end + 1], sight))
         widths = np.concatenate([edge.widths for edge in edges])
@@ -297,7 +297,7 @@ class RouteCourse:
         return not np.median(leg) >= WIDE or not there.max(initial=0.0) >= WIDE
 
 
-def _bends(course: Array, sight: Sight) -> Iterator[int]:
+def _bends(course: Array, sight: FreeView) -> Iterator[int]:
     """Yield the points after the first one at which the way has corners, and the last one.
 
     It has the fewest straight legs that are free, and of those ways it is the shortest.

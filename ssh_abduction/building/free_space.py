@@ -44,7 +44,7 @@ def drawn(strips: Sequence[Array], *more: Array) -> tuple[NDArray[np.bool_], Arr
     return free, corner
 
 
-class Sight:
+class FreeView:
     """Which points of a route see each other: all that is between them is free."""
 
     def __init__(self, edges: Sequence[PlanEdge]) -> None:
