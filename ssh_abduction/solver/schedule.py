@@ -103,7 +103,7 @@ WEIGHED = (
     SourceTurn("beam of 1", "up to 2,000 steps", "It finds most true maps.", until=0.7),
     SourceTurn(
         "joint drives",
-        "several drives",
+        "several drives; in logs of robots before the beam of 1",
         "Joined maps of single drives show whether a narrow beam over all drives missed one.",
         until=0.5,
     ),

@@ -86,10 +86,10 @@ class Beams:
         has none.
         """
         theory = self._parts.task.theory
-        most = 1.0
+        most, is_log = 1.0, bool(spreads_of(self._parts.task.trace).any())
         if theory.jumped:
             most = turn("beams with wrong displacements").until
-        elif spreads_of(self._parts.task.trace).any():
+        elif is_log:
             most = turn("beams of logs").until
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         several = bool(theory.several_drives or theory.lifts)
@@ -104,11 +104,12 @@ class Beams:
                 lambda: self._search(width, clashes),
             )
 
+        # Beams of logs seldom end, so joining drives comes first there.
+        first = [beam(widths[0]), Source(turn("joint drives"), lambda: several, self._join)]
         return [
             Source(turn("smoothing"), lambda: True, self._smooth),
             Source(turn("false closures"), self._doubts_closures, self._sort_closures),
-            *map(beam, widths[:1]),
-            Source(turn("joint drives"), lambda: several, self._join),
+            *(first[::-1] if is_log else first),
             *map(beam, widths[1:]),
             Source(
                 turn("beam without axioms"),

@@ -100,7 +100,10 @@ class Explaining:
         poses = self.poses(believed)
         square, nats = poses.likelihood(self.wide)
         # Each true closure is expected to have a chi-square of three.
-        if not n or (square - self.poses(believed, ()).misfit(poses) - 3 * n) / 2 < FAULT:
+        if (
+            not n
+            or (square - self.poses(believed, ()).minimum(poses.best[0])[1] - 3 * n) / 2 < FAULT
+        ):
             return square, nats, believed
         found = self._assigned(n)
         other, cost = self.likelihood(found)
@@ -168,9 +171,7 @@ class Explaining:
         while len(left):
             look_at_clock()
             poses = self.poses(aliases.tolist(), np.setdiff1d(range(n), left))
-            if before is not None:
-                poses.begin_at(before)
-            before = poses
+            before = poses.best[0] if before is None else poses.minimum(before)[0]
             known = range(1, _count(aliases.tolist()) + 1)
             ways = np.array([0, *known, *(-k for k in known)])
             others = []
@@ -179,7 +180,7 @@ class Explaining:
                 trial[left] = way
                 others.append(self.poses(trial.tolist()))
             rows = len(self.equations.first) - n + left
-            squares, nats = poses.predicting(others, rows, self.wide)
+            squares, nats = poses.predicting(others, rows, self.wide, before)
             way = (squares / 2 + nats).argmin(axis=0)
             cost, sure = (squares / 2 + nats).min(axis=0), nats[way, np.arange(len(left))]
             agree = np.flatnonzero(cost < free[left] + FAULT)

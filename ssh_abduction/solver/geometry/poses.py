@@ -102,16 +102,11 @@ class Poses:
     @cached_property
     def best(self) -> tuple[Array, float]:
         """The unknowns with the least sum of squares, and this sum."""
-        return self._best()
+        return self.minimum(still=STILL)
 
-    def begin_at(self, near: Poses) -> None:
-        """Find the best unknowns only about, beginning at poses with as many unknowns, if any."""
-        if self._size == near._size:
-            self.best = self._best(near.best[0], NEARLY)
-
-    def misfit(self, near: Poses | None = None) -> float:
-        """Compute the least chi-square; only about, if begun at poses with the same unknowns."""
-        return self._best(near.best[0], NEARLY)[1] if near else self.best[1]
+    def misfit(self) -> float:
+        """Compute the least chi-square."""
+        return self.best[1]
 
     def likelihood(self, wide: Array) -> tuple[float, float]:
         """Compute the least chi-square, and -log of the marginal likelihood of the displacements.
@@ -122,7 +117,7 @@ class Poses:
         return square, square / 2 + self._volume(unknown, wide)
 
     def predicting(
-        self, others: Sequence[Poses], rows: NDArray[np.int_], wide: Array
+        self, others: Sequence[Poses], rows: NDArray[np.int_], wide: Array, unknown: Array
     ) -> tuple[Array, Array]:
         """Compute how well the best poses predict some equations that they were not fitted to.
 
@@ -130,12 +125,12 @@ class Poses:
             others: Poses with the same unknowns, (m,). They have these equations in different ways.
             rows: The numbers of these equations, (n,).
             wide: As in `likelihood`.
+            unknown: The best unknowns.
 
         Returns:
             The chi-squares, and the nats by which the equations are less surely predicted than by
             their own covariance, each (m, n).
         """
-        unknown = self.best[0]
         factor = self._factored(unknown, wide)
         squares, nats = np.zeros((2, len(others), len(rows)))
         for i, other in enumerate(others):
@@ -157,7 +152,7 @@ class Poses:
         whose values are known, and those whose covariance is wanted. The likelihood is returned
         first, as in `likelihood`.
         """
-        unknown, square = self._best(start, NEARLY)
+        unknown, square = self.minimum(start)
         nats = square / 2 + self._volume(unknown, wide)
         return nats, unknown, self._covariance(unknown, fixed, wanted)
 
@@ -179,12 +174,14 @@ class Poses:
         covariance = self._covariance(unknown, fixed, entries)
         return part, unknown[entries], covariance, squares
 
-    def _best(self, start: Array | None = None, still: float = STILL) -> tuple[Array, float]:
+    def minimum(self, start: Array | None = None, still: float = NEARLY) -> tuple[Array, float]:
         """Find the unknowns with the least sum of squares, and this sum.
 
-        `start` has unknowns to begin with; None to compute some. End if a round lowers the sum of
-        squares by less than the share `still`.
+        `start` has unknowns to begin with; None to compute some. They are ignored if they are those
+        of other poses. End if a round lowers the sum by less than the share `still`.
         """
+        if start is not None and len(start) != self._size:
+            return self.best
         unknown = self._begun() if start is None else start
         off = self._residuals(unknown)
         # Levenberg-Marquardt: damp a step more until it lowers the sum of squares.
