@@ -15,9 +15,9 @@ from coarse import every_second_beam, hall
 
 from perception.errors import LogError
 from perception.places import importing, log_checks
-from perception.places.following import scans_after_a_carry
+from perception.places.following import follow, scans_after_a_carry
 from perception.places.importing import import_log, tracked
-from perception.places.track import Track
+from perception.places.track import Track, wrapped
 from perception.readers.echoes import LaserOptions, interpret_log
 from perception.readers.scans import LaserScanner, RobotLog, Scan
 from simulator.robot import meetings
@@ -145,6 +145,31 @@ def test_missing_odometry_does_not_turn_wrongly(scans: Scans) -> None:
     notes = notes_of(with_poses(scans[:150:3], lambda x, y, h: (0.0, 0.0, 0.0)))
     assert "Record the odometry" in notes
     assert "turn differently" not in notes
+
+
+def seen_from(pose: Sequence[float], walls: Sequence[Sequence[float]], line: int) -> Scan:
+    """A scan of 180 beams with a reach of 8 m and an odometer that never moves."""
+    laser = LaserScanner(-math.pi / 2, math.pi / 180, 180, 8.0)
+    met = meetings(np.array(walls), np.array([pose]), laser.bearings).min(axis=2)[0]
+    return Scan(np.where(met < 8, met, np.inf), laser, (0.0, 0.0, 0.0), line=line)
+
+
+def test_scans_far_apart_without_odometry_are_matched() -> None:
+    """Their motion is searched, since an odometer that never moves does not show that it stands."""
+    chance = np.random.default_rng(1)
+    starts = chance.uniform(-9, 9, (40, 2))
+    walls = np.column_stack([starts, starts + chance.uniform(-2, 2, (40, 2))])
+    poses = [(4 * math.sin(a), -4 * math.cos(a), a) for a in np.arange(0, math.tau, 0.3).tolist()]
+    walls = walls[np.abs(np.hypot(*walls.reshape(-1, 2, 2).mean(axis=1).T) - 4) > 1.5]
+    track = follow(RobotLog([seen_from(p, walls, line) for line, p in enumerate(poses, 1)]))
+    assert math.dist(poses[0][:2], poses[1][:2]) > 1.1
+    for k, pair in enumerate(pairwise(poses)):
+        step, seen = (
+            displacement_between(*pair),
+            displacement_between(track.pose(k), track.pose(k + 1)),
+        )
+        assert math.dist(seen[:2], step[:2]) < 0.2
+        assert abs(wrapped(seen[2] - step[2])) < 0.05
 
 
 def one_elsewhere(scans: Scans) -> Scans:

@@ -102,6 +102,13 @@ CONTRARY, CLEAR = 25.0, 0.8
 # In a bare corridor, moving on and standing still match equally well. If their shares of points on
 # walls differ by at most this, the robot is taken to have moved on.
 ALIKE = 0.03
+# Where the odometer is missing, the robot may have moved by AHEAD metres, with standard deviations
+# ANYWHERE in metres and radians. A scan is matched from each of these guesses, with the standard
+# deviations UNKNOWN around it: metres ahead, and radians of a turn on the way. The LIKELIEST
+# matches are compared.
+AHEAD, ANYWHERE = 0.5, (1.5, 0.75, 0.6)
+GUESSES = [(x, math.radians(turn)) for x in (0.0, 1.0, 2.0, 3.0) for turn in range(-75, 76, 15)]
+LIKELIEST = 8
 # Numbers that a growing track keeps for each scan: pose, covariance and share.
 ROW = 3 + 9 + 1
 
@@ -273,12 +280,13 @@ class Follower:
             return Followed(scan, (0.0, 0.0, 0.0)), True
         onward = displacement_between(last.scan.odometry, scan.odometry)
         doubt = Doubt.CARRIED if self.lifted else self._doubt_of(self._count, onward)
-        self.doubts |= {} if doubt is Doubt.NONE else {self._count: doubt}
-        start = self._walls.keys[-1] if doubt is Doubt.NONE else last
+        may_lead = doubt in (Doubt.NONE, Doubt.MISSING)
+        start = self._walls.keys[-1] if may_lead else last
         onward = displacement_between(start.scan.odometry, scan.odometry)
         guess = moved(start.pose, onward)
-        if doubt is Doubt.NONE and start.shows_the_same(scan, onward):
+        if may_lead and start.shows_the_same(scan, onward):
             return Followed(scan, guess, share=start.share), False
+        self.doubts |= {} if doubt is Doubt.NONE else {self._count: doubt}
         if doubt is Doubt.NONE and scan.laser.mount not in self._mounts:
             # The first scan of another laser may show none of the known walls.
             return Followed(scan, guess, odometer_covariance(onward)), True
@@ -330,6 +338,8 @@ class ScanMotion:
             return nowhere
         if doubt is Doubt.UNKNOWN:
             return self._without_odometry() or nowhere
+        if doubt is Doubt.MISSING:
+            return self._searched()
         prior = odometer_covariance(self.onward)
         # An odometer that misses a large turn stands still. In corridors, scans that hardly
         # overlap match as well if they are turned around.
@@ -374,7 +384,7 @@ class ScanMotion:
                     return match[0] * len(self.seen) / TOGETHER - loss
 
                 best = max([*found, *turned], key=gain)
-                if self._intrudes(best[1]):
+                if self._intruding(best[1]) > INTRUDING:
                     best = max(found, key=gain)
                 share, pose, information = best
         covariance = covariance_turned(-self.last[2], _accumulating(information, weight))
@@ -384,15 +394,48 @@ class ScanMotion:
             covariance += np.diag(off**2)
         return (float(pose[0]), float(pose[1]), wrapped(float(pose[2]))), covariance, share
 
-    def _intrudes(self, pose: Array) -> bool:
-        """Whether a pose puts walls into free space that the last keyframes saw, or vice versa."""
+    def _intruding(self, pose: Array) -> float:
+        """The share of points of the scan, at a pose, and of the last keyframes in free space."""
         at: Pose = (float(pose[0]), float(pose[1]), float(pose[2]))
         inside = seen = 0
         for key in self.keys:
             one, other = (self.scan, at), (key.scan, key.pose)
             for masks in (_in_free_space(*one, *other), _in_free_space(*other, *one)):
                 inside, seen = inside + int(masks[0].sum()), seen + int(masks[1].sum())
-        return inside > INTRUDING * seen
+        return inside / max(seen, 1)
+
+    def _searched(self) -> Followed:
+        """Match the scan from many guesses, as the odometer does not say how the robot moved.
+
+        The covariance is that of the best match, and how far other matches are from it, each
+        weighed by its likelihood.
+        """
+        walls, turned = Surfaces.joined(self.recent), self.last[2]
+        prior, near = (
+            np.asarray(np.linalg.inv(covariance_turned(turned, np.diag(spread) ** 2)))
+            for spread in (ANYWHERE, UNKNOWN)
+        )
+        middle = np.array(moved(self.last, (AHEAD, 0.0, 0.0)))
+        if not (len(walls) and len(self.seen)):
+            return Followed(self.scan, self.last, np.diag(ANYWHERE) ** 2, 0.0)
+        fit = ScanFit(self.seen.some(POINTS), walls)
+        independent = len(self.seen) / TOGETHER
+        found = []
+        for far, turn in GUESSES:
+            onward = (far * math.cos(turn / 2), far * math.sin(turn / 2), turn)
+            share, pose, information = fit.improved(np.array(moved(self.last, onward)), near)
+            gain = share * independent - _square(pose, middle, prior) / 2
+            found.append((gain, share, pose, information))
+        found = sorted(found, key=lambda match: -match[0])[:LIKELIEST]
+        gains = np.array([match[0] - self._intruding(match[2]) * independent for match in found])
+        _, share, pose, information = found[int(gains.argmax())]
+        off = errors_of(np.array([match[2] for match in found]), pose)
+        off[:, :2] = points_turned(-turned, off[:, :2])
+        weights = np.exp(gains - gains.max())
+        covariance = covariance_turned(-turned, _accumulating(information, near))
+        covariance += np.einsum("m,mi,mj->ij", weights / weights.sum(), off, off)
+        x, y, heading = pose.tolist()
+        return Followed(self.scan, (x, y, wrapped(heading)), covariance, share)
 
     def _without_odometry(self) -> Followed | None:
         """Match the scan without odometry; None if it does not match.

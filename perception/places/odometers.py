@@ -288,6 +288,7 @@ class Doubt(Enum):
     SEAM = "a drive seems to begin: the step is unknown unless the scan matches at its end"
     DOUBTFUL = "the step is long: it is a jump if the scan matches only near the previous pose"
     UNKNOWN = "the odometer jumped, or missed a motion"
+    MISSING = "the odometer stands still in most steps, so it does not show that the robot stands"
     CARRIED = "the robot was carried while nothing was logged"
 
 
@@ -300,10 +301,14 @@ class LiveJumps:
 
     def __init__(self) -> None:
         self._steps: deque[float] = deque(maxlen=LATELY)
+        self._count = self._still = 0  # steps so far, and those in which the odometer stands still
 
     def __call__(self, scan: int, onward: Pose) -> Doubt:
         """Judge the step to the scan with this index, from its motion in metres and radians."""
-        far = math.hypot(*onward[:2])
+        far, stands = math.hypot(*onward[:2]), max(map(abs, onward)) < STILL
+        self._count, self._still = self._count + 1, self._still + stands
+        if stands and self._still > MISSING * self._count:
+            return Doubt.MISSING
         usual = float(np.median(self._steps)) if self._steps else 0.0
         least = max(FAR, UNUSUAL * usual)
         if far > 0:
@@ -334,6 +339,7 @@ def doubts_of(log: RobotLog) -> tuple[dict[int, Doubt], list[tuple[int, int]]]:
     doubts: dict[int, Doubt] = {}
     # The last doubt about a step counts.
     for scans, doubt in (
+        (_targets(stands_still(log)) if is_missing(log) else (), Doubt.MISSING),
         (_targets(doubtful), Doubt.DOUBTFUL),
         (restarted.union(scan for scan, _ in seams_of(log)), Doubt.SEAM),
         (_targets(jumped) | moved, Doubt.UNKNOWN),
