@@ -564,7 +564,7 @@ def test_ctrl_c_ends_the_processes_and_prints_their_maps(
         out, err = process.communicate(timeout=100)
     assert process.returncode == 130
     lines = [first, *out.splitlines()]
-    assert first.startswith("quick.jsonl: 4 places")
+    assert first.startswith("quick.jsonl: 5 places. Proven minimal")
     unfinished = len(paths) - sum("(interrupted)" not in line for line in lines)
     assert err == f"ssh-abduction: interrupted: {unfinished} of 5 traces not finished\n"
     assert re.match(r"slow.jsonl: \w+.*\(interrupted\)", lines[1])

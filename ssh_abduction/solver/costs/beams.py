@@ -105,7 +105,7 @@ class Beams:
             )
 
         # Beams of logs seldom end, so joining drives comes first there.
-        first = [beam(widths[0]), Source(turn("joint drives"), lambda: several, self._join)]
+        first = [*map(beam, widths[:1]), Source(turn("joint drives"), lambda: several, self._join)]
         return [
             Source(turn("smoothing"), lambda: True, self._smooth),
             Source(turn("false closures"), self._doubts_closures, self._sort_closures),
