@@ -3,6 +3,7 @@ odometers."""
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -18,7 +19,7 @@ from perception.errors import LogError
 from perception.places import importing
 from perception.places.distinctive import Visit
 from perception.places.following import turned_wrongly
-from perception.places.importing import import_log, tracked
+from perception.places.importing import import_log, in_frame_of, tracked
 from perception.places.odometers import Doubt, describe_cuts, doubts_of, keep_one_source
 from perception.places.tracing import starts_of_drives
 from perception.places.track import Track
@@ -269,3 +270,10 @@ def test_only_a_long_step_of_the_odometer_is_called_a_jump(
     notes = describe_cuts(log, track, [])
     assert sum("The odometry jumps once" in note for note in notes) == jumps
     assert "The scans do not fit those before them, once" in notes[-1]
+
+
+def test_poses_keep_the_frame_of_the_first_visit() -> None:
+    poses = np.array([(1.0, 2.0, 0.5), (4.0, 6.0, 1.0)])
+    found = in_frame_of(np.array([0.0, 0.0, 0.5 - math.pi / 2]), poses)
+    expected = [(0.0, 0.0, 0.5 - math.pi / 2), (4.0, -3.0, 1.0 - math.pi / 2)]
+    np.testing.assert_allclose(found, expected, atol=1e-12)

@@ -33,7 +33,7 @@ from perception.places import closures, following, log_checks, odometers, relati
 from perception.places.distinctive import WIDTH, WINDOW, Visit, find_visits
 from perception.places.partings import with_partings
 from perception.places.tracing import closure_of, starts_of_drives, to_trace
-from perception.places.track import Array, Track
+from perception.places.track import Array, Track, points_turned
 from perception.readers.scans import RobotLog
 from perception.views import ViewClusterer
 from ssh_abduction.data.checks import a_number
@@ -193,8 +193,18 @@ def with_poses(
     poses = closures.fitted_poses(track, visits, closings)
     if across := relations.closures_across_cuts(track, visits, poses):
         closings += across
-        poses = closures.fitted_poses(track, visits, closings)
+        poses = in_frame_of(poses[0], closures.fitted_poses(track, visits, closings))
     return track, visits, closings, poses
+
+
+def in_frame_of(first: Array, poses: Array) -> Array:
+    """Turn and shift poses, (n, 3) metres and radians, so that the first one is `first`.
+
+    Closures fix only how poses lie to each other.
+    """
+    turn = first[2] - poses[0, 2]
+    at = points_turned(turn, poses[:, :2] - poses[0, :2]) + first[:2]
+    return np.column_stack([at, poses[:, 2] + turn])
 
 
 def placed(
