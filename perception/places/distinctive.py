@@ -256,9 +256,12 @@ class _Detector:
         way = recent.way(recent.end - 1) - behind
         if way < 0:
             return None
-        scan = recent.at(way)
-        middle = recent.poses(scan, scan + 1)[0, :2]
-        return self._maps.around(scan, middle, HALF), middle
+        return self._map_at(recent.at(way))
+
+    def _map_at(self, scan: int) -> tuple[Patch, Array]:
+        """The local map around the position of the robot at a scan, and this position."""
+        here = self._recent.poses(scan, scan + 1)[0, :2]
+        return self._maps.around(scan, here, HALF), here
 
     @property
     def _next(self) -> int | None:
@@ -305,8 +308,8 @@ class _Detector:
 
     def _junctions_at(self, scan: int) -> list[Junction]:
         """The junctions near the robot in the local map of a scan, the largest first."""
-        here = self._recent.poses(scan, scan + 1)[0, :2]
-        found = junctions(self._maps.around(scan, here, HALF), self._room)
+        patch, here = self._map_at(scan)
+        found = junctions(patch, self._room)
         near = [junction for junction in found if math.dist(junction.middle, here) <= SEEN]
         return sorted(near, key=lambda junction: -junction.radius)
 

@@ -21,14 +21,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, combinations, islice
+from itertools import accumulate, chain, combinations, islice
 from statistics import median
 
 import numpy as np
 
 from perception.places.closures import KEPT, TURN, VisitMatch, is_reliable
 from perception.places.distinctive import Visit, patches_of
-from perception.places.local_map import LocalScene, Match, Patch, Turned, match
+from perception.places.local_map import LocalScene, Patch, Turned, match
 from perception.places.track import Array, Track, points_moved, points_turned
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.odometry import Pose
@@ -112,7 +112,7 @@ class Relocation:
         self._known = DriveScenes.of(visits[some], poses[some])
         self._scenes, self._poses = list[LocalScene](), list[Array]()  # of the stations
         self._found: list[VisitMatch] = []
-        self._matching: Iterator[Match | None] = iter(())
+        self._matching: Iterator[VisitMatch | None] = iter(())
         self._open = 0  # how many visits the last station was not matched with yet
 
     @property
@@ -124,8 +124,8 @@ class Relocation:
         """Begin the next station: the local map around `middle`, (x, y) metres on the new track."""
         self._scenes.append(LocalScene.of(patch, middle))
         self._poses.append(np.array([*middle, 0.0]))
-        turned = Turned.of(self._scenes[-1], TURNS)
-        self._matching = (match(scene, turned) for scene in self._known.scenes)
+        number = len(self._scenes) - 1
+        self._matching = _matched(self._known.scenes, self._scenes[number], number)
         self._open = len(self._known.scenes)
 
     def go_on(self, share: float) -> tuple[Pose, Pose] | None:
@@ -134,10 +134,8 @@ class Relocation:
         Returns a pose on the new track, and the same in the frame of the visits; None if it is not
         known yet where the robot is.
         """
-        total, last = len(self._known.scenes), len(self._scenes) - 1
-        for matched in islice(self._matching, math.ceil(share * total)):
-            if matched is not None and is_reliable(matched):
-                self._found.append(VisitMatch(total - self._open, last, matched))
+        for one in islice(self._matching, math.ceil(share * len(self._known.scenes))):
+            self._found += [] if one is None else [one]
             self._open -= 1
         return None if self.is_busy else self._located()
 
@@ -154,14 +152,18 @@ class Relocation:
 
 def _reliable_matches(ours: DriveScenes, theirs: DriveScenes) -> list[VisitMatch]:
     """Match each visit of a drive with each visit of an earlier one, in all rotations."""
-    found: list[VisitMatch] = []
-    for j, scene in enumerate(theirs.scenes):
-        turned = Turned.of(scene, TURNS)
-        for i, other in enumerate(ours.scenes):
-            matched = match(other, turned)
-            if matched is not None and is_reliable(matched):
-                found.append(VisitMatch(i, j, matched))
-    return found
+    each = (_matched(ours.scenes, scene, j) for j, scene in enumerate(theirs.scenes))
+    return [one for one in chain.from_iterable(each) if one is not None]
+
+
+def _matched(
+    scenes: Sequence[LocalScene], scene: LocalScene, number: int
+) -> Iterator[VisitMatch | None]:
+    """Match the scene with this number with each of some, in all rotations; None if unreliable."""
+    turned = Turned.of(scene, TURNS)
+    for i, other in enumerate(scenes):
+        found = match(other, turned)
+        yield VisitMatch(i, number, found) if found is not None and is_reliable(found) else None
 
 
 def _best_of_each_visit(agreed: Sequence[VisitMatch]) -> list[VisitMatch]:
