@@ -58,6 +58,7 @@ class Beams:
         """
         self._parts, self._misfit, self._add = parts, misfit, add
         self._nats, self._believed = best, believed
+        self._is_log = bool(spreads_of(parts.task.trace).any())
         # The cost of the best map of smoothing or a broad beam, and the estimate of it by a beam.
         self._best = math.inf, math.inf
         self.broken = -math.inf
@@ -86,10 +87,10 @@ class Beams:
         has none.
         """
         theory = self._parts.task.theory
-        most, is_log = 1.0, bool(spreads_of(self._parts.task.trace).any())
+        most = 1.0
         if theory.jumped:
             most = turn("beams with wrong displacements").until
-        elif is_log:
+        elif self._is_log:
             most = turn("beams of logs").until
         # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
         several = bool(theory.several_drives or theory.lifts)
@@ -109,7 +110,7 @@ class Beams:
         return [
             Source(turn("smoothing"), lambda: True, self._smooth),
             Source(turn("false closures"), self._doubts_closures, self._sort_closures),
-            *(first[::-1] if is_log else first),
+            *(first[::-1] if self._is_log else first),
             *map(beam, widths[1:]),
             Source(
                 turn("beam without axioms"),
@@ -146,9 +147,9 @@ class Beams:
 
     def _doubts_closures(self) -> bool:
         """Whether closures may be false. Those of a log are trusted until its map does not fit."""
-        trace = self._parts.task.trace
-        trusts = spreads_of(trace).any() and len(self._believed()) == len(trace.closures)
-        return bool(trace.closures) and not trusts
+        closures = self._parts.task.trace.closures
+        trusts = self._is_log and len(self._believed()) == len(closures)
+        return bool(closures) and not trusts
 
     def _is_time_for(self, width: int, last: int, left: float) -> bool:
         """Whether to search with this beam. If only one of both has time, the last one goes first.
