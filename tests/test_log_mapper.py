@@ -70,8 +70,11 @@ def test_saved_drive_goes_on_as_if_it_had_not_ended(scans: tuple[Scan, ...], hou
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (lambda data: data.replace(b'"version": 1', b'"version": 9'), "of version 1, got 9"),
-        (lambda data: b"something", "of version 1, got another file"),
+        (
+            lambda data: data.replace(b'"version": 1', b'"version": 9'),
+            ": expected a state of version 1, got 9; move it away, and start anew$",
+        ),
+        (lambda data: b"something", ": expected a state of version 1, got another file; move it"),
         (lambda data: data[:-5], "got a damaged file"),
         (None, "No such file"),
     ],
@@ -86,8 +89,9 @@ def test_other_states_are_refused(
         state.write_bytes(change(state.read_bytes()))
     else:
         state.unlink()
-    with pytest.raises(LogError, match=told):
+    with pytest.raises(LogError, match=told) as caught:
         OnlineLogMapper.load(tmp_path)
+    assert str(caught.value).count("expected") == 1
 
 
 def test_search_gives_a_map_and_a_belief(scans: tuple[Scan, ...]) -> None:

@@ -206,6 +206,8 @@ class Folder:
                 raise ValueError(f"{named(self.path / SCANS)} is too short")
             scans, track = self._read(np.frombuffer(data, np.float64))
             state = from_bytes(rest[head["lasers"] :], scans)
+        except LogError:
+            raise
         except (
             OSError,
             ValueError,
