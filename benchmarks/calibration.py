@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import random
 import statistics
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
 from arguments import add_number
-from truth import Known, Noise, aces3, is_true, mazes, partition, plans
+from truth import Known, aces3, is_true, mazes, noise_of, partition, plans
 
 from ssh_abduction import Theory, solve
 from ssh_abduction.data import Odometry
@@ -30,16 +29,10 @@ THEORIES = {"views": Theory.topological().replace(star="none"), "stars": Theory.
 HEAD = "| confidence | answers | mean | true | true map listed |\n|---|---|---|---|---|"
 
 
-def noise_of(seed: int) -> Noise:
-    """Draw the errors of scale and drift by the default standard deviations."""
-    odometry, chance = Odometry(), random.Random(seed)
-    return Noise(odometry, chance.gauss(0, odometry.scale), chance.gauss(0, odometry.bend))
-
-
 def traces(seeds: Sequence[int], folder: Path | None) -> Iterator[Known]:
     """Yield the traces of each seed."""
     for seed in seeds:
-        noise = noise_of(seed)
+        noise = noise_of(Odometry(), seed)
         yield from chain(mazes(3, 24, [seed], noise), mazes(4, 30, [seed], noise))
         if folder:
             every = [*plans(folder, 24, [seed], noise)] if seed % 8 == 0 else []

@@ -36,12 +36,12 @@ from simulator.robot import Body
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.odometry import NUMBERS, Pose
+from ssh_abduction.data.odometry import Pose
 from ssh_abduction.solution import Status
 from ssh_abduction.solver import find_backbone
 
 ROOT = Path(__file__).parent.parent
-# The default noise: 5 % along the way, 0.5 % across it, and 0.002 rad of heading per metre.
+# A small noise: 5 % along the way, 0.5 % across it, and 0.002 rad of heading per metre.
 NOISE = {
     "along": 0.05,
     "across": 0.005,
@@ -54,6 +54,7 @@ NOISE = {
     "offset": 0.0,
     "facing": 0.0,
 }
+NOISES = {"default": Odometry(), "small": Odometry(**NOISE | {"scale": 0.05, "bend": 0.0035})}
 # The layout of the ACES3 route: x and y of three columns and three rows of places, in metres.
 COLUMNS, ROWS = (-20.0, -1.0, 22.5), (-0.5, -19.0, -39.0)
 ACES3 = {
@@ -89,6 +90,12 @@ class Noise:
     odometry: Odometry
     scale: float = 0.0
     bend: float = 0.0
+
+
+def noise_of(odometry: Odometry, seed: int) -> Noise:
+    """Draw the errors of scale and drift by their standard deviations."""
+    chance = random.Random(seed)
+    return Noise(odometry, chance.gauss(0, odometry.scale), chance.gauss(0, odometry.bend))
 
 
 def partition(names: Sequence[Hashable]) -> tuple[int, ...]:
@@ -268,10 +275,10 @@ class Judged:
     seconds: float
 
 
-def judged(known: Known, theory: Theory, limit: float) -> tuple[str, Judged]:
+def judged(known: Known, theory: Theory, work: float) -> tuple[str, Judged]:
     """Solve a trace, and return a row of the table and what came out."""
     began = time.perf_counter()
-    solution = solve(known.trace, theory, time_limit=limit)
+    solution = solve(known.trace, theory, work_limit=work)
     seconds = time.perf_counter() - began
     true = [is_true(ssh_map, known) for ssh_map in solution.maps]
     all_true = bool(true) and all(true) and (solution.complete or share_all(solution))
@@ -368,7 +375,7 @@ def share_all(solution: Solution) -> bool:
     )
 
 
-def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
+def report(traces: Iterator[Known], theory: Theory, work: float) -> str:
     """Solve each trace, print a row for each, and return the sums."""
     print(
         "| trace | steps | true dstates, places | status | dstates, places, paths | "
@@ -377,7 +384,7 @@ def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
     )
     found = []
     for known in traces:
-        text, one = judged(known, theory, limit)
+        text, one = judged(known, theory, work)
         print(text, flush=True)
         found.append(one)
     if not found:
@@ -435,7 +442,8 @@ def arguments() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="folder of the plans, or of the traces of worlds",
     )
-    add_number(parser, "--limit", "S", 60.0, "seconds for each")
+    parser.add_argument("--noise", choices=NOISES, default="default", help="errors of odometry")
+    add_number(parser, "--work", "W", 6.0, "units of work for each")
     parser.add_argument("--stars", action="store_true", help="give the solver stars, too")
     parser.add_argument(
         "--causal", action="store_true", help="use the causal theory, and judge only dstates"
@@ -450,42 +458,28 @@ def arguments() -> argparse.ArgumentParser:
             metavar="N",
             help=f"faults of this kind in each trace; each costs {price} dstates (default 0)",
         )
-    for name in NUMBERS:
-        parser.add_argument(
-            f"--{name}",
-            type=float,
-            default=NOISE[name],
-            metavar="X",
-            help=f"the field of Odometry (default {NOISE[name]})",
-        )
-    add_number(parser, "--scale-error", "SHARE", 0.0, "report all ways longer by this share")
-    add_number(parser, "--bend-error", "DEGREES", 0.0, "drift of the heading per metre")
     return parser
 
 
 def chosen(options: argparse.Namespace) -> Iterator[Known]:
     """Make the traces that the options ask for."""
-    noise = Noise(
-        Odometry(**{name: getattr(options, name) for name in NUMBERS}),
-        options.scale_error,
-        math.radians(options.bend_error),
-    )
-
-    def seeds(count: int) -> range:
-        return range(options.first, options.first + (options.seeds or count))
-
-    match options.family:
-        case "mazes":
-            return mazes(options.cells, options.steps or 40, seeds(10), noise)
-        case "plans":
-            if not options.folder.is_dir():
-                sys.exit(f"--folder: expected a folder of plans, got {options.folder}; name one")
-            return plans(options.folder, options.steps or 100, seeds(1), noise)
-        case "worlds":
-            return worlds(options.folder)
-        case "aces3":
-            return aces3(seeds(10), noise)
-    return taylor_hall(options.tours, seeds(20), noise)
+    count = options.seeds or {"plans": 1, "taylor-hall": 20}.get(options.family, 10)
+    if options.family == "worlds":
+        yield from worlds(options.folder)
+        return
+    if options.family == "plans" and not options.folder.is_dir():
+        sys.exit(f"--folder: expected a folder of plans, got {options.folder}; name one")
+    for seed in range(options.first, options.first + count):
+        noise = noise_of(NOISES[options.noise], seed)
+        match options.family:
+            case "mazes":
+                yield from mazes(options.cells, options.steps or 40, [seed], noise)
+            case "plans":
+                yield from plans(options.folder, options.steps or 100, [seed], noise)
+            case "aces3":
+                yield from aces3([seed], noise)
+            case _:
+                yield from taylor_hall(options.tours, [seed], noise)
 
 
 def main() -> None:
@@ -505,7 +499,7 @@ def main() -> None:
         with_faults(known, options.misread, options.jumped, options.first + i)
         for i, known in enumerate(chosen(options))
     )
-    print(f"\n{report(traces, theory, options.limit)}")
+    print(f"\n{report(traces, theory, options.work)}")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from dataclasses import replace
 from itertools import combinations
@@ -228,7 +229,7 @@ def test_maps_of_logs_name_doubtful_joins() -> None:
     line = question._answer(0, ["a.log"], done, None, time.monotonic() - 60).line
     assert line.startswith(f"a.log: {solution.verdict}\n  optimal: ")
     assert TOLD in line
-    assert line.endswith("; 60.0 s")
+    assert re.search(r"; 6\d\.\d s$", line)
     # Neither the second part of x nor the log that is named like one confuses their sources.
     drives = [{"name": name} for name in ("x", "x part 3", "x part 2")]
     files["run.json"] = json.dumps({"log": {}, "drives": drives}).encode()
