@@ -22,6 +22,7 @@ TURN, SHIFT = cmath.rect(1, 0.7), 30 - 12j
 # The places of the map, in the order of first visits.
 AT = [complex(*CROSS[p]) for p in (0, 1, 4, 2, 5, 3)]
 MOVED = [TURN * z + SHIFT for z in AT]
+POINTS = [(AT[0], MOVED[0]), (AT[5], MOVED[5])]
 
 
 def written(folder: Path, text: str) -> str:
@@ -41,6 +42,7 @@ def points_of(capsys: pytest.CaptureFixture[str], *words: str) -> list[complex]:
     "rows",
     [
         ["place,x,y", *(f"p{p},{MOVED[p].real},{MOVED[p].imag}" for p in (0, 2, 5))],
+        ["map_x,map_y,x,y", *(f"{z.real},{z.imag},{w.real},{w.imag}" for z, w in POINTS)],
         ["step, x, y", *(f"{t},{MOVED[p].real},{MOVED[p].imag}" for t, p in ((0, 0), (2, 2)))],
         [
             "# a pose with a yaw says all",
@@ -62,6 +64,12 @@ def test_origin_is_the_pose_of_the_first_dstate(
 ) -> None:
     found = points_of(capsys, str(house), "--origin", f"30,-12,{math.degrees(0.7)}")
     assert np.allclose(sorted(found, key=abs), sorted(MOVED, key=abs), atol=1e-3)
+
+
+def test_scale_says_how_much_longer_distances_are() -> None:
+    frame = MapFrame.of_points({"a": (0j, 0j), "b": (10j, 12 + 0j)})
+    assert math.isclose(frame.scale, 1.2)
+    assert [metres for _, metres in frame.residuals] == pytest.approx([1, 1])
 
 
 def test_rooms_and_doors_move_with_the_places(house: Path) -> None:

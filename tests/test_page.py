@@ -26,6 +26,7 @@ from in_processes import until
 from ssh_abduction import Localiser, Solution, SSHMap, Theory, Trace, solve, view_page
 from ssh_abduction.cli import main
 from ssh_abduction.cli.correct import correct_pair
+from ssh_abduction.cli.use import write_frame
 from ssh_abduction.data import Action, DState, MapError, Step, TraceError, together
 from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
@@ -706,6 +707,26 @@ def test_server_writes_what_a_person_says_of_two_steps(
             served.answer("correct", {"kind": "elsewhere", "pair": [0, 1]}, watch)
 
 
+def test_server_writes_the_frame_of_two_points(house: Path) -> None:
+    maps = str(house / "maps.json")
+    solution, trace = Solution.load(maps), Trace.load(house / "trace.jsonl")
+    with PageServer(Listing.of(solution), trace, frame=partial(write_frame, maps)) as served:
+        watch, points = Watch(None), [[0, 0, 1, 1], [4, 0, 1, 6]]
+        told = served.answer("frame", {"points": points}, watch)["text"]
+        assert "at most 0.50 m" in told
+        assert "1.250 times" in told
+        assert "--frame-of" in told
+        assert main(["export", maps, "--to", "nav2", "--frame-of", str(house / "frame.csv")]) == 0
+        for wrong in ([[0, 0, 1, 1]], [[0, 0, 1]], [[0, 0, 1, None], [4, 0, 1, 6]], None):
+            with pytest.raises(MapError, match="expected"):
+                served.answer("frame", {"points": wrong}, watch)
+        (house / "frame.csv").write_text("mine")
+        with pytest.raises(MapError, match="another file; move it"):
+            served.answer("frame", {"points": points}, watch)
+        assert (house / "frame.csv").read_text() == "mine"
+        (house / "frame.csv").unlink()
+
+
 def test_view_refuses_a_used_port_and_other_folders(
     house: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -723,6 +744,8 @@ def test_view_refuses_a_used_port_and_other_folders(
 
 
 def test_page_over_walls_in_the_browser(browser: Any, house: Path) -> None:
+    from selenium.webdriver import ActionChains
+
     page = Shown(browser, (house / "page.html").as_uri())
     assert browser.find_elements("css selector", ".walls")
     assert browser.find_elements("css selector", ".ground .street")
@@ -742,4 +765,18 @@ def test_page_over_walls_in_the_browser(browser: Any, house: Path) -> None:
     before = browser.execute_script("return camera.dx")
     browser.switch_to.active_element.send_keys("\ue014")  # the right arrow
     assert browser.execute_script("return camera.dx") == before - 60
+    page["slider"].send_keys("\ue013")  # the arrow key leads to the previous step
+    browser.execute_script("setScan(data.ground.at[1] - 1)")
+    assert browser.execute_script("return state.step") == 0
+    assert page.drawn(".laser").get_attribute("d") != ""
+    browser.execute_script("document.querySelector('#framed details').open = true")
+    for row in browser.find_elements("css selector", "#points fieldset"):
+        row.find_element("css selector", "button").click()
+        drawing = page.drawn("#drawings svg")
+        y = 60 if row.text.startswith("Point 1") else -60
+        ActionChains(browser).move_to_element_with_offset(drawing, 0, y).click().perform()
+        browser.switch_to.active_element.send_keys("3\t4" if y == 60 else "3\t14")
+    page.click("frame")
+    assert "printf 'map_x,map_y,x,y" in page["framing"].text
+    assert len(browser.find_elements("css selector", ".point")) == 2
     assert page.complaints == []

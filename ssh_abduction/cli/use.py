@@ -410,7 +410,8 @@ FORMATS = {
         "--set frame TEXT=map": "the name of the coordinate frame in nav2 and tmap2 files",
         "--frame-of CSV": (
             "put the map into the frame of the poses in this file: lines place,x,y or step,x,y or "
-            "time,x,y, each perhaps with yaw in radians. How far the points are off is printed"
+            "time,x,y, each perhaps with yaw in radians, or map_x,map_y,x,y, as the page writes "
+            "them. How far the points are off is printed"
         ),
         "--origin X,Y,DEGREES": (
             "put the map into another frame, in which its first dstate has this pose",
@@ -486,6 +487,23 @@ def _framed(options: argparse.Namespace, listing: Listing, ssh_map: SSHMap) -> S
     frame = frame_of_file(options.frame_of, ssh_map, trace, drives)
     print(printable(f"{named(options.frame_of)}: {frame.sentence}"), file=sys.stderr)
     return frame.moved(ssh_map)
+
+
+def write_frame(maps: str, points: Sequence[Sequence[float]]) -> str:
+    """Write points that are known in two maps beside a file of maps, and say how to use them.
+
+    Each point has its position in the map and that in the other map, in metres. Raises MapError.
+    """
+    from ssh_abduction.output.map_frames import write_points
+
+    file = Path(maps).parent / "frame.csv"
+    sentence = write_points(file, points)
+    folder = maps if shared.trace_beside(maps) is None else str(Path(maps).parent)
+    named_files = f"{shlex.quote(folder)} --to nav2 --frame-of {shlex.quote(str(file))}"
+    return (
+        f"{sentence}\nwritten to {named(file)}; to use it: ssh-abduction export {named_files} "
+        "-o graph.geojson"
+    )
 
 
 @verb(
@@ -649,6 +667,7 @@ def _serve(
         time_limit=options.time_limit,
         ground=_ground(options, trace),
         correct=None if options.maps == "-" else partial(correct_pair, options.maps),
+        frame=None if options.maps == "-" else partial(write_frame, options.maps),
     )
     with server:
         print(server.url, flush=True)

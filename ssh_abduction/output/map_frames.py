@@ -1,7 +1,8 @@
 """Move a map into the frame of another map, such as that of Nav2, by points known in both.
 
->>> MapFrame.of_points({"door": (0, 1 + 1j), "desk": (2, 1 + 3j)}).sentence
-'2 points; residuals 0.00 m (root mean square), at most 0.00 m (door)'
+>>> frame = MapFrame.of_points({"door": (0, 1 + 1j), "desk": (2, 1 + 3j)})
+>>> frame.residuals, frame.sentence.split("; ")[2]
+((('door', 0.0), ('desk', 0.0)), 'distances there are 1.000 times those of the map')
 """
 
 from __future__ import annotations
@@ -14,17 +15,18 @@ import os
 from bisect import bisect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from ssh_abduction.data.drives import Drive, step_of
 from ssh_abduction.data.errors import AbductionError, MapError, brief, named
-from ssh_abduction.data.files import read_file
+from ssh_abduction.data.files import read_file, save_file
 from ssh_abduction.data.map_parts import Pose, thing_named
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.layout import fitted_motion, turned_pose
 
-COLUMNS = "place,x,y or step,x,y or time,x,y, each perhaps with yaw"
+COLUMNS = "place,x,y or step,x,y or time,x,y, each perhaps with yaw, or map_x,map_y,x,y"
 LARGEST = 2**26  # bytes of a file of poses
 SECONDS = 1.0  # between two poses of a file, between which a step may lie
 NEAREST = 0.5  # in metres; nearer points say too little about the rotation
@@ -38,11 +40,13 @@ class MapFrame:
         turn: The rotation, a complex number of length 1.
         shift: The origin of the map in the other frame, in metres.
         residuals: How far each point is from where it should be, in metres, by its name.
+        scale: By how much distances between the points are longer in the frame than in the map.
     """
 
     turn: complex
     shift: complex
     residuals: tuple[tuple[str, float], ...] = ()
+    scale: float = 1.0
 
     @classmethod
     def of_origin(cls, x: float, y: float, degrees: float) -> MapFrame:
@@ -67,7 +71,7 @@ class MapFrame:
             )
         turn, shift = fitted_motion([a for a, _ in pairs], [b for _, b in pairs])
         off = {name: abs(turn * a + shift - b) for name, (a, b) in points.items()}
-        return cls(turn, shift, tuple(off.items()))
+        return cls(turn, shift, tuple(off.items()), _extent(pairs, 1) / _extent(pairs, 0))
 
     @property
     def sentence(self) -> str:
@@ -76,7 +80,8 @@ class MapFrame:
         mean = math.sqrt(sum(metres**2 for metres in off) / max(1, len(off)))
         worst, most = max(self.residuals, key=lambda point: point[1], default=("", 0.0))
         said = f"residuals {mean:.2f} m (root mean square), at most {most:.2f} m ({worst})"
-        return f"{len(off)} points; {said}"
+        share = f"distances there are {self.scale:.3f} times those of the map"
+        return f"{len(off)} points; {said}; {share}"
 
     def moved(self, ssh_map: SSHMap) -> SSHMap:
         """Return the same map with its poses, paths, corridors, rooms and doors in this frame.
@@ -114,10 +119,22 @@ class MapFrame:
         )
 
 
+def _extent(pairs: Sequence[tuple[complex, complex]], side: int) -> float:
+    """The root of the sum of squared distances from the middle of the points, in one frame."""
+    middle = sum(pair[side] for pair in pairs) / len(pairs)
+    return math.sqrt(sum(abs(pair[side] - middle) ** 2 for pair in pairs))
+
+
+def has_frame(ssh_map: SSHMap) -> bool:
+    """Whether all poses of a map are in one frame, which can be moved into another one."""
+    one = len(ssh_map.pieces) <= 1 and len(ssh_map.floors) <= 1
+    return one and bool(_poses(ssh_map))
+
+
 def _check(ssh_map: SSHMap) -> None:
-    if not ssh_map.fit or not ssh_map.fit.poses:
+    if not _poses(ssh_map):
         raise MapError("frame: expected a map with poses, got one without; map a robot's log")
-    if len(ssh_map.pieces) > 1 or len(ssh_map.floors) > 1:
+    if not has_frame(ssh_map):
         raise MapError(
             "frame: expected a map of one piece and one floor, got several, each with its own "
             "frame; map the drives of one floor"
@@ -133,9 +150,9 @@ def frame_of_file(
     """Fit a frame to the poses in a CSV file.
 
     The first line has the names of the columns: x and y in metres, perhaps yaw in radians, and
-    `place` (such as p4 or a name that a person gave), `step` (such as 12 or monday:12) or `time`
-    (seconds, as the scans have it; the poses of a localiser, between which those of steps are
-    interpolated). A yaw counts as a second point, a metre ahead.
+    `map_x` and `map_y` (the same point in the map), `place` (such as p4 or a name), `step` (such
+    as 12 or monday:12) or `time` (seconds, as the scans have it; the poses of a localiser, between
+    which those of steps are interpolated). A yaw counts as a second point, a metre ahead.
 
     Args:
         path: The file.
@@ -150,8 +167,9 @@ def frame_of_file(
     data = read_file(path, LARGEST, "a readable file of poses", MapError)
     rows = csv.reader(io.StringIO(data.decode("utf-8-sig", "replace")), skipinitialspace=True)
     header = [name.strip().lower() for name in next(rows, [])]
-    keys = [name for name in ("place", "step", "time") if name in header]
-    if len(keys) != 1 or not {"x", "y"} <= {*header}:
+    keys = [name for name in ("place", "step", "time", "map_x") if name in header]
+    needed = {"x", "y", *(["map_y"] if "map_x" in keys else [])}
+    if len(keys) != 1 or not needed <= {*header}:
         raise MapError(
             f"{named(path)}: line 1: expected the names of columns, {COLUMNS}, got "
             f"{brief(','.join(header))}; write them"
@@ -175,6 +193,24 @@ def frame_of_file(
         return MapFrame.of_points(points)
     except MapError as error:
         raise MapError(f"{named(path)}: {error}") from None
+
+
+def write_points(file: Path, points: Sequence[Sequence[float]]) -> str:
+    """Write points for `frame_of_file`: of each its position in the map and in the frame.
+
+    Returns how well they fit. Raises MapError, also if the file has something else.
+    """
+    pairs = {f"point {k}": (complex(*p[:2]), complex(*p[2:])) for k, p in enumerate(points, 1)}
+    frame = MapFrame.of_points(pairs)
+    head = "map_x,map_y,x,y"
+    if file.exists() and not file.read_bytes().startswith(head.encode()):
+        raise MapError(
+            f"{named(file)}: expected no such file, or points that the page wrote, got another "
+            "file; move it"
+        )
+    rows = [",".join(f"{number:g}" for number in point) for point in points]
+    save_file(file, "\n".join([head, *rows, ""]).encode(), "points", MapError)
+    return frame.sentence
 
 
 class _PoseReader:
@@ -205,9 +241,12 @@ class _PoseReader:
         return at, self.number(row, "yaw") if has_yaw else None
 
     def points(self, row: Sequence[str], line: int) -> dict[str, tuple[complex, complex]]:
-        """Read a row about a place or a step."""
+        """Read a row about a point, a place or a step."""
         at, yaw = self.pose(row)
         text = self.cell(row, self._key)
+        if self._key == "map_x":
+            here = complex(self.number(row, "map_x"), self.number(row, "map_y"))
+            return {f"line {line}": (here, at)}
         label = self._label(text)
         if self._key == "place" and yaw is not None:
             raise MapError("yaw: expected none for a place, which has no heading; name a step")

@@ -40,6 +40,7 @@ from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.output.layout import Layout, drawable_poses, layout
+from ssh_abduction.output.map_frames import has_frame
 from ssh_abduction.output.roads import undecided_places
 from ssh_abduction.output.scene import axes
 from ssh_abduction.rivals.comparison import Choice, compare
@@ -152,6 +153,7 @@ def content_of(
         "overview": overview(maps, spots),
         "ground": ground.seen,
         "indoors": _indoors(maps[0]) if ground.seen else {},
+        "has_frame": has_frame(maps[0]),
         "report": [asdict(section) for section in ground.sections],
     }
 
@@ -632,11 +634,11 @@ def drawn_images(trace: Trace) -> dict[str, Any] | None:
         "first": round(first, 3),
         "step": round(step * every, 4),
         "reach": round(reach, 2),
-        "images": [None if image is None else _text(image[::every] / reach) for image in held],
+        "images": [None if image is None else encoded(image[::every] / reach) for image in held],
     }
 
 
-def _text(shares: NDArray[np.float64]) -> str:
+def encoded(shares: NDArray[np.float64]) -> str:
     """Encode numbers from 0 to 1 as characters. A larger number counts as 1, NaN becomes LOST."""
     last = len(ALPHABET) - 1
     return "".join(

@@ -37,6 +37,7 @@ SCRIPTS = (
     "choosing",
     "replay",
     "pairs",
+    "framing",
     "main",
 )
 # Characters in JSON that could end the script element or a line of the script.

@@ -18,7 +18,7 @@ import select
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -26,7 +26,7 @@ from typing import Any
 
 from ssh_abduction.data.checks import a_list, free_port, one_of
 from ssh_abduction.data.corrections import ASSERTIONS
-from ssh_abduction.data.errors import AbductionError, MapError, brief
+from ssh_abduction.data.errors import AbductionError, MapError, brief, is_finite
 from ssh_abduction.data.schema import FieldReader
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page import answers
@@ -59,6 +59,7 @@ class PageServer(ThreadingHTTPServer):
         ground: What is known of the log of the maps.
         correct: A function that writes what a person says of two steps, by its kind (such as
             "elsewhere") and the steps, and returns a sentence. None if nothing can be written.
+        frame: Likewise, for points that give the frame of another map: four numbers each.
 
     Raises:
         MapError: The maps are not of the trace, or the port is in use or may not be used.
@@ -80,11 +81,12 @@ class PageServer(ThreadingHTTPServer):
         time_limit: float | None = 30.0,
         ground: Ground | None = None,
         correct: Callable[[str, int, int], str] | None = None,
+        frame: Callable[[Sequence[Sequence[float]]], str] | None = None,
     ) -> None:
         self._trace, self._theory, self._maps, self._limit = trace, theory, max_maps, time_limit
         self._listing = listing
         self._run, self._called = run, called or Called(listing.source)
-        self._ground, self._correct = ground, correct
+        self._ground, self._correct, self._frame = ground, correct, frame
         self.page = html_of(self._content(listing), served=True).encode()
         self._token = secrets.token_urlsafe(24)
         self._one_at_a_time = threading.Lock()
@@ -111,19 +113,27 @@ class PageServer(ThreadingHTTPServer):
         return rest if hmac.compare_digest(token.encode(), self._token.encode()) else None
 
     def answer(self, question: str, data: Mapping[str, Any], watch: Watch) -> dict[str, Any]:
-        """Answer "explain", why two steps are one dstate or not, "solve", or "correct".
+        """Answer "explain", why two steps are one dstate or not, "solve", "correct" or "frame".
 
-        "solve" finds maps, and "correct" writes what a person says of two steps. `data` has `pair`,
+        "solve" finds maps, "correct" writes what a person says of two steps, and "frame" writes
+        `points` that are known in another map, too. `data` has `pair`,
         the two steps; `kind`, what is said of them; and `same` and `different`, lists of pairs of
         steps that are assumed to be one dstate, or different ones. The answer has `text`; and
         `assuming`, the cost of each assumption, or `content`, the new content of the page. Raises
         AbductionError for a malformed question or one without an answer, and LimitError.
         """
-        known = ("explain", "solve", *(["correct"] if self._correct else []))
+        written = {"correct": self._correct, "frame": self._frame}
+        known = ("explain", "solve", *(name for name, writes in written.items() if writes))
         one_of("question", question, known, MapError, mend="ask one of these")
         if self._correct and question == "correct":
             kind = one_of("kind", data.get("kind"), ASSERTIONS, MapError, mend="take one of these")
             return {"text": self._correct(kind, *self._pair(data.get("pair")))}
+        if self._frame and question == "frame":
+            mend = "send a list such as [[0, 0, 1, 2], [5, 0, 6, 2]]"
+            points = a_list("points", data.get("points"), MapError, what="points", mend=mend)
+            read = FieldReader("question")
+            row = read.several(read.that("a number of metres", is_finite), "four numbers", 4)
+            return {"text": self._frame([row(point, "point") for point in points])}
         theory = self._assuming(data)
         pair = self._pair(data.get("pair")) if question == "explain" else None
         maps = self._listing.maps

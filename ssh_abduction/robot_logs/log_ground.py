@@ -30,6 +30,7 @@ from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.output.layout import drawable_poses
+from ssh_abduction.page.content import MOST, encoded
 
 Array = NDArray[np.float64]
 
@@ -45,6 +46,7 @@ APART = 0.2  # metres between two points of the robot's way
 ASIDE = 5.0  # metres between drives that no map joins
 # The share of the points of walls that may lie outside the window at first: stray beams.
 STRAY = 0.005
+SECTORS = 180  # directions in which the page shows a scan
 GREY = b"\x8a\x8a\x8a"  # the colour of walls, which can be seen on white and on black
 
 
@@ -55,8 +57,9 @@ def ground_of(log: RobotLog, imported: Imported, ssh_map: SSHMap | None) -> dict
         A dict with `walls`, a picture as the URL of a PNG; `grain`, the width of its points;
         `box`, its left, top, width and height;
         `view`, the box (left, lowest, right, highest) of all but stray points; `spots`, the x, y
-        and heading (radians) of each step; `way`, points of the robot's way; and `at`, the
-        index of the point of each step.
+        and heading (radians) of each step; `way`, points of the robot's way, with `headings`;
+        `at`, the index of the point of each step; and `scans`, what the laser saw at the points,
+        encoded as `drawn_images` encodes; None if no ranges are known.
     """
     poses = laid_over(imported, ssh_map)
     walls = _walls(log, poses)
@@ -79,7 +82,29 @@ def ground_of(log: RobotLog, imported: Imported, ssh_map: SSHMap | None) -> dict
         "view": np.round([*points.min(axis=0), *points.max(axis=0)], 2).tolist(),
         "spots": [[round(number, 3) for number in spot] for spot in _spots(poses, imported)],
         "way": np.round(way, 2).tolist(),
+        "headings": [round(poses[scan][2], 2) for scan in kept],
+        "scans": _scans([log.scans[scan] for scan in kept]),
         "at": [kept.index(scans[visit]) for visit in _visit_of(imported)],
+    }
+
+
+def _scans(scans: Sequence[Scan]) -> dict[str, Any] | None:
+    """Encode how far the walls are in each direction of the robot, for as many scans as fit."""
+    ranges = np.full((len(scans), SECTORS), np.inf)
+    for row, scan in zip(ranges, scans, strict=True):
+        x, y = _ends(scan, (0.0, 0.0, 0.0)).T
+        sectors = np.floor(np.arctan2(y, x) / math.tau * SECTORS).astype(int) + SECTORS // 2
+        np.minimum.at(row, sectors % SECTORS, np.hypot(x, y))
+    used = np.flatnonzero(np.isfinite(ranges).any(axis=0))
+    if not len(used):
+        return None
+    ranges = np.where(np.isfinite(ranges), ranges / DRAWN, np.nan)[:, used[0] : used[-1] + 1]
+    every = -(-ranges.size // MOST)
+    return {
+        "first": (used[0] + 0.5) * 360 / SECTORS - 180,
+        "step": 360 / SECTORS,
+        "reach": DRAWN,
+        "images": [None if k % every else encoded(row) for k, row in enumerate(ranges)],
     }
 
 

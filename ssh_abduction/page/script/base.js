@@ -11,7 +11,7 @@ const $ = (id) => document.getElementById(id);
 let data = JSON.parse($("content").textContent);
 const served = data.served;
 const assumed = { same: [], different: [] };
-const state = { mode: "overview", map: 0, other: 1, step: 0, picked: [], replay: 0, region: null, found: null };
+const state = { mode: "overview", map: 0, other: 1, step: 0, scan: null, picked: [], replay: 0, region: null, found: null, pointing: null };
 let decoded = new Map(),
   figures = [];
 

@@ -144,6 +144,7 @@ function movable(figure) {
       moved = false;
       return;
     }
+    if (state.pointing !== null) return setPoint(figure, event);
     const target = event.target.closest("[data-step]");
     let steps = target ? figure.marks[Number(target.dataset.mark)].steps : null;
     if (!steps) {

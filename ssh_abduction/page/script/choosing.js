@@ -53,7 +53,10 @@ function legend() {
   if (state.mode === "one" && mapOf(state.map).streets.some((street) => !street.travelled))
     rows.push(["street", "order", "not travelled: the order of the path implies it"]);
   if (data.places[0].some(([place]) => place !== null))
-    rows.push(["node", "", "a place"], ["dstate", "", "a dstate, with its heading"]);
+    rows.push(["node", "", data.ground ? "a place; small if the robot only passed it" : "a place"]);
+  if (layers.has("arrows")) rows.push(["dstate", "", "a dstate, with its heading"]);
+  if (data.ground) rows.push(["way", "", "a way out of a place"]);
+  if (data.indoors.doors?.length) rows.push(["door", "", "a door"]);
   data.drives.forEach(({ name }, k) => rows.push(["trail", colourOf(k), `the way of ${name}`]));
   if (!replay().other) rows.push(["here", "", "where the robot is at this step"]);
   if (replay().beliefs)
@@ -67,7 +70,7 @@ function legend() {
         side,
         side === "within" ? `in ${state.region.name}` : `${side} of ${state.region.name}`,
       ]);
-  if (figures.some((figure) => figure.layout?.ellipses?.length))
+  if (layers.has("ellipses") && figures.some((figure) => figure.layout?.ellipses?.length))
     rows.push(["ellipse", "", "two standard deviations of a position"]);
   const changes = data.faults.some(([, , kind]) => kind === "changed");
   if (data.faults.length)
@@ -95,6 +98,7 @@ function legend() {
       svg = element("svg:svg", { viewBox: "0 0 38 16", "aria-hidden": "true" }, null, row);
     if (shape === "trail")
       element("svg:path", { d: "M2,8 H36", class: classes("trail", kind) }, null, svg);
+    else if (shape === "way") element("svg:path", { d: "M12,8 H26", class: shape }, null, svg);
     else if (shape === "street")
       element(
         "svg:path",

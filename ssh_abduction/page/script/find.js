@@ -15,6 +15,7 @@ function showLayers() {
     box.addEventListener("change", () => {
       layers[box.checked ? "add" : "delete"](name);
       paint();
+      legend();
     });
   }
 }
@@ -91,12 +92,19 @@ function tellReport() {
   }
 }
 
-// Paper has no folds.
+// Paper has no folds. The drawing is made for its width, so that names can be read.
 let folded = [];
+function forPaper(printed) {
+  $("stage").classList.toggle("paper", printed);
+  settle();
+  paint();
+}
 addEventListener("beforeprint", () => {
   folded = [...document.querySelectorAll("details:not([open])")];
   for (const part of folded) part.open = true;
+  forPaper(true);
 });
 addEventListener("afterprint", () => {
   for (const part of folded) part.open = false;
+  forPaper(false);
 });

@@ -174,11 +174,13 @@ function paintGateways(figure, [x, y], node, r) {
   }
 }
 
-// The laser, and the robot, over the map.
+// The laser, and the robot, over the map: of the scan at this time, else of the step.
 function paintLaser(figure) {
-  const spot = replay().other ? undefined : data.spots[state.step],
-    { images } = replay(),
-    text = images?.images[state.step] ?? null;
+  const { scans, way, headings } = data.ground,
+    k = state.scan === null ? null : scans.images.findLastIndex((text, k) => text !== null && k <= state.scan),
+    spot = replay().other ? undefined : k === null ? data.spots[state.step] : [...way[k], headings[k]],
+    images = k === null ? replay().images : scans,
+    text = images?.images[k ?? state.step] ?? null;
   figure.laser.setAttribute("d", "");
   if (!spot) return;
   const [x, y, heading] = spot;

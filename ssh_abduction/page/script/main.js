@@ -12,6 +12,7 @@ function load(judging = true) {
   tellDoubts();
   tellDrives();
   tellReport();
+  tellFrame();
   listThings();
   $("choices").replaceChildren();
   for (const choice of data.choices.slice(0, 20)) {
@@ -97,7 +98,7 @@ $("other").addEventListener("change", () => {
 });
 $("slider").addEventListener("input", () => {
   play(false);
-  setStep(Number($("slider").value));
+  (gliding() ? setScan : setStep)(Number($("slider").value));
 });
 $("play").addEventListener("click", () => play(!player));
 $("which").addEventListener("change", () => chooseReplay(Number($("which").value)));
@@ -125,6 +126,7 @@ $("different").addEventListener("click", () => assume("different"));
 $("forget").addEventListener("click", () => assume(null));
 $("accept").addEventListener("click", () => correct(true));
 $("reject").addEventListener("click", () => correct(false));
+$("frame").addEventListener("click", frame);
 $("find").addEventListener("change", () => find($("find").value));
 $("stop").addEventListener("click", () => {
   giveUp();

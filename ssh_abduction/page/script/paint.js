@@ -382,6 +382,7 @@ function paintOver(figure) {
   paintChosen(figure);
   paintFound(figure);
   if (data.ground) paintLaser(figure);
+  paintPoints(figure);
   const beliefs = replay().beliefs,
     labeling = figure.map === null ? Object.keys(beliefs ?? {})[0] : data.maps[figure.map].labeling,
     belief = beliefs?.[labeling]?.[state.step];

@@ -118,14 +118,14 @@ function giveUp() {
   $("busy").hidden = true;
 }
 
-async function ask(question, body) {
+async function ask(question, body, told = $("answer")) {
   giveUp();
   const mine = (asking = new AbortController()),
     begun = Date.now(),
     since = () => {
       $("waited").textContent = `Solving for ${Math.round((Date.now() - begun) / 1000)} s`;
     };
-  $("answer").textContent = "";
+  told.textContent = "";
   $("busy").hidden = false;
   since();
   const clock = setInterval(since, 500);
@@ -140,12 +140,12 @@ async function ask(question, body) {
       throw new Error(
         `the server refused (${response.status}); open the address that view --serve printed`,
       );
-    const told = await response.json();
-    if (told.error) throw new Error(told.error);
-    return told;
+    const answer = await response.json();
+    if (answer.error) throw new Error(answer.error);
+    return answer;
   } catch (error) {
     if (asking === mine)
-      $("answer").textContent =
+      told.textContent =
         error instanceof TypeError
           ? "No answer: the server has ended; start view --serve again"
           : `No answer: ${error.message}`;

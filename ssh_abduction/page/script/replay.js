@@ -1,12 +1,27 @@
 // The replay of a trace, step by step, with images and beliefs.
 
-function setStep(t) {
+// Whether the slider goes through the scans of the log, not only through the steps.
+function gliding() {
+  return Boolean(data.ground?.scans) && !replay().other;
+}
+
+function setScan(k) {
+  const t = Math.max(0, data.ground.at.findLastIndex((at) => at <= k));
+  if (t !== state.step) return setStep(t, k);
+  state.scan = k;
+  $("slider").value = k;
+  for (const figure of figures) paintOver(figure);
+}
+
+function setStep(t, scan = null) {
   const { steps, images } = replay();
   if (!(t >= 0 && t < steps.length)) return;
   state.step = t;
+  state.scan = gliding() ? (scan ?? data.ground.at[t]) : null;
   const step = steps[t],
     parts = [];
-  $("slider").value = t;
+  $("slider").value = state.scan ?? t;
+  $("slider").setAttribute("aria-valuetext", `step ${called(t)}`);
   const [first, last] = endsOf(t);
   $("at").textContent =
     replay().other || !data.drives.length
@@ -214,17 +229,20 @@ function play(on) {
   if (!on) return;
   const [first, last] = endsOf(state.step);
   if (state.step === last) setStep(first);
+  const { length } = replay().steps,
+    pause = gliding() ? Math.max(40, (PLAYING * length) / data.ground.way.length) : PLAYING;
   player = setInterval(() => {
-    setStep(state.step + 1);
+    if (gliding()) setScan(state.scan + 1);
+    else setStep(state.step + 1);
     if (state.step >= last) play(false);
-  }, PLAYING);
+  }, pause);
 }
 
 function chooseReplay(k) {
   play(false);
   state.replay = k;
   $("which").value = k;
-  $("slider").max = replay().steps.length - 1;
+  $("slider").max = (gliding() ? data.ground.way : replay().steps).length - 1;
   setStep(Math.min(state.step, replay().steps.length - 1));
   legend();
 }
