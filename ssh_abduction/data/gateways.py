@@ -38,7 +38,7 @@ from ssh_abduction.data.star import (
     angle_between,
 )
 from ssh_abduction.data.trace import Action, Trace
-from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.clock import SHORT_TURN, look_at_clock
 
 # A name beside those of axioms, for a weaker form of the axiom gateway_path: dstates of one course
 # face one way, but dstates that face one way may be on different paths.
@@ -279,7 +279,7 @@ def _fitted(
             return tuple(chosen)
         sight = sights[len(chosen)]
         for here in _readings(sight, axioms, most, turned=bool(chosen)):
-            look_at_clock()
+            look_at_clock(SHORT_TURN)
             on_drives = {**closed, sight.drive: _closed(here)} if most else closed
             # The steps of a drive see the same gateways.
             if most and (
