@@ -336,7 +336,7 @@ def test_flags_override_the_theory_for_logs(
     assert f"star={star}, boundary={boundary}" in capsys.readouterr().err
 
 
-def test_default_work_limit_is_a_twentieth_of_the_drive() -> None:
+def test_default_work_limit_is_a_fortieth_of_the_drive() -> None:
     laser = LaserScanner(-1.0, 1.0, 3, 30.0)
     timed = tuple(Scan(np.ones(3), laser, (0.1 * i, 0.0, 0.0), time=2.0 * i) for i in range(51))
     track = Track(np.array([scan.odometry for scan in timed]), np.zeros((51, 3, 3)))
@@ -347,7 +347,7 @@ def test_default_work_limit_is_a_twentieth_of_the_drive() -> None:
         (),
         {"track": 0.5, "places": 1.0},
     )
-    assert work_for(RobotLog(timed, source="timed.log"), imported) == pytest.approx(100 / 20)
+    assert work_for(RobotLog(timed, source="timed.log"), imported) == pytest.approx(100 / 40)
     # A clock that once goes back by a second is used; one that often goes back is not.
     long = tuple(Scan(np.ones(3), laser, (0.0, 0.0, 0.0), time=2.0 * i) for i in range(201))
     for back, drove in ((1, 401.0), (5, None)):
@@ -358,7 +358,7 @@ def test_default_work_limit_is_a_twentieth_of_the_drive() -> None:
     for unit in (None, 1000.0):
         untimed = tuple(replace(scan, time=unit and unit * scan.time) for scan in timed)
         left = work_for(RobotLog(untimed, source="untimed.log"), imported)
-        assert left == pytest.approx(5.0 / SPEED / 20)
+        assert left == pytest.approx(5.0 / SPEED / 40)
 
 
 def test_map_on_an_unreliable_track_has_no_probability(

@@ -57,7 +57,7 @@ _log = log_of(__name__)
 
 # Without a limit, the search gets SHARE of a unit of work for each second that the robot drove, and
 # at least LEAST units.
-SHARE, LEAST = 1 / 20, 30.0
+SHARE, LEAST = 1 / 40, 8.0
 # Without a map, the search is given LONGER times its time, at most PATIENCE times.
 LONGER, PATIENCE = 4.0, 3
 # The recogniser treats all ranges below this, in metres, as equal. So does the clustering of views.
@@ -214,7 +214,7 @@ def seconds_driven(log: RobotLog) -> float | None:
 
 
 def work_for(log: RobotLog, imported: Imported) -> float:
-    """Compute the units of work for mapping a log: a twentieth of the seconds that it drove.
+    """Compute the units of work for mapping a log: a fortieth of the seconds that it drove.
 
     The time of the import does not count, so that a log gets the same work on each machine.
     """
@@ -347,7 +347,7 @@ def map_log(
         time_limit: Seconds after which the search ends in any case; None for no limit.
         work_limit: Units of work for the search. A unit is about a second of a quiet core. One log
             and work limit give one map on each machine. None: until the time limit or, if there is
-            none, a unit for 20 seconds of driving, and at least 30. If no map is found by then, the
+            none, a unit for 40 seconds of driving, and at least 8. If no map is found by then, the
             search goes on for up to 64 times as many units.
         max_maps: List at most this many minimal maps; None lists all.
         corrections: Names and corrections of a person, to be obeyed.
