@@ -7,17 +7,20 @@ import sqlite3
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from coarse import hall
+from scipy.spatial.transform import Rotation
 from test_bags import notes, written
 from test_readers import LASER, SMALL, Messages, bag, drive
 
 from perception.errors import LogError
 from perception.places.following import follow
 from perception.places.odometers import lag_of, with_lag
+from perception.readers.bag_geometry import Mount, believed
 from perception.readers.echoes import LaserOptions, interpret_log
 from perception.readers.lines import zstd_module
 from perception.readers.logs import read_log
@@ -112,6 +115,52 @@ def tilted(m: Messages, degrees: float, change: Callable[[Any, int], None]) -> L
     turn = m.types["geometry_msgs/msg/Quaternion"](x=0.0, y=math.sin(half), z=0.0, w=math.cos(half))
     transform.transforms[0].transform.rotation = turn
     return [("/tf_static", 0.5, transform), *ahead(m, change)]
+
+
+@pytest.mark.parametrize("turns", [(0, 0, 30), (0, 30, 0), (90, 20, 15), (10, 0, 150)])
+def test_walls_that_a_tilted_laser_sees_stay_straight(turns: tuple[int, int, int]) -> None:
+    """The laser turns by yaw, pitch and roll between walls a metre to the left and the right."""
+    rotation = Rotation.from_euler("ZYX", turns, degrees=True).as_matrix()
+    heading = math.atan2(rotation[1, 0], rotation[0, 0])
+    rows = tuple(map(tuple, rotation.tolist()))
+    mount = Mount((0.0, 0.0, heading), bool(rotation[2, 2] < 0), rows, 0.5)
+    first, step, beams = -math.pi + 1e-3, math.tau / 360, 360
+    _, across, up = mount.rays(first, step, beams)
+    ends = np.minimum(1 / np.abs(across), np.where(up < 0, -0.5 / up, np.inf))
+    ranges = mount.levelled(ends, first, step, 12.0)
+    bearings = (-1 if mount.is_flipped else 1) * (first + step * np.arange(beams)) + heading
+    seen = np.isfinite(ranges)
+    assert seen.sum() > 150
+    off = np.abs(np.abs(ranges * np.sin(bearings))[seen] - 1)
+    assert (off < 1e-6).mean() > 0.95
+    assert off.max() < 0.15  # the nearest beam counts alone at the edge of the floor
+
+
+@pytest.mark.parametrize(("rooms", "ceiling"), [((1, 5), 2.5), ((1, 1), math.inf)])
+def test_ceiling_that_a_tilted_laser_sees_is_unknown(
+    rooms: tuple[int, int], ceiling: float
+) -> None:
+    """A laser that looks up is in rooms between two sizes, below a ceiling at 2.5 m."""
+    rotation = Rotation.from_euler("Y", -30, degrees=True).as_matrix()
+    mount = Mount((0.0, 0.0, 0.0), False, tuple(map(tuple, rotation.tolist())), 0.5)
+    beams = 180
+    first, step = -math.pi / 2, math.pi / beams
+    _, _, up = mount.rays(first, step, beams)
+    flat = np.linspace(*rooms, 20)[:, None] / np.sqrt(1 - up**2)
+    ends = np.where(up > 0, np.minimum(flat, 2 / np.abs(up)), flat)
+    scans = [
+        SimpleNamespace(
+            angle_min=first, angle_max=math.pi / 2, angle_increment=step, range_max=9.0, ranges=r
+        )
+        for r in ends
+    ]
+    said: list[str] = []
+    found = believed(mount, scans, "laser", "log", False, said)
+    assert found.ceiling == pytest.approx(ceiling, abs=0.01)
+    assert ("ceiling 2.5 m above" in said[0]) == math.isfinite(ceiling)
+    unknown = found.levelled(ends[-1], first, step, 9.0) == -math.inf
+    assert unknown[beams // 2] == math.isfinite(ceiling)
+    assert not unknown[2]
 
 
 def test_steep_laser_is_refused(tmp_path: Path) -> None:

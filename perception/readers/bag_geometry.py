@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perception.errors import LogError
 from perception.readers.scans import Array, Damaged
@@ -20,6 +21,12 @@ FULL, LEAST_DEGREES = 1.01 * math.tau, 30.0
 SAME_SHARE = 0.03
 # Tilts in degrees: up to LEVEL they change nothing; beyond STEEP a laser shows no floor plan.
 LEVEL, STEEP = 2.0, 45.0
+# Neighbouring beams see one surface if their distances differ by less than this factor.
+ONE_SURFACE = 1.5
+# The highest beams end at a ceiling if SPIKE times as many end within FLOOR metres of it as in an
+# equally wide band below, and it is at least ROOM metres above the floor: a laser that rolls sees
+# a wall beside it at one height, too. It is judged from LEAST_ENDS beams on.
+SPIKE, ROOM, LEAST_ENDS = 5, 1.9, 50
 # A beam meets the floor if it ends at most this many metres above it. Beams that end more than
 # BELOW metres below the floor contradict the tilt if they are more than the share MANY_BELOW of
 # those that look at the floor. But if the share ON_FLOOR of them ends at one height, within FLOOR
@@ -102,6 +109,7 @@ class Mount:
     # Rotation of a tilted laser in the frame of the robot, three rows; empty for a level one.
     rotation: tuple[tuple[float, ...], ...] = ()
     height: float = 0.0  # of a tilted laser above the floor, in metres
+    ceiling: float = math.inf  # height of the ceiling above the floor, in metres
 
     @property
     def tilt(self) -> float:
@@ -117,26 +125,57 @@ class Mount:
     def levelled(self, ranges: Array, first: float, step: float, reach: float) -> Array:
         """Project ranges, (beams,), of a tilted laser to the plane.
 
-        Each bearing gets the beam that points nearest to it. Ranges are minus infinity (unknown)
-        where no beam points, and where a beam meets the floor.
+        Between two beams that see one surface, a bearing gets its distance on the line between
+        their ends; otherwise that of the nearest beam. The nearest beam alone would give walls
+        steps that move along with the robot. Ranges are minus infinity (unknown) where no beam
+        points, and where a beam meets the floor or the ceiling.
         """
-        nearest, flat, down = _levelling(self, first, step, len(ranges))
+        level = _levelling(self, first, step, len(ranges))
         ranges = np.where(ranges >= reach, np.inf, ranges)
-        with np.errstate(invalid="ignore"):
-            ends = self.height + np.minimum(ranges, reach) * down
-            ranges = np.where((down < 0) & (ends <= FLOOR), -np.inf, ranges * flat)
-        return np.asarray(np.where(nearest < 0, -np.inf, ranges[nearest]))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ends = self.height + np.minimum(ranges, reach) * level.up
+            met = (level.up < 0) & (ends <= FLOOR) | (level.up > 0) & (ends >= self.ceiling - FLOOR)
+            flat = np.where(met, -np.inf, ranges * level.flat)
+            near, other = flat[level.nearest], flat[level.other]
+            far = np.maximum(near, other)
+            between = level.weights[0] / near + level.weights[1] / other
+            on_one = (np.minimum(near, other) > far / ONE_SURFACE) & np.isfinite(far)
+            found = np.where(on_one & (between > 0), 1 / between, near)
+        return np.asarray(np.where(level.is_seen, found, -np.inf))
+
+
+@dataclass(frozen=True, eq=False)
+class _Levelling:
+    """How the beams of a tilted laser lie above the bearings of the projected scan."""
+
+    flat: Array  # (beams,) the way along the floor of a beam, as a share of its length
+    up: Array  # (beams,) the way up of a beam, as a share of its length
+    nearest: NDArray[np.intp]  # (beams,) the nearest beam to each bearing
+    other: NDArray[np.intp]  # (beams,) the nearest beam on the other side of the bearing
+    is_seen: NDArray[np.bool_]  # (beams,) whether a beam points at the bearing, or nearly so
+    # (2, beams): the sum of these shares of the inverse distances of `nearest` and `other` is the
+    # inverse distance of the line between their ends.
+    weights: Array
 
 
 @lru_cache(maxsize=64)
-def _levelling(mount: Mount, first: float, step: float, beams: int) -> tuple[Array, Array, Array]:
-    """For each bearing the nearest beam, or -1; and how far each beam goes flat and up."""
+def _levelling(mount: Mount, first: float, step: float, beams: int) -> _Levelling:
+    """Find the beams around each bearing."""
     rays = mount.rays(first, step, beams)
     side = -1.0 if mount.is_flipped else 1.0
     wished = side * (first + step * np.arange(beams)) + mount.pose[2]
-    off = np.abs(np.angle(np.exp(1j * (np.arctan2(rays[1], rays[0]) - wished[:, None]))))
-    nearest = np.where(off.min(axis=1) <= abs(step), off.argmin(axis=1), -1)
-    return nearest, np.hypot(rays[0], rays[1]), rays[2]
+    off = np.angle(np.exp(1j * (np.arctan2(rays[1], rays[0]) - wished[:, None])))
+    rows = np.arange(beams)
+    nearest = np.abs(off).argmin(axis=1)
+    beyond = np.where(off * off[rows, nearest][:, None] < 0, np.abs(off), np.inf)
+    other = beyond.argmin(axis=1)
+    one, two = off[rows, nearest], off[rows, other]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        weights = np.stack([np.sin(two), -np.sin(one)]) / np.sin(two - one)
+    # Without a beam on the other side, the nearest one counts alone.
+    weights[:, ~np.isfinite(beyond.min(axis=1)) | (np.abs(two - one) > 3 * abs(step))] = np.nan
+    seen = np.abs(one) <= abs(step)
+    return _Levelling(np.hypot(rays[0], rays[1]), rays[2], nearest, other, seen, weights)
 
 
 def believed(
@@ -157,16 +196,15 @@ def believed(
             f"{source}: expected a laser that is tilted by at most {STEEP:.0f} degrees, got "
             f"{said}; mend the transforms, or say where it sits (--set mount=X,Y,DEGREES)"
         )
-    ends = [np.zeros(0)]
+    ends, tops = [np.zeros(0)], [np.zeros(0)]
     for message in scans:
         first, step, _ = angles_of(message)
         ranges = ranges_of(message)
-        down = mount.rays(first, step, len(ranges))[2]
+        up = mount.rays(first, step, len(ranges))[2]
         seen = (ranges > 0) & (ranges < message.range_max)
-        ends.append(
-            (mount.height + ranges * down)[seen & (mount.height < -message.range_max * down)]
-        )
-    heights = np.concatenate(ends)
+        ends.append((mount.height + ranges * up)[seen & (mount.height < -message.range_max * up)])
+        tops.append((ranges * up)[seen & (up > 0)])
+    heights, above = np.concatenate(ends), np.concatenate(tops)
     below = heights[heights < -BELOW]
     if len(below) > MANY_BELOW * len(heights):
         floor = float(np.median(below))
@@ -178,12 +216,27 @@ def believed(
                 "the laser sits: --set mount=X,Y,DEGREES."
             )
             return level
-        mount = Mount(mount.pose, mount.is_flipped, mount.rotation, mount.height - floor)
+        mount = replace(mount, height=mount.height - floor)
         heights = heights - floor
     met = 100 * float((heights <= FLOOR).mean()) if len(heights) else 0.0
+    mount = replace(mount, ceiling=_ceiling(mount.height + above))
+    also = f" or the ceiling {mount.ceiling:.1f} m above it" if mount.ceiling < math.inf else ""
     notes.append(
         f"The laser is tilted by {said}. Its ranges are projected to the floor plane, and beams "
-        f"that meet the floor ({met:.0f} % of those that look at it) count as unknown. If it is "
-        "level, say where it sits: --set mount=X,Y,DEGREES."
+        f"that meet the floor ({met:.0f} % of those that look at it){also} count as unknown. If it "
+        "is level, say where it sits: --set mount=X,Y,DEGREES."
     )
     return mount
+
+
+def _ceiling(heights: Array) -> float:
+    """Return the height of the ceiling; infinity if no ceiling shows.
+
+    `heights`, in metres above the floor, are those at which the beams that look up end.
+    """
+    if len(heights) < LEAST_ENDS:
+        return math.inf
+    top = float(np.percentile(heights, 99.9))
+    top = float(np.median(heights[np.abs(heights - top) <= FLOOR]))
+    at, below = (int((np.abs(heights - z) <= FLOOR).sum()) for z in (top, top - 2 * FLOOR))
+    return top if top >= ROOM and at > SPIKE * max(below, 1) else math.inf
