@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 import pytest
@@ -18,6 +18,9 @@ from worlds import rectangle
 
 from ssh_abduction import SSHMap, Trace, solve
 from ssh_abduction.cli import jobs, main, outcome
+
+if TYPE_CHECKING:
+    from ssh_abduction.robot_logs.log_maps import LogMap
 
 # Hypothesis has no deadlines, because clingo takes a hundred times as long for some random traces
 # as for others. Examples are the same in each run, unless NEW_EXAMPLES is set.
@@ -130,14 +133,20 @@ def room(tmp_path: Path) -> str:
 
 
 @pytest.fixture(scope="session")
-def files_of_round(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The files of the map of a log, a round through the world `triangle`."""
+def files_of_round(map_of_round: "LogMap") -> dict[str, bytes]:
+    """The files of the map of a log."""
+    return map_of_round.files()
+
+
+@pytest.fixture(scope="session")
+def map_of_round(tmp_path_factory: pytest.TempPathFactory) -> "LogMap":
+    """The map of a log, a round through the world `triangle`."""
     from perception.readers.logs import read_log
     from ssh_abduction.robot_logs.log_maps import map_log
 
     log = tmp_path_factory.mktemp("logs") / "round.log"
     assert main(["simulate", "triangle", "-o", str(log), "--set", "every=0.5"]) == 0
-    return map_log(read_log(log), name="round", work_limit=3).files()
+    return map_log(read_log(log), name="round", work_limit=3)
 
 
 @pytest.fixture

@@ -202,7 +202,7 @@ EDGE = {"source": "a", "action": "east", "target": "b"}
     [
         ([], "expected a graph with edges, got []"),
         ({"nodes": []}, "expected a graph with edges"),
-        (["a"], "edge 1: source: expected a name, got ''; name the source"),
+        (["a"], "edge 1: expected an object such as"),
         ([{**EDGE, "target": "a"}], "edge 1: expected two places, got a move from 'a' to itself"),
         ([EDGE, {"source": "a", "target": "b"}], "edge 2: action: expected a name, got ''"),
         ([{**EDGE, "source": ""}], "edge 1: source: expected a name, got ''"),

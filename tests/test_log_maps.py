@@ -38,9 +38,11 @@ from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
+from ssh_abduction.page.html import CONTENT
 from ssh_abduction.robot_logs import log_maps
 from ssh_abduction.robot_logs.log_maps import (
     SPEED,
+    LogMap,
     LogMapping,
     how_it_ended,
     map_log,
@@ -49,6 +51,7 @@ from ssh_abduction.robot_logs.log_maps import (
 )
 from ssh_abduction.runtime import workers
 from ssh_abduction.solution import Solution, Status
+from ssh_abduction.solution.recorded import Support
 from ssh_abduction.solver import solve
 
 SCANS = 110
@@ -77,6 +80,20 @@ def runs(hall: Path, in_this_process: Callable[[], AbstractContextManager[object
     with in_this_process():
         assert main(["map", str(hall), str(bad), *words]) == 1
     return hall.parent / "runs"
+
+
+def test_log_without_a_map_has_a_page_of_its_drive(map_of_round: LogMap) -> None:
+    none = {"status": Status.UNSATISFIABLE, "maps": (), "cost": None, "shared": None}
+    solution = replace(map_of_round.solution, **none, support=Support(), levels=())
+    found = replace(map_of_round, solution=solution).files()
+    assert "recogniser.skops" not in found
+    page = found["page.html"].decode()
+    assert "No map. The drive is shown alone." in page
+    content = CONTENT.search(page)
+    assert content is not None
+    ground = json.loads(content[1])["ground"]
+    assert len(ground["spots"]) == len(map_of_round.imported.trace)
+    assert ground["scans"]["images"]
 
 
 def test_scan_matching_corrects_the_odometry(hall: Path) -> None:

@@ -42,6 +42,7 @@ from ssh_abduction.data.drives import (
     step_name,
     step_of,
     together,
+    typed_step,
 )
 from ssh_abduction.data.errors import MapError, TheoryError, TraceError, brief, named, printable
 from ssh_abduction.data.map_parts import (
@@ -404,7 +405,8 @@ def give_name(saved: SavedMap, what: str, name: str) -> str:
     keep_folder_whole(saved.file, "names")
     number = saved.number_at(kind, step)
     where = "" if number is None else f"{named_by_number(kind, number)}, "
-    return printable(f"{where}the {kind} of {step}, is {name.strip()!r}, in {named(file)}")
+    seen = typed_step(saved.drives, step_of(saved.drives, step))
+    return printable(f"{where}the {kind} of {seen}, is {name.strip()!r}, in {named(file)}")
 
 
 # Directions on the map as it is drawn, in degrees counterclockwise from east.
@@ -480,7 +482,8 @@ class SavedMap:
 
         def with_place(step: re.Match[str]) -> str:
             place = self.number_at("place", step[0])
-            return step[0] if place is None else f"{step[0]} [{self.map.called('place', place)}]"
+            typed = typed_step(self.drives, step_of(self.drives, step[0]))
+            return typed if place is None else f"{typed} [{self.map.called('place', place)}]"
 
         names = sorted((re.escape(drive.name) for drive in self.drives), key=len, reverse=True)
         return re.sub(rf"(?:{'|'.join(names)}):\d+", with_place, str(said))

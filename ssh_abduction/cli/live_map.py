@@ -12,6 +12,7 @@ from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c, warn
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import named
+from ssh_abduction.runtime.loggers import begin_stage, log_progress, stages
 
 if TYPE_CHECKING:
     from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper
@@ -129,24 +130,33 @@ def _listen(options: argparse.Namespace, session: LiveSession) -> None:
             lambda line: print(line, flush=True),
             stop.is_set,
         )
-        session.end()
+        with stages("last map"):
+            session.end()
 
 
 def _replay(options: argparse.Namespace, session: LiveSession) -> None:
     """Give the scans of a log to a session, as fast as asked for. Ctrl-C ends the log."""
+    with stages("log", "drive", "last map"):
+        _replayed(options, session)
+
+
+def _replayed(options: argparse.Namespace, session: LiveSession) -> None:
     log = import_log.read(options.replay, options)
     for warning in log.warnings:
         warn([warning])
     due, last = time.monotonic(), None
     known = 0 if options.onto is not None else len(session.mapper)
+    begin_stage("drive")
     with import_log.until_ctrl_c(iter(log.scans[known:]), StopFlag()) as scans:
-        for scan in scans:
+        for k, scan in enumerate(scans, known):
+            log_progress(f"{k} of {len(log)} scans")
             if options.speed and last is not None and scan.time is not None:
                 due += min(max(scan.time - last, 0.0), PAUSE) / options.speed
                 time.sleep(max(0.0, due - time.monotonic()))
             last = scan.time
             session.take(scan)
             session.tick()
+        begin_stage("last map")
         session.end()
 
 

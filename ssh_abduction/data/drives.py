@@ -30,6 +30,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import shlex
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -156,7 +157,7 @@ def _fingerprint(steps: Sequence[Step]) -> str:
 
 
 def step_named(trace: Trace, name: str) -> int:
-    """Return the number of a step, such as "14", or "tuesday:14" for step 14 of a drive.
+    """Return the number of a step, such as "14" or "step14", or "tuesday:14" for that of a drive.
 
     Steps count from 0, in the trace or in the drive. Raises TraceError.
     """
@@ -167,6 +168,7 @@ def step_of(drives: Sequence[Drive], name: str) -> int:
     """Return the number of a step of some drives, as `step_named`. Raises TraceError."""
     a_text("name", name, TraceError)
     drive_name, colon, number = name.rpartition(":")
+    number = number if colon else number.removeprefix("step").strip()
     by_name = {drive.name: drive for drive in drives}
     drive = by_name.get(drive_name) if colon else Drive("", 0, drives[-1].stop)
     if drive is None:
@@ -178,8 +180,8 @@ def step_of(drives: Sequence[Drive], name: str) -> int:
     steps = drive.stop - drive.first
     if not colon and not number.isdecimal():
         raise TraceError(
-            f"step {brief(name)}: expected a step such as {step_name(drives, 0)}, got "
-            f"{brief(name)}; name a drive and a step"
+            f"step {brief(name)}: expected a step such as {typed_step(drives, 0)}, got "
+            f"{brief(name)}; name a step, or a drive and a step"
         )
     if not (number.isascii() and number.isdecimal()) or int(number) >= steps:
         raise TraceError(
@@ -193,6 +195,12 @@ def step_name(drives: Sequence[Drive], step: int) -> str:
     """Return the name of a step, such as "tuesday:14". This inverts `step_of`."""
     drive = next(drive for drive in drives if step < drive.stop)
     return f"{drive.name}:{step - drive.first}"
+
+
+def typed_step(drives: Sequence[Drive], step: int) -> str:
+    """Return a step as a person types it: "step14" if the only drive has a name to be quoted."""
+    name = step_name(drives, step)
+    return name if len(drives) > 1 or shlex.quote(name) == name else f"step{step}"
 
 
 def with_named_faults(ssh_map: SSHMap, drives: Sequence[Drive]) -> SSHMap:

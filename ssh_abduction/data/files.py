@@ -169,7 +169,7 @@ def opened_file(path: str, what: str, error: type[AbductionError]) -> Iterator[B
         raise
     except (OSError, ValueError) as found:
         why = getattr(found, "strerror", None) or found
-        raise error(f"{source_of(path)}: expected {what}: {why}; check the path") from None
+        raise error(f"{source_of(path)}: expected {what}: {why}; {_mend(path)}") from None
 
 
 def read_file(
@@ -180,7 +180,15 @@ def read_file(
         return read_at_most(path, most)
     except (OSError, ValueError) as found:
         why = getattr(found, "strerror", None) or found
-        raise error(f"{named(path)}: expected {what}: {why}; check the path") from None
+        raise error(f"{named(path)}: expected {what}: {why}; {_mend(path)}") from None
+
+
+def _mend(path: str | os.PathLike[str]) -> str:
+    """Say what to do if a file cannot be read: perhaps its folder is not one that map wrote."""
+    folder, name = Path(path).parent, Path(path).name
+    if name in ("maps.json", "trace.jsonl", "run.json") and folder.is_dir():
+        return "name a folder that the command map wrote, or a file"
+    return "check the path"
 
 
 def parse_yaml(data: str | bytes) -> Any:

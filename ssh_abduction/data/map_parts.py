@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import shlex
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -168,7 +169,8 @@ def check_says_what(text: str, drive: str | None = None) -> None:
     """
     if text.strip().isdecimal():
         n = text.strip()
-        ways = f"p{n} or d{n}" if drive is None else f"p{n}, d{n} or {drive}:{n}"
+        step = f"{drive}:{n}" if shlex.quote(drive or "") == drive else f"step{n}"
+        ways = f"p{n} or d{n}" if drive is None else f"p{n}, d{n} or {step}"
         raise MapError(
             f"{n}: expected a place, a dstate or a step, got a number that may be any of these; "
             f"write {ways}"
@@ -458,7 +460,7 @@ def read_json(path: str | os.PathLike[str], what: str = "file of maps") -> Any:
                 "solve prints a line for each of several traces: take one of them"
             ) from None
         where += f": {error.field}" if error.field else ""
-        mend = error.mend or FieldReader.mend
+        mend = error.mend or (FieldReader.mend if what == "file of maps" else "write JSON")
         raise MapError(f"{where}: expected {error.expected}, got {error}; {mend}") from None
 
 

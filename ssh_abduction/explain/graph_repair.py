@@ -330,7 +330,12 @@ def _check_nodes(nodes: Any, edges: Any, where: str) -> None:
 
 def _move(edge: Any, where: str) -> GraphMove:
     """Read an edge. Raises MapError."""
-    record: dict[str, Any] = edge if isinstance(edge, dict) else {}
+    if not isinstance(edge, dict):
+        raise MapError(
+            f'{where}: expected an object such as {{"source": "hall", "action": "east", "target": '
+            f'"kitchen"}}, got {brief(edge)}; write one'
+        )
+    record: dict[str, Any] = edge
     found = [next((record[key] for key in keys if key in record), "") for keys in ENDS]
     for keys, value in zip(ENDS, found, strict=True):
         if not isinstance(value, str | int) or value == "":

@@ -31,6 +31,7 @@ leave region 0 through place 1; pass from right to left of path 1+; enter region
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
@@ -410,7 +411,7 @@ class MoveGraph:
         if isinstance(name, str) and self.map.places:
             check_says_what(name, self._drives[0].name if self._drives else None)
         kind, number = thing_named(str(name), self.map.names) or (None, -1)
-        if kind is None and ":" in str(name) and self._drives:
+        if kind is None and self._drives and re.search("^step|:", str(name)):
             try:
                 kind, number = "dstate", self.map.dstate_at[step_of(self._drives, str(name))]
             except TraceError as error:

@@ -30,13 +30,14 @@ from perception.store import written
 from ssh_abduction.building.derive import with_building
 from ssh_abduction.data.checks import all_instances
 from ssh_abduction.data.corrections import Corrections
-from ssh_abduction.data.drives import drives_of
+from ssh_abduction.data.drives import drives_of, starts_of
 from ssh_abduction.data.errors import TheoryError
 from ssh_abduction.data.files import json_line
+from ssh_abduction.data.map_parts import DState
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page.content import Ground
-from ssh_abduction.page.html import view_page
+from ssh_abduction.page.html import Page, view_page
 from ssh_abduction.robot_logs.log_ground import ground_of
 from ssh_abduction.robot_logs.log_report import may_misread, report
 from ssh_abduction.runtime.loggers import begin_stage, log_of
@@ -177,15 +178,26 @@ class LogMap:
             "trace.jsonl": "".join(f"{line}\n" for line in trace.to_lines()),
             "maps.json": f"{json_line(solution.to_dict())}\n",
         }
-        if solution.maps:
-            seen = ground_of(self.log, self.imported, solution.maps[0])
-            told = report(self.log, self.imported, solution, self.to_dict())
-            found["page.html"] = view_page(solution, trace, ground=Ground(seen, told)).html
+        best = solution.maps[0] if solution.maps else None
+        told = report(self.log, self.imported, solution, self.to_dict())
+        ground = Ground(ground_of(self.log, self.imported, best), told)
+        page = view_page(solution if best else [_unjoined(trace)], trace, ground=ground)
+        if best is None:
+            said = {"verdict": "No map. The drive is shown alone.", "sentence": solution.headline}
+            page = Page({**page.content, **said})
+        found["page.html"] = page.html
         files = {name: text.encode() for name, text in found.items()}
         if solution.maps:
             files["recogniser.skops"] = written(recogniser_of(trace, solution.maps[0]))
         run = f"{json.dumps(self.to_dict(), indent=2, ensure_ascii=False)}\n"
         return {**files, "run.json": run.encode()}
+
+
+def _unjoined(trace: Trace) -> SSHMap:
+    """The drive alone, as a map that joins no two steps."""
+    dstates = tuple(DState(t, view) for t, view in enumerate(trace.views))
+    links = tuple((t, a.name, t + 1) for t, a in enumerate(trace.actions) if not a.starts)
+    return SSHMap(tuple(range(len(trace))), dstates, links, starts=starts_of(trace))
 
 
 def recogniser_of(trace: Trace, ssh_map: SSHMap) -> Any:

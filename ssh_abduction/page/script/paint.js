@@ -35,7 +35,7 @@ function paintFigure(figure) {
   paintEllipses(figure, see);
   figure.nodes.forEach((node, k) => {
     const [x, y] = spots[k],
-      r = node.passed ? Math.min(4, radiusAt(node.at)) : radiusAt(node.at);
+      r = node.passed && data.ground ? Math.min(4, radiusAt(node.at)) : radiusAt(node.at);
     if (data.ground && !node.passed) paintGateways(figure, spots[k], node, r);
     const circle = element(
       "svg:circle",
@@ -124,6 +124,11 @@ function paintFigure(figure) {
       )
         named.add(street.path);
     }
+  // Over walls, places that the robot only passed have their numbers where there is room.
+  if (data.ground && figure.k > 8)
+    figure.nodes.forEach((node, k) => {
+      if (node.passed && !node.own) label(figure, node.name, spots[k], 6, around({ angle: null }), "number");
+    });
   paintFaults(figure, r);
   paintScale(figure);
 }
