@@ -765,7 +765,7 @@ def test_page_over_walls_in_the_browser(browser: Any, house: Path) -> None:
     before = browser.execute_script("return camera.dx")
     browser.switch_to.active_element.send_keys("\ue014")  # the right arrow
     assert browser.execute_script("return camera.dx") == before - 60
-    page["slider"].send_keys("\ue013")  # the arrow key leads to the previous step
+    page["slider"].send_keys("\ue013")  # the arrow key moves to the next scan
     browser.execute_script("setScan(data.ground.at[1] - 1)")
     assert browser.execute_script("return state.step") == 0
     assert page.drawn(".laser").get_attribute("d") != ""

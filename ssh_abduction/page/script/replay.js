@@ -17,10 +17,10 @@ function setStep(t, scan = null) {
   const { steps, images } = replay();
   if (!(t >= 0 && t < steps.length)) return;
   state.step = t;
-  state.scan = gliding() ? (scan ?? data.ground.at[t]) : null;
+  state.scan = scan; // null shows the robot at the pose of its dstate
   const step = steps[t],
     parts = [];
-  $("slider").value = state.scan ?? t;
+  $("slider").value = scan ?? (gliding() ? data.ground.at[t] : t);
   $("slider").setAttribute("aria-valuetext", `step ${called(t)}`);
   const [first, last] = endsOf(t);
   $("at").textContent =
@@ -232,7 +232,7 @@ function play(on) {
   const { length } = replay().steps,
     pause = gliding() ? Math.max(40, (PLAYING * length) / data.ground.way.length) : PLAYING;
   player = setInterval(() => {
-    if (gliding()) setScan(state.scan + 1);
+    if (gliding()) setScan(Number($("slider").value) + 1);
     else setStep(state.step + 1);
     if (state.step >= last) play(false);
   }, pause);
