@@ -782,7 +782,8 @@ def test_names_are_in_all_exports_of_a_map(
         assert "west wing" in export_map(with_region, to), to
     assert route(ssh_map, 0, "kitchen").goal == "place 1 (kitchen)"
     with pytest.raises(
-        MapError, match="or a place as p0, or a region as region0, or kitchen, got 'den'"
+        MapError,
+        match="a place as p0, or a path as path0, or a region as region0, or hall, kitchen, got 'den'",
     ):
         route(ssh_map, 0, "den")
     ssh_map.save(folder / "map.json")

@@ -23,7 +23,9 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import DState, Fit, MapPath, Name, Pose, Region
+from ssh_abduction.data.parts_of_dstates import number_at
 from ssh_abduction.data.trace import Action, Step
+from ssh_abduction.online.routes import route
 from ssh_abduction.robot_logs.log_maps import BARE
 
 Point = tuple[float, float]
@@ -202,6 +204,49 @@ def test_rooms_beside_a_corridor_are_its_wings() -> None:
     assert sorted(p for room in rooms for p in room["places"]) == [*range(6)]
 
 
+def test_each_part_of_a_building_can_be_named_and_reached() -> None:
+    """Two corridors, and a way between them whose places are on both."""
+    points = [*LINE, *((x, 8.0) for x, _ in LINE)]
+    doors = [(1, 5), (2, 3), (6, 7)]
+    found = with_building(*drive(points, [0, 1, 2, 3, 2, 1, 5, 4, 5, 6, 7, 6, 5, 1], doors=doors))
+    assert orders(found) == {(0, 1, 2, 3), (4, 5, 6, 7), (1, 5)}
+    for kind in ("place", "path", "corridor", "room", "door"):
+        things = found.things()[kind]
+        assert things.keys() == {number_at(found, kind, s.id) for s in found.dstates} - {None}
+    between = next(door.id for door in found.doors if door.places == (1, 5))
+    way = route(found, "p0", f"door{between}")
+    assert [move.place for move in way.moves] == [1]
+    rung = next(path.id for path in found.paths if sorted(path.order) == [1, 5])
+    assert route(found, "p7", f"path{rung}").moves[-1].place == 5
+    with pytest.raises(MapError, match="way around what is avoided"):
+        route(found, "p0", "p7", by="actions", avoid=[f"door{between}"])
+    with pytest.raises(MapError, match="or a corridor as corridor0, or a room as room0, or a door"):
+        route(found, "p0", "door9")
+
+
+def test_a_slim_room_has_one_way_though_the_robot_drove_from_door_to_door() -> None:
+    """A corridor of 24 by 4 m, with a door at each place, and the rooms behind them."""
+    sides = [(-1) ** k for k in range(7)]
+    points = [(4.0 * k, y * side) for y in (1.0, 6.0) for k, side in enumerate(sides)]
+    visits = [p for k in range(7) for p in (k, k + 7, k)]
+    found = with_building(*drive(points, visits, 3.0, doors=[(k, k + 7) for k in range(7)]))
+    (corridor,) = found.corridors
+    assert corridor.order in ((*range(7),), (*range(6, -1, -1),))
+    told_sides = [o.side for o in corridor.openings if o.door is not None]
+    assert told_sides in (["left", "right"] * 3 + ["left"], ["right", "left"] * 3 + ["right"])
+    assert not [*faults_of_paths(found), *faults_of_corridors(found)]
+
+
+def test_parts_that_share_wide_free_space_are_one_room() -> None:
+    """The robot leaves a hall by one door, and comes back into it by another one."""
+    points = [(0.0, 0.0), (6.0, 0.0), (6.0, 8.0), (0.0, 8.0), (0.0, 2.2), (3.5, 2.2)]
+    for width, rooms in ((4.0, {0: 0, 5: 0, 2: 1}), (1.0, {0: 0, 5: 2, 2: 1})):
+        found = with_building(*drive(points, [*range(6)], width, doors=[(1, 2), (3, 4)]))
+        assert found.building
+        assert {p: found.building.room_of(p) for p in rooms} == rooms
+        assert not [c for c in found.corridors if 5 in c.order or 0 in c.order] or width == 1.0
+
+
 def test_outlines_of_rooms_end_at_their_doors() -> None:
     """The corridor from x = 0 to 15 is 2 m wide. The room behind it begins at the door, y = 3."""
     found = with_building(*drive(CROSS, TOUR, doors=[(1, 4)]))
@@ -329,6 +374,10 @@ def test_maps_say_what_they_cannot_have() -> None:
         assert found.building
         assert why in found.building.notes[0]
         assert not found.corridors
+    theory = replace(ssh_map, fit=None, paths=(MapPath(0, (0, 1, 2, 3)),))
+    found = with_building(theory, trace)
+    assert found.building
+    assert "only the order of the places of its paths" in found.building.notes[0]
     for wrong, why in (
         (replace(ssh_map, fit=None), "no poses"),
         (with_one_place(ssh_map), "one place"),

@@ -221,7 +221,8 @@ def test_route_counts_rivals_that_agree() -> None:
     [
         (
             {"start": 99, "goal": 1},
-            "from: expected a dstate, 0 to 7, or a place as p0, or a region as region0, got 99",
+            "from: expected a dstate, 0 to 7, or a place as p0, or a path as path0, or a region as "
+            "region0, got 99",
         ),
         ({"start": 0, "goal": "p9"}, "to: expected a dstate, 0 to 7, or a place as p0"),
         ({"start": 0, "goal": True}, "to: expected a dstate"),

@@ -11,7 +11,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from ssh_abduction.building.edges import FloorPlan
-from ssh_abduction.building.rooms import corridors_of, room_of_places, rooms_of, with_doors
+from ssh_abduction.building.rooms import (
+    corridors_of,
+    outlines_of,
+    room_of_places,
+    rooms_of,
+    spaces_of,
+    with_doors,
+)
+from ssh_abduction.building.slim_rooms import straightened, widened
 from ssh_abduction.building.straight_paths import paths_of, ways_of
 from ssh_abduction.data.building import Indoors
 from ssh_abduction.data.groups import gathered
@@ -22,6 +30,10 @@ from ssh_abduction.data.trace import Trace, checked_trace
 NO_POSES = (
     "paths: the map has no poses, so it has neither paths nor corridors, doors and rooms; solve a "
     "trace with displacements, and without a short time limit"
+)
+ONLY_THEORY = (
+    "corridors, doors, rooms: the map has no poses, so it has only the order of the places of its "
+    "paths; solve a trace with displacements"
 )
 NO_PLACES = "paths: the map has no places, so it has no paths; solve with --theory topological"
 NO_WIDTHS = (
@@ -72,7 +84,7 @@ def buildings_of(ssh_map: SSHMap, trace: Trace, most: int = 0) -> Iterator[SSHMa
     checked_map(ssh_map)
     check_of_trace([ssh_map], checked_trace(trace), "map", views=False)
     if not ssh_map.places or not ssh_map.fit or not ssh_map.fit.poses:
-        note = NO_POSES if ssh_map.places else NO_PLACES
+        note = (ONLY_THEORY if ssh_map.paths else NO_POSES) if ssh_map.places else NO_PLACES
         yield replace(ssh_map, building=Indoors(notes=(note,)), paths=_theory_paths(ssh_map))
         return
     plan = FloorPlan.of(ssh_map, trace)
@@ -86,10 +98,13 @@ def buildings_of(ssh_map: SSHMap, trace: Trace, most: int = 0) -> Iterator[SSHMa
     doors = with_doors(plan, room, ssh_map) if plan.measured else ()
     scanned = any("course" in step.extra for step in trace.steps)
     notes = () if plan.measured else (NO_WIDTHS if scanned else NO_SCANS,)
+    spaces = spaces_of(plan, room) if plan.measured else {}
+    outlines = outlines_of(spaces)
+    plan = straightened(plan, room, spaces, outlines)
     for ways in ways_of(plan, most):
         paths = paths_of(plan, ways)
-        corridors = corridors_of(plan, ways, paths)
-        rooms = rooms_of(plan, room, doors, corridors) if plan.measured else ()
+        corridors = corridors_of(plan, widened(ways, room, spaces), paths)
+        rooms = rooms_of(plan, room, doors, corridors, outlines) if plan.measured else ()
         building = Indoors(corridors, rooms, doors, listed, notes)
         yield replace(ssh_map, building=building, paths=_theory_paths(ssh_map) or paths)
 

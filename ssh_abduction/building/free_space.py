@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from perception.places.passages import directions
+from perception.places.passages import WIDE, directions
 from ssh_abduction.building.edges import PlanEdge, walls_beside
 from ssh_abduction.building.travels import Array
 
@@ -42,6 +43,27 @@ def drawn(strips: Sequence[Array], *more: Array) -> tuple[NDArray[np.bool_], Arr
     for strip in strips:
         free[polygon(*((strip - corner) / GRID).T, free.shape)] = True
     return free, corner
+
+
+@dataclass(frozen=True, eq=False)
+class RoomSpace:
+    """The free space of a room: which cells are free, and the position of the first cell."""
+
+    free: NDArray[np.bool_]
+    corner: Array
+
+    def beside(self, course: Array) -> Array:
+        """How far the free space reaches left and right of a course, (n, 2) metres."""
+        ahead = directions(course)
+        left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+        off = np.arange(1, round(2 * WIDE / GRID) + 1)[:, None, None] * GRID * left
+        reach = []
+        for sign in (1, -1):
+            cells = np.rint((course + sign * off - self.corner) / GRID).astype(int)
+            inside = np.all((cells >= 0) & (cells < self.free.shape), axis=2)
+            x, y = np.where(inside[..., None], cells, 0).transpose(2, 0, 1)
+            reach.append(np.logical_and.accumulate(inside & self.free[x, y]).sum(axis=0) * GRID)
+        return np.stack(reach, axis=1)
 
 
 class FreeView:

@@ -7,19 +7,20 @@ corridor parts rooms, but neither the path nor the corridor.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby, pairwise
+from itertools import combinations, groupby, pairwise
 
 import networkx as nx
 import numpy as np
 from scipy import ndimage
 
+from perception.places.passages import DOOR
 from ssh_abduction.building.edges import FloorPlan
-from ssh_abduction.building.free_space import GRID, drawn, strips_of
+from ssh_abduction.building.free_space import GRID, RoomSpace, drawn, strips_of
 from ssh_abduction.building.straight_paths import PairedWay, branches, chain_points
 from ssh_abduction.building.travels import Array
-from ssh_abduction.data.building import Corridor, MapDoor, MapRoom, WayOut
+from ssh_abduction.data.building import Corridor, MapDoor, MapRoom, Point, WayOut
 from ssh_abduction.data.map_parts import MapPath
 from ssh_abduction.data.maps import SSHMap
 
@@ -39,13 +40,46 @@ Part = tuple[int, int]  # the first and the last point of a part of a way
 
 
 def room_of_places(plan: FloorPlan) -> dict[int, int]:
-    """Find the room of each place and corner: those that no door parts have one room."""
+    """Find the room of each place and corner: those that no door parts have one room.
+
+    Parts that share free space which is wider than a door are one room, too: no wall is between.
+    """
     graph = nx.Graph()
     graph.add_nodes_from(plan.spots)
     graph.add_edges_from(edge.ends for edge in plan.edges if not edge.doors)
+    graph.add_edges_from([*_shared(plan, _numbered(graph))])
+    return _numbered(graph)
+
+
+def _numbered(graph: nx.Graph) -> dict[int, int]:
+    """Number the connected parts of a graph of places and corners."""
     parts = sorted(map(sorted, nx.connected_components(graph)), key=lambda part: abs(part[-1]))
     parts.sort(key=lambda part: next((p for p in part if p >= 0), math.inf))
     return {p: k for k, part in enumerate(parts) for p in part}
+
+
+def _shared(plan: FloorPlan, room: dict[int, int]) -> Iterator[tuple[int, int]]:
+    """Yield a place of each of two rooms that share free space which is wider than a door."""
+    strips, spot = strips_of_rooms(plan, room), {k: p for p, k in room.items()}
+    every = [strip for some in strips.values() for strip in some]
+    free = {k: drawn(some, *every)[0] for k, some in strips.items()}
+    for k, other in combinations(free, 2):
+        p, q = spot[k], spot[other]
+        both = free[k] & free[other]
+        if plan.spots[p].frame != plan.spots[q].frame or both.sum() * GRID < DOOR:
+            continue
+        if 2 * GRID * float(ndimage.distance_transform_edt(both).max()) > DOOR:
+            yield p, q
+
+
+def strips_of_rooms(plan: FloorPlan, room: dict[int, int]) -> dict[int, list[Array]]:
+    """Find the strips of free space along the ways of each room. Edges are cut at their doors."""
+    strips: dict[int, list[Array]] = {}
+    for edge in plan.edges:
+        stops = [0, *(gap.at for gap in edge.doors), len(edge.course) - 1]
+        for end, begin, stop in ((edge.ends[0], *stops[:2]), (edge.ends[1], *stops[-2:])):
+            strips.setdefault(room[end], []).extend(strips_of(edge, begin, stop))
+    return {k: some for k, some in strips.items() if some}
 
 
 def with_doors(plan: FloorPlan, room: dict[int, int], ssh_map: SSHMap) -> tuple[MapDoor, ...]:
@@ -193,10 +227,13 @@ def _is_room(way: PairedWay, part: Part, share: float) -> bool:
 
 
 def rooms_of(
-    plan: FloorPlan, room: dict[int, int], doors: Sequence[MapDoor], corridors: Sequence[Corridor]
+    plan: FloorPlan,
+    room: dict[int, int],
+    doors: Sequence[MapDoor],
+    corridors: Sequence[Corridor],
+    outlines: Mapping[int, tuple[Point, ...]],
 ) -> tuple[MapRoom, ...]:
     """Make the rooms, from the room of each place. A room of corners alone has no places."""
-    outlines = _outlines(plan, room)
     return tuple(
         MapRoom(
             k,
@@ -209,25 +246,27 @@ def rooms_of(
     )
 
 
-def _outlines(plan: FloorPlan, room: dict[int, int]) -> dict[int, tuple[tuple[float, float], ...]]:
-    """Find the polygon of the free space of each room: what lies between the walls along its ways.
+def spaces_of(plan: FloorPlan, room: dict[int, int]) -> dict[int, RoomSpace]:
+    """Draw the free space of each room: what lies between the walls along its ways.
 
     Edges are cut at their doors. Free space that is narrower than SPIKE metres, such as the view
     through a door, is left out.
     """
-    from skimage.measure import approximate_polygon, find_contours
-
-    strips: dict[int, list[Array]] = {}
-    for edge in plan.edges:
-        stops = [0, *(gap.at for gap in edge.doors), len(edge.course) - 1]
-        for end, begin, stop in ((edge.ends[0], *stops[:2]), (edge.ends[1], *stops[-2:])):
-            strips.setdefault(room[end], []).extend(strips_of(edge, begin, stop))
     found = {}
-    for number, some in strips.items():
-        if not some:
-            continue
+    for number, some in strips_of_rooms(plan, room).items():
         free, corner = drawn(some)
         free = ndimage.binary_opening(free, iterations=round(SPIKE / GRID / 2))
+        found[number] = RoomSpace(free, corner)
+    return found
+
+
+def outlines_of(spaces: Mapping[int, RoomSpace]) -> dict[int, tuple[Point, ...]]:
+    """Find the polygon of the free space of each room."""
+    from skimage.measure import approximate_polygon, find_contours
+
+    found = {}
+    for number, space in spaces.items():
+        free, corner = space.free, space.corner
         rings = find_contours(np.pad(free, 1).astype(float), 0.5)
         if rings:
             ring = approximate_polygon(max(rings, key=len), 1.5)[:-1]

@@ -19,11 +19,12 @@ from ssh_abduction.cli.parsing import MAPS
 from ssh_abduction.cli.use import way_in_words
 from ssh_abduction.data.building import Corridor, MapDoor, MapRoom
 from ssh_abduction.data.checks import needed
-from ssh_abduction.data.corrections import FILE, number_at
+from ssh_abduction.data.corrections import FILE
 from ssh_abduction.data.drives import step_of
 from ssh_abduction.data.errors import AbductionError, MapError, brief, named
 from ssh_abduction.data.map_parts import list_in_words
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.parts_of_dstates import number_at
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
 from ssh_abduction.explain.pair_reasons import explain_pair

@@ -32,7 +32,6 @@ from ssh_abduction.data.corrections import (
     beside,
     direction,
     load_corrections,
-    number_at,
     save_corrections,
 )
 from ssh_abduction.data.drives import (
@@ -53,6 +52,7 @@ from ssh_abduction.data.map_parts import (
     thing_named,
 )
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.parts_of_dstates import number_at
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted, meant
 from ssh_abduction.explain.no_map import Explanation, explain
@@ -531,9 +531,11 @@ class SavedMap:
                 "places all belong to regions that are smaller or behind a door; name one of "
                 f"{', '.join(sorted(others))}"
             )
+        known = number in self.map.things().get(kind, ())
+        why = "but no step tells it from others" if known else "but the map has none of this number"
         raise MapError(
-            f"{text}: expected a {kind} of the map, got {brief(text)}, but the map has none of "
-            "this number; ssh-abduction show lists them"
+            f"{text}: expected a {kind} of the map, got {brief(text)}, {why}; ssh-abduction show "
+            "lists them"
         )
 
     def thing_to_name(self, text: str) -> tuple[str, str]:

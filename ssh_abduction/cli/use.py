@@ -183,12 +183,13 @@ def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
     {
         "maps": shared.MAPS_SAID,
         "--from A": (
-            "start: a dstate such as d7, a step such as monday:12, or a place or region by number "
-            "or name, such as p3, region2 or kitchen (default: the robot's last dstate)",
+            "start: a dstate such as d7, a step such as monday:12, or a place, region, corridor, "
+            "room, door or path by number or name, such as p3, room2 or kitchen (default: the "
+            "robot's last dstate)",
             {"dest": "start"},
         ),
-        "--to B!": ("goal: a dstate, place or region, named as for --from", {"dest": "goal"}),
-        "--avoid X...": "dstates, places and regions that the route must not visit",
+        "--to B!": ("goal: a dstate, place or room, named as for --from", {"dest": "goal"}),
+        "--avoid X...": "what the route must not visit, named as for --from",
         "--by {actions,places,metres}": (
             "what to minimise. With actions or metres, a route uses only moves that the robot has "
             "made. With places, it may also follow any path of the map, and drive back where the "

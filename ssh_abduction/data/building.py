@@ -192,10 +192,6 @@ class Indoors(SparseData):
         """The id of the longest corridor through a place; None if there is none."""
         return next((c.id for c in self.corridors if place in c.order), None)
 
-    def door_of(self, dstate: int) -> int | None:
-        """The id of the first door through which travels from a dstate lead; None if none do."""
-        return next((door.id for door in self.doors if dstate in door.dstates), None)
-
     def renumbered(
         self,
         place: Mapping[int | None, int],

@@ -41,8 +41,9 @@ from ssh_abduction.data.checks import (
 from ssh_abduction.data.drives import Drive, drives_of, fingerprints_of, step_name, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, is_writable, named, said_of
 from ssh_abduction.data.files import json_line, parse_yaml, read_file, save_file
-from ssh_abduction.data.map_parts import NAMED, Name, region_of, thing_named
+from ssh_abduction.data.map_parts import NAMED, Name, thing_named
 from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.parts_of_dstates import number_at
 from ssh_abduction.data.schema import FieldReader, only_known
 from ssh_abduction.data.star import near_quarter, star_to_json, with_gateway
 from ssh_abduction.data.step import SEEN
@@ -414,8 +415,8 @@ class Corrections:
             if thing_named(naming.name) or (drive in self.drives and number.isdecimal()):
                 raise MapError(
                     f"{where}: names[{i}]: expected a name such as kitchen, got "
-                    f"{brief(naming.name)}, which is how to write a dstate, place, path, region or "
-                    f"step by its number; give another one, such as 'room {naming.name}'"
+                    f"{brief(naming.name)}, which is how to write a dstate, step or part of a map "
+                    f"by its number; give another one, such as 'room {naming.name}'"
                 )
             for key, what in (
                 ((naming.name,), f"another name than {brief(naming.name)}"),
@@ -448,24 +449,6 @@ class Corrections:
             if near_quarter(way) == quarter and action is not None and action.kind == "travel":
                 why = f"the robot {what} {name} through it; say it is open"
                 raise self._contradicted(said, why)
-
-
-def number_at(ssh_map: SSHMap, kind: str, label: int) -> int | None:
-    """Return the number of the place, path, region and so on of a dstate; None if it has none.
-
-    The door of a dstate is the first one through which a travel from there leads. The path of a
-    map without paths of its theory is the longest one through the place.
-    """
-    dstate, building = ssh_map.dstates[label], ssh_map.building
-    if kind in ("corridor", "room", "door"):
-        number = {"corridor": "corridor_of", "room": "room_of", "door": "door_of"}[kind]
-        at = label if kind == "door" else dstate.place
-        return getattr(building, number)(at) if building else None
-    if kind == "path" and not ssh_map.theory_paths:
-        return next((p.id for p in ssh_map.paths if dstate.place in p.order), None)
-    if kind == "region":
-        return region_of(ssh_map.regions, dstate.place)
-    return dstate.place if kind == "place" else dstate.path
 
 
 def direction_in_words(way: float) -> str:

@@ -124,6 +124,18 @@ class SSHMap:
         """The doors; empty if none were derived."""
         return self.building.doors if self.building else ()
 
+    def things(self) -> dict[str, dict[int, tuple[int, ...]]]:
+        """The places of all that can be named, by kind and number, without kinds that it lacks."""
+        found: dict[str, dict[int, tuple[int, ...]]] = {
+            "place": {p: (p,) for p in self.places},
+            "path": {path.id: path.order for path in self.paths},
+            "region": {region.id: region.places for region in self.regions or ()},
+            "corridor": {corridor.id: corridor.order for corridor in self.corridors},
+            "room": {room.id: room.places for room in self.rooms},
+            "door": {door.id: door.places for door in self.doors},
+        }
+        return {kind: some for kind, some in found.items() if some}
+
     @property
     def labels(self) -> tuple[Any, ...]:
         """The id of the dstate of each step: one sequence for each drive if there are several.

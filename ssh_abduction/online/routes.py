@@ -219,15 +219,15 @@ def route(
 
     Args:
         maps: A solution, maps of one trace, or one map.
-        start: The number of a dstate, such as 7 or "d7"; or a step such as "monday:12"; or a place
-            or region, such as "p3", "region2" or "kitchen", which means any dstate there; None for
-            the dstate of the last step.
-        goal: A dstate, place or region, named in the same way.
+        start: The number of a dstate, such as 7 or "d7"; or a step such as "monday:12"; or a place,
+            path, region, corridor, room or door, such as "p3", "room2" or "kitchen", which means
+            any dstate there; None for the dstate of the last step.
+        goal: A dstate, place and so on, named in the same way.
         by: What to minimise. "actions" and "metres" use links only: moves that the robot has made.
             "places" minimises travels. It also uses moves that the robot has not made: along the
             paths of the map or, if the map has no paths, back along each travel. None means
             "actions" if links lead to the goal, else "places".
-        avoid: Dstates, places and regions that the route must not visit, named in the same way.
+        avoid: What the route must not visit, named in the same way. A door is not passed.
         map: The number of the map to use, from 1, or its id.
 
     Raises:
@@ -402,11 +402,11 @@ class MoveGraph:
     def nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
         """Return the dstates that a user names, and words for them, such as "place 3".
 
-        `name` is a dstate, place or region by its number, such as "d3", "p3" or "region2", or a
-        name that a person gave. A place or region stands for all dstates there, and a step such as
-        "monday:12" for its dstate. The int 3 is dstate 3. But the text "3" is refused if the map
-        has places, as it may be a place, too. `field` is the name of the user's parameter, for
-        messages. Raises MapError, which lists what exists.
+        `name` is a dstate, place, path, region, corridor, room or door by its number, such as "d3",
+        "p3" or "room2", or a name that a person gave. All but a dstate stand for all dstates there,
+        and a step such as "monday:12" for its dstate. The int 3 is dstate 3. But the text "3" is
+        refused if the map has places, as it may be a place, too. `field` is the name of the user's
+        parameter, for messages. Raises MapError, which lists what exists.
         """
         if isinstance(name, str) and self.map.places:
             check_says_what(name, self._drives[0].name if self._drives else None)
@@ -416,28 +416,21 @@ class MoveGraph:
                 kind, number = "dstate", self.map.dstate_at[step_of(self._drives, str(name))]
             except TraceError as error:
                 raise MapError(f"{field}: {error}") from None
-        region = next((r for r in self.map.regions or () if r.id == number), None)
-        places = {"place": {number}, "region": {*region.places} if region else set()}
-        for room in self.map.rooms:
-            if (kind, number) == ("room", room.id):
-                places["room"] = {*room.places}
-        for corridor in self.map.corridors:
-            if (kind, number) == ("corridor", corridor.id):
-                places["corridor"] = {*corridor.order}
-        found: set[Node] = {
-            s.id
-            for s in self.map.dstates
-            if (s.id == number if kind == "dstate" else s.place in places.get(kind or "", ()))
-        }
+        things = self.map.things()
+        places = things.get(kind or "", {}).get(number, ())
+        found: set[Node] = {s.id for s in self.map.dstates if s.place in places}
+        if kind == "dstate":
+            found = {s.id for s in self.map.dstates if s.id == number}
+        elif kind == "door" and places and field.startswith("avoid"):
+            found = {*self.map.doors[number].dstates}  # Travels through it begin there.
         if found and kind:
             if kind == "dstate":
                 return found, self.dstate_called(number)
             return found, self.map.called(kind, number)
-        known = f", or a place as p{self.map.places[0]}" if self.map.places else ""
-        known += ", or a region as region0" if self.map.regions else ""
-        names = [
-            n.text for n in self.map.names if n.kind in ("place", "region", "room", "corridor")
-        ]
+        known = "".join(
+            f", or a {k} as {'p' if k == 'place' else k}{min(some)}" for k, some in things.items()
+        )
+        names = [n.text for n in self.map.names]
         known += f", or {', '.join(names)}" if names else ""
         raise MapError(
             f"{field}: expected a dstate, 0 to {len(self.map.dstates) - 1}{known}, got "

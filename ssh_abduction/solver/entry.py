@@ -17,7 +17,6 @@ from ssh_abduction.data.corrections import (
     Corrections,
     checked_corrections,
     direction_in_words,
-    number_at,
 )
 from ssh_abduction.data.drives import (
     Drive,
@@ -30,6 +29,7 @@ from ssh_abduction.data.drives import (
 )
 from ssh_abduction.data.errors import SolverError, brief, named
 from ssh_abduction.data.maps import SSHMap, check_of_trace
+from ssh_abduction.data.parts_of_dstates import number_at
 from ssh_abduction.data.star import with_gateway
 from ssh_abduction.data.step import Step
 from ssh_abduction.data.trace import Trace, checked_trace
