@@ -13,6 +13,7 @@ import pytest
 
 from ssh_abduction import Solution, Theory, Trace, check, export_map, route, solve
 from ssh_abduction.cli import main
+from ssh_abduction.cli.judge import _with_steps
 from ssh_abduction.data import (
     Corrections,
     MapError,
@@ -31,6 +32,7 @@ from ssh_abduction.data.star import Gateway, with_gateway
 from ssh_abduction.output import to_dot, to_networkx, to_svg
 from ssh_abduction.output.cards import map_card
 from ssh_abduction.page.content import content_of
+from ssh_abduction.rivals import Listing
 
 MONDAY = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
 TUESDAY = Trace.from_steps("bcd", ["around", "travel"], name="tuesday")
@@ -78,6 +80,23 @@ def folder(solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 def solving(folder: Path, *names: str) -> list[str]:
     files = [str(folder / f"{name}.jsonl") for name in names or ("monday", "tuesday")]
     return ["solve", *files, "--together", "-o", str(folder / "building" / "maps.json")]
+
+
+def test_typos_of_things_name_what_is_near(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = str(folder / "building" / "maps.json")
+    for words, said in (
+        (["explain", maps, "p0", "p99"], "p99: expected a place of the map"),
+        (["explain", maps, "p0", "pth1"], "step 'pth1': expected a step"),
+        (["name", maps, "regoin1", "x"], "did you mean region1"),
+        (["name", maps, "1", "x"], "write p1, d1 or monday:1"),
+    ):
+        assert main(words) == 1
+        assert said in capsys.readouterr().err
+    listing = Listing.load(maps)
+    assert _with_steps(["p0", "monday:1"], listing) == ["step0", "monday:1"]
+    assert _with_steps(["p0", "path0"], listing) == ["p0", "path0"]
 
 
 def test_corrections_survive_a_round_trip(tmp_path: Path) -> None:

@@ -500,6 +500,7 @@ class SavedMap:
             return "place", self.step(text)
         except MapError as error:
             names = {name.text for name in self.map.names} | {n.name for n in self._names}
+            names |= {f"{kind}{n}" for kind in NAMED for n in re.findall(r"\d+$", text)}
             hint = meant(text, names, 3) or "; or a place such as p4"
             raise MapError(f"{error}{hint}") from None
 

@@ -366,11 +366,11 @@ Answer: TypeAlias = PairExplanation | TraceExplanation | PlaceExplanation
         ),
         "[steps step...]": (
             "what to explain. Two steps (numbers from 0, or DRIVE:STEP in a joint trace): why they "
-            "are one dstate or two. A place and a path, such as p7 path2: on which side of the "
-            "path the place lies. A place alone: its side of each path, and its regions. Nothing: "
-            "why the trace has no map. Numbers of places and paths are those of the first minimal "
-            "map, or of the first map in a file of maps. In a file, places and paths may also be "
-            "given by name",
+            "are one dstate or two. In a file of maps, a place stands for its first step. A place "
+            "and a path, such as p7 path2: on which side of the path the place lies. A place "
+            "alone: its side of each path, and its regions. Nothing: why the trace has no map. "
+            "Numbers of places and paths are those of the first minimal map, or of the first map "
+            "in a file of maps. In a file, places and paths may also be given by name",
             {"default": ()},
         ),
         **shared.max_maps("minimal maps, to count those in which the two steps are one dstate"),
@@ -413,6 +413,8 @@ def run_explain(options: argparse.Namespace) -> int:
         listing = listing if listing.steps == len(trace) else None
     if listing is not None:
         given["known"] = listing.maps
+    if listing is not None:
+        options.steps = _with_steps(options.steps, listing)
     of_place = _place_asked(options.steps, listing)
     question: PairQuestion | TraceQuestion | PlaceQuestion
     pair: PairInMap | None = None
@@ -451,6 +453,24 @@ def run_explain(options: argparse.Namespace) -> int:
         answer = question.answer()
         guard.finish(_exit_code(answer), lambda: written(answer))
     return _exit_code(answer)
+
+
+def _with_steps(words: Sequence[str], listing: Listing) -> Sequence[str]:
+    """Replace each of two places, in a question without a path, by the first step there."""
+    ssh_map = listing.maps[0]
+    found = [thing_named(word, ssh_map.names) or ("", 0) for word in words]
+    if len(words) != 2 or "path" in (kinds := [kind for kind, _ in found]) or "place" not in kinds:
+        return words
+    first = {ssh_map.dstates[s].place: t for t, s in reversed([*enumerate(ssh_map.dstate_at)])}
+    steps = []
+    for word, (kind, number) in zip(words, found, strict=True):
+        if kind == "place" and number not in first:
+            raise AbductionError(
+                f"{word}: expected a place of the map, got {brief(word)}, but the map has none of "
+                "this number; ssh-abduction show lists them"
+            )
+        steps.append(f"step{first[number]}" if kind == "place" else word)
+    return steps
 
 
 def _place_asked(words: Sequence[str], listing: Listing | None) -> tuple[int, int | None] | None:
