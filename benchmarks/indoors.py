@@ -7,7 +7,8 @@ doors the robot drove through. Usage:
 
 LOG.log is a log that `simulate --format carmen` wrote, with its truth beside it. MAPS is the folder
 that `map` wrote. A corridor of the plan counts if the robot visited three of its places or more. It
-is whole if one corridor of the map, and no other, has at least two of them, and all but one.
+is whole if one corridor of the map, and no other, has at least two of them, and all but one. A
+corridor of the map is merged if it has two places or more of each of two of them.
 
 The order of the places of a corridor of the map is judged by Kendall's tau: it is compared with
 their true positions along the line that fits them best. A place is truly left of the path of a
@@ -69,14 +70,18 @@ def judged(
     def label(name: str) -> str:
         return labels[int(name.split()[1])] or ""
 
-    for name, count in Counter(true.values()).items():
-        if count >= 3 and "CORR" in label(name):
-            own = {p for p in true if true[p] == name}
-            shared = [len(own & other) for other in corridors if len(own & other) > 1]
-            counts["corridors true"] += 1
-            counts["corridors whole"] += len(shared) == 1 and shared[0] >= len(own) - 1
-            counts["corridors missed"] += not shared
+    halls = [
+        {p for p in true if true[p] == name}
+        for name, count in Counter(true.values()).items()
+        if count >= 3 and "CORR" in label(name)
+    ]
+    for own in halls:
+        shared = [len(own & other) for other in corridors if len(own & other) > 1]
+        counts["corridors true"] += 1
+        counts["corridors whole"] += len(shared) == 1 and shared[0] >= len(own) - 1
+        counts["corridors missed"] += not shared
     for other in corridors:
+        counts["corridors merged"] += sum(len(own & other) > 1 for own in halls) > 1
         names = Counter(true[p] for p in other if p in true)
         counts["corridors named"] += 1
         counts["corridors false"] += not names or "CORR" not in label(names.most_common(1)[0][0])

@@ -802,7 +802,7 @@ def test_names_are_in_all_exports_of_a_map(
     assert route(ssh_map, 0, "kitchen").goal == "place 1 (kitchen)"
     with pytest.raises(
         MapError,
-        match="a place as p0, or a path as path0, or a region as region0, or hall, kitchen, got 'den'",
+        match="a path as path0, or a region as region0, or hall, kitchen, got 'den'",
     ):
         route(ssh_map, 0, "den")
     ssh_map.save(folder / "map.json")

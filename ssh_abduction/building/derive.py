@@ -100,7 +100,7 @@ def buildings_of(ssh_map: SSHMap, trace: Trace, most: int = 0) -> Iterator[SSHMa
     notes = () if plan.measured else (NO_WIDTHS if scanned else NO_SCANS,)
     spaces = spaces_of(plan, room) if plan.measured else {}
     outlines = outlines_of(spaces)
-    plan = straightened(plan, room, spaces, outlines)
+    plan = straightened(plan, room, spaces)
     for ways in ways_of(plan, most):
         paths = paths_of(plan, ways)
         corridors = corridors_of(plan, widened(ways, room, spaces), paths)

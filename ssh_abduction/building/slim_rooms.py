@@ -13,66 +13,50 @@ from itertools import pairwise
 
 import numpy as np
 
-from perception.places.passages import STEP, resampled
+from perception.places.passages import STEP, directions, resampled
 from ssh_abduction.building.edges import FloorPlan, Gap, PlanEdge, Spot
-from ssh_abduction.building.free_space import RoomSpace
+from ssh_abduction.building.free_space import GRID, RoomSpace
 from ssh_abduction.building.rooms import BESIDE, LONG, SLIM
 from ssh_abduction.building.straight_paths import PairedWay
 from ssh_abduction.building.travels import Array
-from ssh_abduction.data.building import Point
 
 ONWARD = math.radians(45)  # An edge that leaves within this angle goes on straight.
 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """The least rectangle around a room."""
+    """The rectangle around a room, along its longer axis."""
 
     middle: Array
-    ahead: Array  # the unit vector along its longer side
+    ahead: Array  # the unit vector along it
     length: float
     width: float
 
     @classmethod
-    def of(cls, outline: Sequence[Point]) -> Box:
-        """Find the rectangle of least area around a polygon."""
-        from scipy.spatial import ConvexHull
-
-        points = np.array(outline)
-        hull = points[ConvexHull(points).vertices]
-        boxes = []
-        for x, y in np.roll(hull, -1, axis=0) - hull:
-            ahead = np.array([x, y]) / math.hypot(x, y)
-            frame = np.stack([ahead, [-ahead[1], ahead[0]]])
-            least, most = (hull @ frame.T).min(axis=0), (hull @ frame.T).max(axis=0)
-            k = int((most - least).argmax())
-            sizes = sorted(most - least, reverse=True)
-            boxes.append(
-                cls((least + most) / 2 @ frame, frame[k], float(sizes[0]), float(sizes[1]))
-            )
-        return min(boxes, key=lambda box: box.length * box.width)
+    def of(cls, space: RoomSpace) -> Box:
+        """Find the rectangle around the free cells of a room."""
+        cells = space.corner + GRID * np.argwhere(space.free)
+        frame = np.linalg.eigh(np.cov(cells.T))[1].T[::-1]
+        least, most = (cells @ frame.T).min(axis=0), (cells @ frame.T).max(axis=0)
+        length, width = most - least
+        return cls((least + most) / 2 @ frame, frame[0], float(length), float(width))
 
     def along(self, point: Array) -> float:
         """How far a point is along the box, from its middle."""
         return float((point - self.middle) @ self.ahead)
-
-    def left_of(self, off: Array) -> bool:
-        """Whether a vector points to the left of the box."""
-        return bool(self.ahead[0] * off[1] - self.ahead[1] * off[0] > 0)
 
 
 def straightened(
     plan: FloorPlan,
     room: Mapping[int, int],
     spaces: Mapping[int, RoomSpace],
-    outlines: Mapping[int, Sequence[Point]],
 ) -> FloorPlan:
     """Return the plan with one straight way through each room that is long and slim."""
     spots, edges, corners = dict(plan.spots), list(plan.edges), plan.corners
-    for number, outline in outlines.items():
+    for number, space in spaces.items():
         inner = [e for e in edges if not e.doors and {room.get(p) for p in e.ends} == {number}]
-        box = Box.of(outline)
-        if not inner or box.length < max(LONG, SLIM * box.width):
+        box = Box.of(space) if inner and space.free.any() else None
+        if box is None or box.length < max(LONG, SLIM * box.width):
             continue
         others = [edge for edge in edges if all(edge is not e for e in inner)]
         far = sorted((box.along(spots[p].at), p) for p in spots if room.get(p) == number)
@@ -90,7 +74,7 @@ def straightened(
         for metres, (_, p) in zip(at, far, strict=True):
             spots[p] = replace(spots[p], at=box.middle + metres * box.ahead)
         ends = [p for _, p in far]
-        edges = [*others, *_chain(box, spaces[number], ends, at, inner)]
+        edges = [*others, *_chain(box, space, ends, at, inner)]
     edges.sort(key=lambda e: (min(e.travels), e.ends))
     return FloorPlan(spots, edges, plan.name, plan.measured, corners)
 
@@ -132,8 +116,7 @@ def _chain(
     seen: list[tuple[float, Gap]] = []
     for edge in inner:
         for gap in (p for p in edge.passages if p.side != "through"):
-            k = max(1, min(gap.at, len(edge.course) - 2))
-            same = (edge.course[k + 1] - edge.course[k - 1]) @ box.ahead > 0
+            same = directions(edge.course)[gap.at] @ box.ahead > 0
             side = gap.side if same else {"left": "right", "right": "left"}[gap.side]
             metres = box.along(edge.course[gap.at])
             if all(g.side != side or abs(m - metres) > BESIDE for m, g in seen):
@@ -142,7 +125,9 @@ def _chain(
     for (p, begin), (q, end) in pairwise(zip(ends, at, strict=True)):
         line = box.middle + np.array([[begin], [end]]) * box.ahead
         course = resampled(line, STEP)
-        gaps = (replace(g, at=round((m - begin) / STEP)) for m, g in seen if begin < m <= end)
-        passages = tuple(sorted(gaps, key=lambda g: g.at))
-        passages = tuple(replace(g, at=min(g.at, len(course) - 1)) for g in passages)
+        passages = tuple(
+            replace(gap, at=min(round((m - begin) / STEP), len(course) - 1))
+            for m, gap in sorted(seen, key=lambda pair: pair[0])
+            if begin < m <= end
+        )
         yield PlanEdge((p, q), course, travels, space.beside(course), passages)

@@ -24,7 +24,6 @@ from ssh_abduction.data.drives import step_of
 from ssh_abduction.data.errors import AbductionError, MapError, brief, named
 from ssh_abduction.data.map_parts import list_in_words
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.parts_of_dstates import number_at
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import meant
 from ssh_abduction.explain.pair_reasons import explain_pair
@@ -119,12 +118,9 @@ class KnownMap:
 
     def steps(self, kind: str, number: int | None) -> frozenset[int]:
         """The steps at a place, or in a room or corridor."""
-        at = self.map.dstate_at
-        return frozenset(
-            t
-            for t, label in enumerate(at)
-            if number is not None and number_at(self.map, kind, label) == number
-        )
+        places = self.map.things().get(kind, {}).get(-1 if number is None else number, ())
+        at = (self.map.dstates[label].place for label in self.map.dstate_at)
+        return frozenset(t for t, place in enumerate(at) if place in places)
 
     def steps_at(self, places: Iterable[int]) -> frozenset[int]:
         """The steps at some places."""
