@@ -6,8 +6,8 @@ Context Protocol asks about fifty questions about the map. Usage:
     python benchmarks/agent_questions.py LOG.log MAPS [LOG.log MAPS ...]
 
 LOG.log is a log that `simulate PLAN.xml --format carmen` wrote, with its truth beside it. MAPS is
-the folder that `map` wrote; names are given in a copy of it. An answer is sure if it says so: its
-probability is 0.95 or more. The questions are:
+the folder that `map` wrote; names are given in a copy of it. An answer is sure if it says so, as
+in "sure: probability 0.99". The questions are:
 
 * "Is room 4 the room I saw at step 90?", for pairs of a room of the map and a step. It is true if
   most visits to the room were in the true room of the step.
@@ -39,7 +39,7 @@ import numpy as np
 from mcp import Client
 
 from ssh_abduction import Trace
-from ssh_abduction.cli.agent_desk import SURE, MapDesk, server_of
+from ssh_abduction.cli.agent_desk import MapDesk, server_of
 from ssh_abduction.data.groups import gathered
 
 NEAR = 1.5  # metres between two visits to one place
@@ -79,7 +79,7 @@ async def asked(client: Client, truth: TruthOfDrive, seed: int) -> AsyncIterator
         return dict(result.structured_content or {})
 
     def is_sure(answer: dict[str, Any]) -> bool:
-        return (answer["probability"] or 0) >= SURE
+        return answer["how_sure"].startswith("sure")
 
     listed = await ask("list_rooms_and_places")
     places = {place["place"]: place for place in listed["places"]}

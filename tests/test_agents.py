@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from ssh_abduction.theory.theory import Theory
 mcp = pytest.importorskip("mcp")
 
 from ssh_abduction.cli import agent_desk  # noqa: E402
-from ssh_abduction.cli.agent_desk import MapDesk, server_of  # noqa: E402
+from ssh_abduction.cli.agent_desk import KnownMap, MapDesk, server_of  # noqa: E402
 
 # Rooms: 0 has the corridor with places 0 to 3; 1 is place 4, left of it; 2 is place 5, right of it.
 DOORS = [(1, 4), (2, 5)]
@@ -117,6 +118,19 @@ def test_questions(house: Path, tool: str, given: dict[str, str], expected: dict
         assert answer["how_sure"].startswith(sure)
     if tool == "route":
         assert "through the door" in answer["said"]
+
+
+def test_no_answer_is_sure_of_a_room_with_a_gap_as_narrow_as_a_door(house: Path) -> None:
+    known = KnownMap.load(house)
+    assert known.sureness(1.0, [0])["how_sure"].startswith("sure")
+    narrow = {"widths": [[0.3, 0.4]]}
+    steps = [replace(step, extra={**step.extra, **narrow}) for step in known.trace.steps]
+    gap = replace(known, trace=replace(known.trace, steps=tuple(steps)))
+    assert gap.sureness(1.0, [0]) == {
+        "probability": 1.0,
+        "how_sure": "doubtful: a gap as narrow as a door may divide room 0",
+    }
+    assert gap.sureness(0.5, [0])["how_sure"] == "doubtful: probability 0.50"
 
 
 def test_a_reason_and_an_experiment_are_said(house: Path, monkeypatch: pytest.MonkeyPatch) -> None:

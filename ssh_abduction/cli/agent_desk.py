@@ -42,7 +42,8 @@ INSTRUCTIONS = (
     "Maps of buildings that a robot drove through. Name things by number, such as p4, room4, "
     "corridor2 or door1, by a name that a person gave, or by a step of the drive, such as "
     "'step 90'. A probability in an answer is that of the joins of visits that the answer needs: "
-    "that the robot was at one place twice. Walls and doors are taken as the laser saw them."
+    "that the robot was at one place twice. Walls and doors are taken as the laser saw them, "
+    "but no answer is sure of a room that a gap as narrow as a door may divide."
 )
 
 
@@ -151,6 +152,26 @@ class KnownMap:
         best = partition(weighed.rivals[0].at) if weighed else set()
         return self.share(lambda at: partition(at) == best)
 
+    def may_be_two(self, room: int) -> bool:
+        """Whether the robot passed a gap in a room that is no wider than a door of this map."""
+        places, doors = self.map.rooms[room].places, self.map.doors
+        widest = max((door.width for door in doors), default=0.0)
+        at = [self.map.dstates[label].place for label in self.map.dstate_at]
+        return any(
+            here in places and there in places and sum(widths) <= widest
+            for step, here, there in zip(self.trace.steps, at, at[1:], strict=False)
+            for widths in step.extra.get("widths", ())
+        )
+
+    def sureness(self, probability: float | None, rooms: Iterable[int]) -> Answer:
+        """How sure an answer about some rooms is, as a number and in words."""
+        narrow = sorted(filter(self.may_be_two, rooms))
+        if not narrow or not probability or probability < SURE:
+            return _sureness(probability)
+        two = ", ".join(self.map.called("room", room) for room in narrow)
+        said = f"doubtful: a gap as narrow as a door may divide {two}"
+        return {"probability": probability, "how_sure": said}
+
 
 class MapDesk:
     """Answers questions about the maps in some folders. Each of `tools` is a question.
@@ -256,12 +277,13 @@ class MapDesk:
         beyond = here.union(*(indoors.rooms[room].places for room in rooms))
         called = ", ".join(known.map.called("room", room) for room in rooms)
         probability = known.as_mapped(known.steps_at(beyond)) if rooms else None
+        concerned = {*rooms, *(room for room in own if room is not None)}
         return {
             "said": f"beside {known.called(kind, step)}: {called or 'no room that is known'}",
             "rooms": rooms,
             "names": [known.map.name_of("room", room) for room in rooms],
             "doors": [door.id for door in doors],
-            **_sureness(probability),
+            **known.sureness(probability, concerned),
             "all": "not known: there may be doors that the robot did not drive through or notice",
         }
 
@@ -297,7 +319,8 @@ class MapDesk:
             share = share if same or share is None else round(1 - share, 4)
         things = [known.called(kind, step) for _, step, _ in found]
         text = f"yes, both are {things[0]}" if same else f"no, {things[0]} and {things[1]} are two"
-        return {"same": same, "said": text, **_sureness(share)}
+        concerned = {n for n in numbers if n is not None and same and kind == "room"}
+        return {"same": same, "said": text, **known.sureness(share, concerned)}
 
     def why(self, one: str, other: str, building: str = "") -> Answer:
         """Say why two visits are at one place, or at two, by the axioms and the odometry."""
