@@ -28,7 +28,6 @@ from ssh_abduction.data.errors import (
     AbductionError,
     LocaliserError,
     MapError,
-    brief,
     named,
     printable,
     said_of,
@@ -518,12 +517,7 @@ def write_frame(maps: str, points: Sequence[Sequence[float]]) -> str:
         "-o --output FILE": "write the page to this file and do not open it",
         "--run TRACE": (
             "a second trace from the mapped world. The page replays it, with a belief about where "
-            "the robot is at each step. It may be the trace that was mapped. Beliefs come from its "
-            "views, or from the file of --belief"
-        ),
-        "--belief FILE": (
-            "file with what localise --json printed for the trace of --run, or for the trace that "
-            "was mapped"
+            "the robot is at each step. It may be the trace that was mapped"
         ),
         "--serve": (
             "serve the page, on this computer only, so that it can explain why two steps are one "
@@ -565,7 +559,7 @@ def run_view(options: argparse.Namespace) -> int:
         shlex.quote(options.trace) if options.trace else "TRACE",
         "".join(f" {shlex.quote(flag)}" for flag in flags),
     )
-    localised = _run(options, trace, listing)
+    localised = _run(options, trace)
     if options.serve:
         assert trace is not None
         return _serve(options, listing, trace, theory, localised, called)
@@ -602,49 +596,15 @@ def _check(options: argparse.Namespace, trace: Trace | None) -> None:
         raise AbductionError(f"port: expected 0 to 65535, got {options.port}; name a free port")
 
 
-def _run(options: argparse.Namespace, trace: Trace | None, listing: Listing) -> Run | None:
+def _run(options: argparse.Namespace, trace: Trace | None) -> Run | None:
     """Make the localised run that the options ask for; None if they ask for none."""
-    from ssh_abduction.page.content import Run
-
-    if options.run is None and options.belief is None:
+    if options.run is None:
         return None
-    followed = Trace.load(options.run) if options.run is not None else trace
-    if followed is None:
-        raise AbductionError(
-            "--belief: expected the trace of the run, got none; name it with --run, or give the "
-            "trace that was mapped"
-        )
-    if options.belief is not None:
-        return _with_beliefs(followed, options.belief, listing)
     from ssh_abduction.online.localiser import Localiser
-
-    return Run(followed, lambda ssh_map: Localiser(ssh_map, trace=trace).beliefs(followed))
-
-
-def _with_beliefs(followed: Trace, file: str, listing: Listing) -> Run:
-    """Make a run with the beliefs of a file that `localise --json` wrote. Raises MapError."""
     from ssh_abduction.page.content import Run
 
-    record = read_json(file)
-    record = record if isinstance(record, dict) else {}
-    beliefs = record.get("beliefs")
-    if not isinstance(beliefs, list):
-        raise MapError(
-            f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write "
-            "them with localise --json"
-        )
-    with said_of(named(file), MapError):
-        number = listing.number(record.get("map", 1))
-    chosen = listing.maps[number]
-    size = record.get("dstates", len(chosen.dstates)), len(beliefs)
-    if size != (len(chosen.dstates), len(followed)):
-        raise MapError(
-            f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, in "
-            f"map {number + 1} with {len(chosen.dstates)} dstates, got {size[1]} in a map with "
-            f"{brief(size[0])} dstates; run localise with these maps, or name that run with --run"
-        )
-    labels = chosen.dstate_at
-    return Run(followed, lambda ssh_map: beliefs if ssh_map.dstate_at == labels else None)
+    followed = Trace.load(options.run)
+    return Run(followed, lambda ssh_map: Localiser(ssh_map, trace=trace).beliefs(followed))
 
 
 def _serve(
