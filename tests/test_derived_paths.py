@@ -327,7 +327,8 @@ def test_pieces_and_floors_are_kept_apart(floors: bool) -> None:
     """Places and walls that lie at one point of two frames have nothing to do with each other."""
     one = drive(HALL, [0, 2, 1, 0], width=9.0, courses=LANE)
     other = drive(BETWEEN, [0, 1], width=0.4)
-    found = with_building(*in_frames([one, other, drive(CROSS, TOUR, doors=[(1, 4)])], floors))
+    joint, trace = in_frames([one, other, drive(CROSS, TOUR, doors=[(1, 4)])], floors)
+    found = with_building(joint, trace)
     assert len(found.floors if floors else found.pieces) == 3
     alone = orders(with_building(*one))
     assert alone == {(0, 2, 1)}, "the lane is no edge of its own"
@@ -336,6 +337,11 @@ def test_pieces_and_floors_are_kept_apart(floors: bool) -> None:
     assert [room.places for room in found.rooms] == [(0, 1, 2), (3, 4), (5, 6, 7, 8, 10), (9,)]
     street = next(path for path in found.paths if len(path.order) == 4)
     assert {*street.left, *street.right} == {9, 10}
+    if floors:
+        way = ("go 5 m on, to place 0", "take 'up'", "go 10 m along corridor 1, to place 4")
+        assert directions_to(found, trace, [2], [4]) == way
+    with pytest.raises(MapError, match="in another part"):
+        directions_to(found, trace, [3], [0])  # The robot took no lift back.
 
 
 def test_drives_that_share_places_have_common_paths() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import networkx as nx
 import numpy as np
@@ -24,6 +24,7 @@ from ssh_abduction.data.building import Corridor
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.output.roads import place_of_steps
 
 # A bend of less than AHEAD degrees goes straight on, and one of more than BACK turns around. A bend
 # of less than HALF degrees is half a turn, and one of more than SHARP is sharp. A person who comes
@@ -76,16 +77,26 @@ class Guide:
                 "displacements, or leave out --words"
             )
         self._map, self.plan = ssh_map, FloorPlan.of(ssh_map, trace)
+        at = [None if p is None else self.plan.name[p] for p in place_of_steps(ssh_map)]
+        self._lifts = [
+            (at[t], at[t + 1], action.name)
+            for t, action in enumerate(trace.actions)
+            if action.changes_floor
+        ]
 
     def ends_to(self, start: Collection[int], goal: Collection[int]) -> list[int]:
         """Find the shortest way: the ends at which its edges begin; empty at the goal.
 
-        An end is 2 x the number of an edge, plus 0 or 1. Raises MapError if no edges lead there.
+        An end is 2 x the number of an edge, plus 0 or 1; a lift or stairs is -1 minus its number.
+        Raises MapError if neither edges nor lifts lead there.
         """
         begin, end = ({self.plan.name[p] for p in some} for some in (start, goal))
-        graph: nx.MultiGraph[int] = nx.MultiGraph()
-        for x, edge in enumerate(self.plan.edges):
-            graph.add_edge(*edge.ends, key=x, metres=edge.length)
+        graph: nx.MultiDiGraph[int] = nx.MultiDiGraph()
+        for edge in self.plan.edges:
+            for ends in (edge.ends, edge.ends[::-1]):
+                graph.add_edge(*ends, metres=edge.length)
+        for p, q, _ in self._lifts:
+            graph.add_edge(p, q, metres=0.0)
         found = begin & set(graph)
         reached, nodes = (
             nx.multi_source_dijkstra(graph, found, weight="metres") if found else ({}, {})
@@ -96,7 +107,7 @@ class Guide:
                 "to: expected a goal to which travels of the robot lead, got one in another part "
                 "of the map; drive on"
             )
-        ends = []
+        way: list[int] = []
         for p, q in pairwise(nodes[nearest[1]] if nearest else ()):
             options = [
                 2 * x + k
@@ -104,8 +115,9 @@ class Guide:
                 for k in (0, 1)
                 if (edge.ends[k], edge.ends[1 - k]) == (p, q)
             ]
-            ends.append(min(options, key=lambda e: self.plan.edges[e // 2].length))
-        return ends
+            lift = next((-1 - k for k, lift in enumerate(self._lifts) if lift[:2] == (p, q)), -1)
+            way.append(min(options, key=lambda e: self.plan.edges[e // 2].length, default=lift))
+        return way
 
     def told(self, ends: Sequence[int]) -> Iterator[str]:
         """Tell a way along edges, given by the ends at which they begin.
@@ -114,7 +126,14 @@ class Guide:
         """
         if not ends:
             yield "there is nothing to do: the start is at the goal"
-            return
+        for on_floor, some in groupby(ends, key=lambda e: e >= 0):
+            if on_floor:
+                yield from self._told([*some])
+            else:
+                yield from (f"take {self._lifts[-1 - e][2]!r}" for e in some)
+
+    def _told(self, ends: Sequence[int]) -> Iterator[str]:
+        """Tell a way along edges of one floor."""
         route = self.route(ends)
         beside = _merged(sorted(_beside(self.plan, ends, route), key=lambda b: b.metres))
         for k, (begin, end) in enumerate(pairwise(route.stops)):
