@@ -548,7 +548,7 @@ def test_sentence_names_the_most_probable_missed_join() -> None:
     assert weighed.sentence.endswith("; steps 1 and 3 may be at one place, too (0.27)")
     apart = Rival(10.5, (0, 1, 2, 3), (0, 1, 2, 3))
     doubtful = replace(weighed, rivals=(*rivals, apart))
-    most = "; the most doubtful join, of steps 0 and 2, has probability 0.69"
+    most = "; the least sure join, of steps 0 and 2, has probability 0.69"
     assert doubtful.sentence.endswith(most)
     assert replace(doubtful, broken=30.0).sentence.endswith(f"{most} if the axioms hold")
     assert replace(weighed, rivals=(best,)).missed is None

@@ -222,7 +222,7 @@ class Solution(MapSequence):
     def sureness(self) -> str:
         """How sure the first map is, in words; an empty text if there is nothing to say.
 
-        If maps were weighed, the text gives its probability and its most doubtful join. If they
+        If maps were weighed, the text gives its probability and its least sure join. If they
         were counted, it gives the joins that rest on minimality alone.
         """
         if self.weighed is not None:

@@ -270,7 +270,7 @@ class Weighed:
                 return f"{text}; no other map was found, so it is unknown which joins are doubtful"
             given = f" among the {len(self.rivals)} maps found"
         steps, sure = _told(self.joins[0])
-        return f"{text}; the most doubtful join, of {steps}, has probability {sure}{given}"
+        return f"{text}; the least sure join, of {steps}, has probability {sure}{given}"
 
     @property
     def _misread(self) -> str:
