@@ -172,6 +172,19 @@ def test_scans_far_apart_without_odometry_are_matched() -> None:
         assert abs(wrapped(seen[2] - step[2])) < 0.05
 
 
+def test_end_of_a_seen_wall_does_not_hold_the_robot_back() -> None:
+    """In a corridor without features, new points lie beyond the end of the walls seen before."""
+    walls = [(-20.0, y, 40.0, y) for y in (-1.0, 1.0)]
+    scans = []
+    for k in range(40):
+        x, y = 0.3 * k, 0.0
+        scan = seen_from((x, y, 0.0), walls, k + 1)
+        ranges = scan.ranges + np.random.default_rng(k).normal(0, 0.015, len(scan.ranges))
+        ranges[np.abs(scan.laser.bearings) < math.radians(65)] = np.nan  # as if they met the floor
+        scans.append(replace(scan, ranges=ranges, odometry=(x, y, 0.0)))
+    assert follow(RobotLog(scans)).pose(39)[0] == pytest.approx(11.7, abs=0.5)
+
+
 def one_elsewhere(scans: Scans) -> Scans:
     """One scan of a good drive shows another place."""
     return [*scans[:60], replace(scans[60], ranges=scans[260].ranges), *scans[61:150]]

@@ -185,8 +185,9 @@ def test_match_against_the_odometer_gets_a_large_covariance(share: float, is_wid
     seen[astray] *= 0.4  # people in the room
     still, turned = (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)
     scan = Scan(np.zeros(1), LaserScanner(0.0, 0.1, 1, 8.0), turned)
-    recent = [Surfaces(walls, normals)]
-    motion = ScanMotion(scan, Surfaces(seen, normals), recent, still, turned, still)
+    lengths = np.full(len(walls), 0.3)
+    recent = [Surfaces(walls, normals, lengths)]
+    motion = ScanMotion(scan, Surfaces(seen, normals, lengths), recent, still, turned, still)
     pose, covariance, found = motion.matched(turned, odometer_covariance(still))
     assert abs(pose[2]) < 0.05
     assert found == pytest.approx(share, abs=0.1)
@@ -243,6 +244,7 @@ def test_neither_few_points_nor_points_in_free_space_outweigh_the_odometer(
         ahead = Surfaces(
             np.stack([np.full(points, 3.0), np.linspace(-1, 1, points)], 1),
             np.tile([-1.0, 0.0], (points, 1)),
+            np.full(points, 0.3),
         )
         return ahead.moved((0.0, 0.0, bearing))
 

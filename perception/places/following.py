@@ -423,7 +423,7 @@ class ScanMotion:
         found = []
         for far, turn in GUESSES:
             onward = (far * math.cos(turn / 2), far * math.sin(turn / 2), turn)
-            share, pose, information = fit.improved(np.array(moved(self.last, onward)), near)
+            share, pose, information = fit.improved(np.array(moved(self.last, onward)), near, False)
             gain = share * independent - _square(pose, middle, prior) / 2
             found.append((gain, share, pose, information))
         found = sorted(found, key=lambda match: -match[0])[:LIKELIEST]
@@ -495,6 +495,7 @@ class Surfaces:
 
     points: Array  # (m, 2) metres
     normals: Array  # (m, 2) unit normals
+    lengths: Array  # (m,) length in metres of the line that shows the normal
 
     def __len__(self) -> int:
         """The number of points."""
@@ -502,19 +503,19 @@ class Surfaces:
 
     def moved(self, pose: Pose | Array) -> Surfaces:
         """Transform to the frame that a pose is given in, from the frame of the pose."""
-        return Surfaces(points_moved(pose, self.points), points_turned(pose[2], self.normals))
+        points, normals = points_moved(pose, self.points), points_turned(pose[2], self.normals)
+        return Surfaces(points, normals, self.lengths)
 
     def some(self, most: int) -> Surfaces:
         """Take at most this many points, evenly spread."""
         kept = np.unique(np.linspace(0, len(self) - 1, min(len(self), most)).astype(int))
-        return Surfaces(self.points[kept], self.normals[kept])
+        return Surfaces(self.points[kept], self.normals[kept], self.lengths[kept])
 
     @staticmethod
     def joined(several: Iterable[Surfaces]) -> Surfaces:
         """Make one of several."""
-        parts = [(one.points, one.normals) for one in several]
-        points, normals = map(np.concatenate, zip(*parts, strict=True))
-        return Surfaces(points, normals)
+        parts = [(one.points, one.normals, one.lengths) for one in several]
+        return Surfaces(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def surfaces_in(scan: Scan, without: NDArray[np.bool_] | None = None) -> Surfaces:
@@ -525,7 +526,7 @@ def surfaces_in(scan: Scan, without: NDArray[np.bool_] | None = None) -> Surface
     laser, ranges, good = scan.laser, scan.ranges, in_sight(scan)
     r = np.where(good, ranges, 0.0)
     points = np.stack([r * np.cos(laser.bearings), r * np.sin(laser.bearings)], axis=1)
-    normals = np.full(points.shape, np.nan)
+    normals, lengths = np.full(points.shape, np.nan), np.zeros(len(points))
     # The farthest neighbours that still lie on one line with the point give the best normal.
     for k in (1, 2, 3):
         if len(points) <= 2 * k:
@@ -543,11 +544,12 @@ def surfaces_in(scan: Scan, without: NDArray[np.bool_] | None = None) -> Surface
             & (length < 0.25 + 0.1 * r[middle])
             & (off < ROUGHNESS)
         )
-        normals[middle][smooth] = normal[smooth]
+        normals[middle][smooth], lengths[middle][smooth] = normal[smooth], length[smooth]
     on_surface = good & np.isfinite(normals[:, 0])
     if without is not None:
         on_surface &= ~without
-    return Surfaces(points[on_surface], normals[on_surface]).moved(laser.mount)
+    some = on_surface.nonzero()
+    return Surfaces(points[some], normals[some], lengths[some]).moved(laser.mount)
 
 
 def in_sight(scan: Scan) -> NDArray[np.bool_]:
@@ -575,33 +577,39 @@ class ScanFit:
         """The walls. These settings build the tree faster, and queries take no longer."""
         return cKDTree(self.walls.points, compact_nodes=False, balanced_tree=False)
 
-    def improved(self, guess: Array, weight: Array) -> tuple[float, Array, Array]:
+    def improved(self, guess: Array, weight: Array, led: bool = True) -> tuple[float, Array, Array]:
         """Move a pose until the points lie on the walls, by Gauss-Newton steps.
 
-        `weight` is the (3, 3) inverse covariance of the guess. Returns the share of the points on
-        walls, the pose, and its inverse covariance.
+        `weight` is the (3, 3) inverse covariance of the guess, and `led` whether odometry made it.
+        Returns the share of the points on walls, the pose, and its inverse covariance.
         """
-        information, pose, share = weight, guess, 0.0
-        for count in range(ROUNDS):
-            placed, met, distance, nearest = self._met(pose, max(END, BEGIN * SHRINK**count))
+        information, pose, share, far = weight, guess, 0.0, BEGIN
+        for _ in range(ROUNDS):
+            placed, met, distance, nearest = self._met(pose, far)
             share = float((distance[met] < END).sum() / len(placed))
             if len(met) < 5:
                 break
-            normal = self.walls.normals[nearest[met]]
-            off = products(placed[met] - self.walls.points[nearest[met]], normal)
-            arm = placed[met] - pose[:2]
-            jacobian = np.column_stack(
-                [normal, arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]]
-            )
+            wall = nearest[met]
+            normal = self.walls.normals[wall]
+            apart = placed[met] - self.walls.points[wall]
+            off = products(apart, normal)
+            along = normal[:, ::-1] * (1, -1)
+            jacobian = np.column_stack([normal, products(placed[met] - pose[:2], along)])
             # Cauchy weights give little influence to points that are far off.
             weights = 1 / (TOGETHER * ROUGHNESS**2 * (1 + (off / (2 * ROUGHNESS)) ** 2))
+            # A normal is as uncertain as the ends of its line. So it says little about points far
+            # along the wall, as beyond its seen end. At first, points are far from their place.
+            if led and far <= END:
+                weights /= 1 + 2 * (products(apart, along) / self.walls.lengths[wall]) ** 2
             astray = pose - guess
             astray[2] = wrapped(astray[2])
             information = jacobian.T @ (jacobian * weights[:, None]) + weight
             step = np.linalg.solve(information, jacobian.T @ (weights * off) + weight @ astray)
             pose = pose - step
-            if np.abs(step).max() < 1e-4:
+            is_still = np.abs(step).max() < 1e-4
+            if is_still and (far <= END or not led):
                 break
+            far = END if is_still else max(END, far * SHRINK)
         return share, pose, information
 
     def share(self, pose: Array) -> float:
