@@ -1,7 +1,7 @@
 """Keep the minimal maps of a trace up to date, step by step, while the robot drives.
 
 >>> from ssh_abduction import OnlineMapper, Theory
->>> mapper = OnlineMapper("end", Theory.topological())
+>>> mapper = OnlineMapper("end", Theory.topological(), time_limit=None)
 >>> walk = [("travel", "hall"), ("travel", "end"), ("around", "end"), ("travel", "hall")]
 >>> for action, view in walk:
 ...     solution = mapper.observe(action, view)
