@@ -44,6 +44,7 @@ from ssh_abduction.data.drives import (
     typed_step,
 )
 from ssh_abduction.data.errors import MapError, TheoryError, TraceError, brief, named, printable
+from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.map_parts import (
     NAMED,
     check_says_what,
@@ -521,7 +522,8 @@ class SavedMap:
             return "place", step_name(self.drives, self.map.dstate_at.index(number))
         if kind not in (*NAMED, "dstate"):
             return None
-        for t, label in enumerate(self.map.dstate_at):
+        at = self.map.dstate_at
+        for label, t in firsts(zip(at, range(len(at)), strict=True)).items():
             if number_at(self.map, kind, label) == number:
                 return kind, step_name(self.drives, t)
         region = next((r for r in self.map.regions or () if r.id == number), None)

@@ -413,7 +413,6 @@ def run_explain(options: argparse.Namespace) -> int:
         listing = listing if listing.steps == len(trace) else None
     if listing is not None:
         given["known"] = listing.maps
-    if listing is not None:
         options.steps = _with_steps(options.steps, listing)
     of_place = _place_asked(options.steps, listing)
     question: PairQuestion | TraceQuestion | PlaceQuestion

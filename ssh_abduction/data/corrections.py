@@ -198,13 +198,15 @@ class Corrections:
         """
         checked_map(ssh_map)
         drives = _drives(drives)
-        numbers = {
-            kind: [number_at(ssh_map, kind, label) for label in ssh_map.dstate_at] for kind in NAMED
+        of_dstates = {
+            kind: [number_at(ssh_map, kind, label) for label in range(len(ssh_map.dstates))]
+            for kind in {name.kind for name in ssh_map.names}
         }
         left: dict[tuple[str, int], list[int]] = {}  # the steps that have no name yet
         found: list[Naming] = []
         for name in ssh_map.names:
-            here = [t for t, number in enumerate(numbers[name.kind]) if number == name.id]
+            numbers = of_dstates[name.kind]
+            here = [t for t, s in enumerate(ssh_map.dstate_at) if numbers[s] == name.id]
             if here := left.setdefault((name.kind, name.id), here):
                 found.append(Naming(name.text, name.kind, step_name(drives, here.pop(0))))
         return cls(names=tuple(found))

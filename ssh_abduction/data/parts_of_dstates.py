@@ -17,6 +17,8 @@ def number_at(ssh_map: SSHMap, kind: str, label: int) -> int | None:
     dstate, and its path in a map without paths of its theory, is the one that it faces along.
     """
     dstate = ssh_map.dstates[label]
+    if kind == "place":
+        return dstate.place
     if kind == "region":
         return region_of(ssh_map.regions, dstate.place)
     if kind == "path" and ssh_map.theory_paths:
@@ -31,7 +33,9 @@ def number_at(ssh_map: SSHMap, kind: str, label: int) -> int | None:
         }
         return min(far, key=lambda door: far[door], default=None)
     own = [number for number, places in things.items() if dstate.place in places]
-    return min(own, key=lambda n: (_bend_to(ssh_map, label, things[n]), n), default=None)
+    if len(own) < 2:
+        return next(iter(own), None)
+    return min(own, key=lambda n: (_bend_to(ssh_map, label, things[n]), n))
 
 
 def _bend_to(ssh_map: SSHMap, label: int, order: Sequence[int]) -> float:

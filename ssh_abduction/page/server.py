@@ -116,11 +116,11 @@ class PageServer(ThreadingHTTPServer):
         """Answer "explain", why two steps are one dstate or not, "solve", "correct" or "frame".
 
         "solve" finds maps, "correct" writes what a person says of two steps, and "frame" writes
-        `points` that are known in another map, too. `data` has `pair`,
-        the two steps; `kind`, what is said of them; and `same` and `different`, lists of pairs of
-        steps that are assumed to be one dstate, or different ones. The answer has `text`; and
-        `assuming`, the cost of each assumption, or `content`, the new content of the page. Raises
-        AbductionError for a malformed question or one without an answer, and LimitError.
+        `points` that are known in another map, too. `data` has `pair`, the two steps; `kind`, what
+        is said of them; and `same` and `different`, lists of pairs of steps that are assumed to be
+        one dstate, or different ones. The answer has `text`; and `assuming`, the cost of each
+        assumption, or `content`, the new content of the page. Raises AbductionError for a malformed
+        question or one without an answer, and LimitError.
         """
         written = {"correct": self._correct, "frame": self._frame}
         known = ("explain", "solve", *(name for name, writes in written.items() if writes))
