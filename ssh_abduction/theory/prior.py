@@ -110,6 +110,15 @@ class Prior:
         nats: Array = self._apart[:, 1] + self._apart[:, 0] * (not self._has_places)
         return nats + self.seen[:, 0]
 
+    @property
+    def new(self) -> Array:
+        """The nats that a new dstate, and a new place, cost at each step at least, (steps, 2).
+
+        That is without what they show.
+        """
+        new = self._apart[:, ::-1]
+        return new if self._has_places else new.sum(axis=1, keepdims=True) * [1.0, 0.0]
+
     def gain(self, spread: Array) -> Array:
         """Return how many nats more density a prediction gives than the prior does.
 
@@ -140,6 +149,13 @@ class Prior:
         )
         return math.fsum([*seen, -self.crowd * len({*places})])
 
+    def least_shown(self, of: int, steps: Sequence[int]) -> float:
+        """Return what some steps cost at least by what they show of a dstate (of=0) or place.
+
+        If views may be misread, it may be less than at the steps.
+        """
+        return float(self.seen[:, of].min() if self._misreads else self.seen[[*steps], of].max())
+
     def repeated(self, of: int, names: Sequence[int], pairs: Mapping[int, int]) -> float:
         """Return the nats that `shown` saves if dstates (of=0) or places (of=1) repeat others.
 
@@ -167,9 +183,8 @@ class Prior:
         if self._misreads:  # a dstate may have a more probable view than its first step
             seen = np.minimum(seen, seen.min(axis=0))
         # What a part of the building repeats may cost nothing to show.
-        new = self._apart[:, ::-1] + seen * (not self._repeats)
-        if not self._has_places:
-            new = new.sum(axis=1, keepdims=True) * [1.0, 0.0]
+        seen = seen * (not self._repeats)
+        new = self.new + (seen if self._has_places else seen.sum(axis=1, keepdims=True) * [1, 0])
         of_dstates, of_places = np.sort(new[[*dstates], 0]), np.sort(new[[*places], 1])
         return np.cumsum([0.0, 0.0, *of_dstates]), np.cumsum([0.0, 0.0, *of_places])
 

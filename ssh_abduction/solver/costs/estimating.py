@@ -23,6 +23,7 @@ from ssh_abduction.solution.values import Cost
 from ssh_abduction.solution.weighed import Rival
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.sources.metric.completing import completed
+from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.fields import FAULT, MISREAD, ONE_WAY
 from ssh_abduction.theory.pairs import pairs_in
@@ -163,6 +164,18 @@ def maps_apart(
         found = completed(problem.trace, problem.theory, rival.dstates, places, facing)
         if found is not None:
             yield found
+
+
+def course_completed(
+    problem: Problem, misfit: Misfit, dstates: Sequence[int], places: Sequence[int]
+) -> SSHMap | None:
+    """Make a map of the dstate and place of each step; None if no axioms allow it."""
+    of_dstate = [*dict(zip(dstates, places, strict=True)).values()]
+    facing = misfit.poses(dstates, places).gaussian()[1][-len(of_dstate) :]
+    found = completed(problem.trace, problem.theory, dstates, of_dstate, facing.tolist())
+    if found is not None and problem.theory.misread:
+        found = with_faults(found, problem.trace, problem.trace, problem.theory)
+    return found
 
 
 def estimated(

@@ -79,6 +79,20 @@ class Misfit:
             self._known[groups] = self._explaining(groups).least()
         return self._known[groups]
 
+    def explanations(
+        self, dstates: Sequence[int], places: Sequence[Hashable]
+    ) -> Iterator[tuple[Poses, float]]:
+        """Yield poses for lower bounds: all closures are true, or one at least is of an alias.
+
+        Also yield the nats that these closures cost at least. In the second case no closure is
+        used, and what dstates and places show may cost nothing.
+        """
+        explaining = self._explaining(_groups_of(dstates, places, ()))
+        n = len(self.trace.closures)
+        yield explaining.poses((0,) * n), 0.0
+        if n:
+            yield explaining.poses((0,) * n, ()), explaining.least_alias()
+
     def of_closing(self, ssh_map: SSHMap) -> float:
         """Compute by how much the returns of a map of the whole trace raise its misfit."""
         dstates, places, wrong = _course_of(ssh_map)

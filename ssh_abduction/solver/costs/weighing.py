@@ -47,6 +47,7 @@ from ssh_abduction.solver.costs.changing import Changing
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
     Course,
+    course_completed,
     dstates_and_places,
     least_places,
     may_join_more,
@@ -201,17 +202,19 @@ class Weighing:
                 lambda: self._is_long and bool(self.candidates and theory.jumped),
                 self._search_jumps,
             ),
-            Source(turn("Benders cuts"), lambda: True, self._cut),
+            Source(turn("Benders cuts"), lambda: not self.proven, self._cut),
         ]
 
     def _force(self) -> None:
         """Find joins that all cheap maps have. Raise the bound, and let clingo assert the joins."""
         task, best = self._task, self.candidates[0]
-        least = self._parts.known.bound.dstates or 0
-        forcing = Forcing(task.problem, task.log, self._misfit, best.map, least)
+        forcing = Forcing(task.problem, task.log, self._misfit, best.map)
         try:
             forcing.force(self._most)
-            if forcing.low < best.nats - EQUAL:
+            if self._lists_all(forcing):
+                self.bound, self.proven = self._nats, True
+                self._parts.known.status = Status.OPTIMAL
+            elif forcing.low < best.nats - EQUAL:
                 for bound in forcing.bounds(best.nats, self.bound):
                     self._raise_bound(bound)
         finally:
@@ -219,6 +222,30 @@ class Weighing:
             returns = forcing.returns
             self._forced = [(one.first, one.second) for one in returns if one.of == "dstate"]
             self._base = max(self._base, self._misfit.of_returns(returns) / 2)
+
+    def _lists_all(self, forcing: Forcing) -> bool:
+        """Whether all maps that are worth finding are known. Add those that are not known yet."""
+        courses = forcing.courses(self._most)
+        known = {dstates_and_places(candidate.map) for candidate in self.candidates}
+        return courses is not None and all(
+            course in known or self._knows(course) for course in courses
+        )
+
+    def _knows(self, course: Course) -> bool:
+        """Add a map with these dstates and places, if there is one. Return whether this is sure."""
+        task = self._task
+        found = course_completed(task.problem, self._misfit, *course)
+        if found is not None and self._add_valid(found) < math.inf:
+            return True
+        if task.theory.has_faults or self.of_labels is None:
+            return False
+        pinned = _pinned(task.theory, course)
+        maps, proven = self.of_labels(task.trace, pinned, self._parts.watch.left())
+        costs = [self.add(ssh_map) for ssh_map in maps if dstates_and_places(ssh_map) == course]
+        # The axioms may need more places. These maps have the fewest.
+        by_places = task.theory.priorities[:2] == ("dstates", "places")
+        too_few = by_places and all(len(one.places) > len({*course[1]}) for one in maps)
+        return proven and (too_few or len(costs) == len(maps))
 
     def _search_jumps(self) -> None:
         """Look for cheaper maps with other wrong displacements."""
@@ -312,7 +339,7 @@ class Weighing:
         if (theory.level == "causal" and not theory.has_faults) or self.of_labels is None:
             return (ssh_map,), True
         trace = task.trace.without_displacements_at(wrong)
-        pinned = _pinned(theory, ssh_map).replace(
+        pinned = _pinned(theory, dstates_and_places(ssh_map)).replace(
             jumped=0.0, displacement="use" if trace.has_displacements else "none"
         )
         found, proven = self.of_labels(trace, pinned, self._parts.watch.left())
@@ -485,19 +512,17 @@ def _exactly(ssh_map: SSHMap) -> list[Equality]:
     return found
 
 
-def _pinned(theory: Theory, ssh_map: SSHMap) -> Theory:
-    """Return a theory that compares maps by counts, and asserts the dstates and places of a map.
+def _pinned(theory: Theory, course: Course) -> Theory:
+    """Return a theory that compares maps by counts, and asserts the dstates and places of steps.
 
     It asserts which dstates are at different places, but not which are at one place.
     """
-    labels = ssh_map.dstate_at
+    labels, places = course
     first = first_index_of(labels)
     same = [(first[label], t) for t, label in enumerate(labels) if t != first[label]]
-    different: list[tuple[int, int]] = []
-    elsewhere: list[tuple[int, int]] = []
-    for a, b in combinations(first, 2):
-        is_one_place = ssh_map.dstates[a].place == ssh_map.dstates[b].place
-        (different if is_one_place else elsewhere).append((first[a], first[b]))
+    pairs = [*combinations(first.values(), 2)]
+    different = [(i, j) for i, j in pairs if places[i] == places[j]]
+    elsewhere = [(i, j) for i, j in pairs if places[i] != places[j]]
     return theory.replace(
         weigh="count",
         same=(*theory.same, *same),

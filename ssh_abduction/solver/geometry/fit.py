@@ -85,9 +85,11 @@ class Explaining:
         square = self.misfit((0,) * n)
         if not n:
             return square
-        return min(
-            square, self.poses((0,) * n, ()).misfit() + 2 * (FAULT + float(self._free(n).min()))
-        )
+        return min(square, self.poses((0,) * n, ()).misfit() + 2 * self.least_alias())
+
+    def least_alias(self) -> float:
+        """Return what an alias costs at least, in nats."""
+        return FAULT + float(self._free(self._closures).min())
 
     def misfit(self, aliases: Aliases) -> float:
         """Return the least chi-square with these aliases."""

@@ -527,6 +527,77 @@ class Poses:
         return covariance
 
 
+def may_be_joined(poses: Poses) -> bool:
+    """Whether `conditional` holds for these poses, and is not too slow."""
+    return not len(poses._missing[0]) and poses._size <= DENSE_INVERSE
+
+
+def conditional(poses: Poses, entries: Sequence[int]) -> tuple[Array, Array]:
+    """Compute how far some unknowns may be off if all before them in a list are known.
+
+    The pose of the first step is known. `entries` are n entries of the vector of `gaussian`.
+    This is for poses without aliases, and no displacement may be missing.
+
+    Raises:
+        numpy.linalg.LinAlgError: Some unknowns are known too exactly.
+
+    Returns:
+        The logarithms of the standard deviations, (n,).
+        The products of the gradients of n + 1 functions of the unknowns, by their covariance,
+        (n + 1, n + 1): half of the logarithm of the determinant of the information matrix, and
+        then these n logarithms.
+    """
+    unknown, x = poses.best[0], 2 * int(poses._place[poses._origin])
+    free = np.setdiff1d(range(poses._size), [x, x + 1, 2 * poses._positions + poses._origin])
+    places = 2 * int(poses._place[: poses._dstates].max()) + 2
+    of = np.array(entries, dtype=int)
+    of = np.searchsorted(free, of + (of >= places) * (2 * poses._positions - places))
+    jacobian = _dense(poses._jacobian(unknown, of_world=True))[:, free]
+    look_at_clock(poses._size**2)  # microunits: most of the time goes to filling matrices
+    # The columns of this root are a basis of the unknowns, in which they have unit covariance.
+    root = np.linalg.inv(np.linalg.cholesky(jacobian.T @ jacobian)).T
+    lower = np.linalg.cholesky(root[of] @ root[of].T)
+    # The derivative of such a logarithm is that of -½ v'Hv, for a fixed vector v (below).
+    vectors = np.zeros((poses._size, len(of)))
+    vectors[free] = root @ solve_triangular(lower, root[of], lower=True).T
+    whole = np.zeros((poses._size, len(free)))
+    whole[free] = root
+    bent = np.column_stack([_bent(poses, unknown, whole).sum(1), -_bent(poses, unknown, vectors)])
+    slopes = root.T @ bent[free]
+    return np.log(lower.diagonal()), slopes.T @ slopes
+
+
+def _bent(poses: Poses, unknown: Array, vectors: Array) -> Array:
+    """Compute the gradients of ½ v'Hv for n fixed vectors v, (size, n).
+
+    H is the information matrix, which changes with the unknowns: turned displacements move
+    positions elsewhere. `vectors` has the n vectors, (size, n).
+    """
+    gone, (_, cos, sin) = poses._gone(unknown).T[..., None], poses._predicted(unknown)
+    cos, sin = cos[:, None], sin[:, None]
+    heading, scale = 2 * poses._positions, poses._sigma[0] * poses._scaled[:, None]
+    to, from_ = poses._place[poses._to], poses._place[poses._from]
+    drift = poses._sigma[1] * poses._way[:, None]
+    # By v, displacements change in the world, and then seen by the robot.
+    turned = vectors[heading + poses._from] - drift / 2 * vectors[-1]
+    longer = scale * vectors[-2] / (1 + unknown[-2] * scale)
+    x = vectors[2 * to] - vectors[2 * from_] + turned * gone[1] + longer * gone[0]
+    y = vectors[2 * to + 1] - vectors[2 * from_ + 1] - turned * gone[0] + longer * gone[1]
+    angle = vectors[heading + poses._to] - vectors[heading + poses._from] + drift * vectors[-1]
+    seen = np.stack([cos * x + sin * y, cos * y - sin * x, angle], 1)
+    weight = (poses._whitening.transpose(0, 2, 1) @ poses._whitening @ seen).transpose(1, 0, 2)
+    by_x, by_y = cos * weight[0] - sin * weight[1], sin * weight[0] + cos * weight[1]
+    by_facing = weight[0] * seen[:, 1] - weight[1] * seen[:, 0]
+    into = np.concatenate([heading + poses._from, 2 * to, 2 * to + 1, 2 * from_, 2 * from_ + 1])
+    by_to = [longer * by_x - turned * by_y, longer * by_y + turned * by_x]
+    of = csr_array((np.ones(len(into)), (into, np.arange(len(into)))), (poses._size, len(into)))
+    bent: Array = of @ np.concatenate([by_facing, *by_to, -by_to[0], -by_to[1]])
+    along = longer * scale / (1 + unknown[-2] * scale)
+    bent[-2] = -(along * (by_x * gone[0] + by_y * gone[1])).sum(0)
+    bent[-1] = -(drift / 2 * by_facing).sum(0)
+    return bent
+
+
 def laid_with_motions(poses: Poses) -> tuple[Array, Array, NDArray[np.int_], Array]:
     """Return the best positions, (places, 2), headings and places of dstates, and motions.
 
