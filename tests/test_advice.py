@@ -41,6 +41,7 @@ SAID_BY = {
     "ssh_abduction/cli/shared.py": (*WITH_MAP, *WITH_THEORY),
     "ssh_abduction/cli/text.py": ("solve",),
     "ssh_abduction/evaluation": ("evaluate",),
+    "ssh_abduction/solution/corrected.py": ("correct",),
     "ssh_abduction/solver/entry.py": ("solve",),
     "ssh_abduction/robot_logs/log_maps.py": ("map",),
     "ssh_abduction/robot_logs/log_report.py": ("map",),

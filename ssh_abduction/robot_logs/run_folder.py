@@ -18,8 +18,7 @@ from ssh_abduction.page.content import Section
 from ssh_abduction.page.html import ground_in, view_page
 from ssh_abduction.robot_logs.log_maps import recogniser_of
 from ssh_abduction.robot_logs.log_report import OF_LOG
-from ssh_abduction.solution import Solution
-from ssh_abduction.solver import with_names
+from ssh_abduction.solution import Solution, with_names
 
 NOTICE = re.compile(r'<p id="made-before" role="alert">.*?</p>\n', re.DOTALL)
 CORRECTED = "Made before the last correction. Solve again to obey it."

@@ -12,6 +12,11 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ssh_abduction.solution.certificate import RESTS_ON as RESTS_ON
     from ssh_abduction.solution.certificate import Certificate as Certificate
+    from ssh_abduction.solution.corrected import obeyed as obeyed
+    from ssh_abduction.solution.corrected import (
+        with_correction_warnings as with_correction_warnings,
+    )
+    from ssh_abduction.solution.corrected import with_names as with_names
     from ssh_abduction.solution.recorded import drives_in as drives_in
     from ssh_abduction.solution.recorded import trace_in as trace_in
     from ssh_abduction.solution.result import Solution as Solution

@@ -29,10 +29,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.derived_regions import find_regions as find_regions
     from ssh_abduction.solver.derived_regions import with_regions as with_regions
     from ssh_abduction.solver.entry import find_backbone as find_backbone
-    from ssh_abduction.solver.entry import obeyed as obeyed
     from ssh_abduction.solver.entry import solve as solve
-    from ssh_abduction.solver.entry import with_correction_warnings as with_correction_warnings
-    from ssh_abduction.solver.entry import with_names as with_names
     from ssh_abduction.solver.geometry.fit import fit as fit
     from ssh_abduction.solver.geometry.ranking import Ranking as Ranking
     from ssh_abduction.solver.parts import Limits as Limits
