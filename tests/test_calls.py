@@ -121,8 +121,6 @@ RIGHT_BY_NAME: dict[str, set[str]] = {
 }
 RIGHT: dict[str, set[str]] = {
     "route.start": {"None"},  # the last dstate
-    "stream_visits.scans": {"dict", *EMPTY},
-    "stream_visits.width": {"3.5", "huge"},
     "Step.of.view": {"None", "-1", "empty text", "nonsense", "folder"},
     "Action.of.value": {"nonsense", "folder"},
     "Action.that_slipped.step": {"huge"},
@@ -432,7 +430,6 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "compare.maps": solution,
         "next_experiment.maps": solution,
         "route.maps": solution,
-        "stream_visits.scans": [],
         "find_backbone.solution": solution,
         "view_page.source": solution,
     }

@@ -15,7 +15,7 @@ from coarse import every_second_beam, hall
 from perception.errors import LogError
 from perception.places.importing import tracked
 from perception.places.odometers import disagreement
-from perception.readers.echoes import MEANINGS, Array, LaserOptions, interpret_log, interpret_scan
+from perception.readers.echoes import MEANINGS, Array, LaserOptions, interpret_log, interpreter_of
 from perception.readers.logs import read_log
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_bag, write_carmen
@@ -196,9 +196,10 @@ def test_zero_is_setting_is_obeyed_without_a_note(drive: tuple[Scan, ...], meani
     told = LaserOptions(zero_is=meaning, no_return=11.0)
     scans, notes = interpret_log(written(drive, constant(0.0)), told)
     assert notes == ()
+    alone_of, _ = interpreter_of([], told)
     is_meant = np.isinf if meaning == "free" else np.isnan
     for scan, alone, true in zip(
-        scans, (interpret_scan(s, told) for s in written(drive, constant(0.0))), drive, strict=True
+        scans, map(alone_of, written(drive, constant(0.0))), drive, strict=True
     ):
         assert is_meant(scan.ranges[true.ranges > SEES]).all()
         assert np.array_equal(scan.ranges, alone.ranges, equal_nan=True)

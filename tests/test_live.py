@@ -23,7 +23,7 @@ from test_log_checks import (
 
 from perception.errors import LogError
 from perception.places.importing import import_log
-from perception.places.live import LOOKS, LiveLog, LivePlace, import_live, stream_visits
+from perception.places.live import LOOKS, LiveLog, LivePlace, Teller, import_live, watched
 from perception.readers.logs import SURVEYED, live_log, read_log
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_carmen
@@ -136,8 +136,10 @@ def test_pipe_is_read_line_by_line(drive: Path) -> None:
 
 def notes_of(scans: Scans) -> str:
     said: list[str] = []
-    for _ in stream_visits(scans, tell=said.append):
-        pass
+    live = LiveLog(tell=said.append)
+    for scan in watched(scans, live.tell):
+        live.add(scan)
+    live.compare()
     assert len(said) == len(set(said))
     return "\n".join(said)
 
@@ -173,7 +175,7 @@ def test_good_stream_gets_no_warning(scans: tuple[Scan, ...]) -> None:
 def test_shuffled_stream_is_refused_before_matching(scans: tuple[Scan, ...]) -> None:
     mixed = random.Random(1).sample(scans, len(scans))
     with pytest.raises(LogError, match="in random order"):
-        next(stream_visits(mixed))
+        next(watched(mixed, Teller(print)))
 
 
 def test_stream_with_two_odometry_sources_is_refused(scans: tuple[Scan, ...]) -> None:
@@ -182,7 +184,7 @@ def test_stream_with_two_odometry_sources_is_refused(scans: tuple[Scan, ...]) ->
         for i, scan in enumerate(scans)
     ]
     with pytest.raises(LogError, match="odometry of one source"):
-        next(stream_visits(two))
+        next(watched(two, Teller(print)))
 
 
 def test_restarted_clock_does_not_cut_a_matching_drive(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 
 import numpy as np
@@ -14,9 +14,9 @@ from test_distinctive import BEARINGS, FORK, log_of
 from perception.errors import LogError
 from perception.places.distinctive import DELAY, Visit, find_visits
 from perception.places.following import follow
-from perception.places.live import stream_visits
+from perception.places.live import LiveLog, import_live, watched
 from perception.places.track import Track
-from perception.readers.scans import Damage, LaserScanner, RobotLog, Scan
+from perception.readers.scans import LaserScanner, RobotLog, Scan
 from simulator.robot import meetings
 
 # A room of 6 by 5 m with a door, in which a robot drives round and round.
@@ -34,6 +34,14 @@ def drive(name: str) -> tuple[RobotLog, Track]:
     """A log, and its track."""
     log = log_of(*DRIVES[name])[0]  # type: ignore[arg-type]
     return log, follow(log)
+
+
+def stream_visits(scans: Iterable[Scan]) -> Iterator[Visit]:
+    """The visits of a drive, as soon as they are final."""
+    live = LiveLog()
+    for scan in watched(scans, live.tell):
+        yield from live.add(scan)[1]
+    yield from live.expected()
 
 
 def fields(visits: list[Visit]) -> list[tuple[object, ...]]:
@@ -61,11 +69,10 @@ def test_streamed_visits_equal_those_of_the_whole_log(name: str) -> None:
 def test_visit_is_final_within_the_promised_distance() -> None:
     (log, track), fed = drive("fork"), 0
 
-    def scans() -> Iterator[Scan | Damage]:
+    def scans() -> Iterator[Scan]:
         nonlocal fed
         for fed, scan in enumerate(log.scans):  # noqa: B007
             yield scan
-        yield Damage(1, "the end")
         fed = 0
 
     way = track.way
@@ -108,9 +115,9 @@ def test_memory_does_not_grow_with_the_drive() -> None:
 @pytest.mark.parametrize("width", [0, -1, math.nan, math.inf, "0.5"])
 def test_a_width_is_a_positive_number(width: object) -> None:
     with pytest.raises(LogError, match="width: expected metres above 0"):
-        stream_visits([], width)  # type: ignore[arg-type]
+        import_live([], width)  # type: ignore[arg-type]
 
 
 def test_items_are_scans() -> None:
     with pytest.raises(LogError, match="expected scans, got 3 as item 0"):
-        list(stream_visits([3]))  # type: ignore[list-item]
+        import_live([3])  # type: ignore[list-item]

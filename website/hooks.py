@@ -79,7 +79,6 @@ THEMES: dict[str, tuple[str, ...]] = {
         "page.Page",
         "perception.views.ViewClusterer",
         "perception.recognition.recogniser",
-        "perception.places.live.stream_visits",
         "perception.readers.logs.read_log",
         "robot_logs.log_mapper.OnlineLogMapper",
         "robot_logs.log_mapper.solved",

@@ -110,7 +110,7 @@ def patches_of(visits: Sequence[Visit]) -> list[PackedPatch]:
         number = next(i for i, visit in enumerate(visits) if visit.patch is None)
         raise ValueError(
             f"visits: expected visits with their local maps, got none for visit {number}; take "
-            "those of find_visits or stream_visits"
+            "those of find_visits"
         )
     return found
 

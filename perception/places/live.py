@@ -76,7 +76,7 @@ def import_live(
     the odometry that its first scans did not show, the track is computed again at the end.
 
     Args:
-        items: The scans with odometry, in order, for example those of `stream_log` or `live_log`.
+        items: The scans with odometry, in order, for example those of `live_log`.
         width: Width of the robot in metres.
         name: Name of the trace; None for a trace without a name.
         tell: A function that gets each note on suspicious scans and odometry, at once.
@@ -91,49 +91,8 @@ def import_live(
         LogError: As `import_log`, or an item is no scan.
     """
     live = LiveLog(width, tell, source)
-    for visit in _visits_of(items, live):
-        show(visit)
-    return live.log, live.finish(name)
-
-
-def stream_visits(
-    scans: Iterable[Scan | Damage], width: float = WIDTH, tell: Tell = tell_nobody
-) -> Iterator[Visit]:
-    """Find the distinctive places that a robot passes, while it drives.
-
-    A visit is yielded when it is final: usually 30 to 40 m of driving after the last scan of the
-    stay, and at most 125 m if scans are at most 0.5 m apart. At the end of the scans, the other
-    visits follow. The first visit waits until the units of the odometry are recognised, which takes
-    about 100 scans of a moving robot.
-
-    If the odometry is good, the visits are those of `import_log` before `partings` moves, joins and
-    adds visits. A jump of the odometer is judged by earlier steps only.
-
-    Args:
-        scans: The scans with odometry, in order, for example those of `stream_log`. Damaged parts
-            are skipped.
-        width: Width of the robot in metres. It cannot pass narrower parts of the free space.
-        tell: A function that gets each note on suspicious scans and odometry, at once.
-
-    Yields:
-        Each visit with its local map. Scans are counted from 0.
-
-    Raises:
-        LogError: The width is no positive number, an item is no scan, the scans are in random
-            order, or the odometry has several sources.
-
-    Example:
-        >>> [visit.scan for visit in stream_visits([])]
-        []
-    """
-    live = LiveLog(width, tell)
-    return _visits_of(scans, live)
-
-
-def _visits_of(items: Iterable[Scan | Damage], live: LiveLog) -> Iterator[Visit]:
-    """Check items, add them to a log, and yield the visits that are final. Raises LogError."""
     if not isinstance(items, Iterable) or isinstance(items, str | bytes):
-        raise LogError(f"scans: expected scans, got {brief(items)}; pass the scans of stream_log")
+        raise LogError(f"scans: expected scans, got {brief(items)}; pass the scans of live_log")
 
     def scans() -> Iterator[Scan]:
         for number, item in enumerate(items):
@@ -144,16 +103,15 @@ def _visits_of(items: Iterable[Scan | Damage], live: LiveLog) -> Iterator[Visit]
             else:
                 raise LogError(
                     f"scans: expected scans, got {brief(item)} as item {number}"
-                    "; take the scans of stream_log"
+                    "; take the scans of live_log"
                 )
 
-    def found() -> Iterator[Visit]:
-        for scan in watched(scans(), live.tell, live.source):
-            yield from live.add(scan)[1]
-        live.compare()
-        yield from live.expected()
-
-    return found()
+    for scan in watched(scans(), live.tell, source):
+        for visit in live.add(scan)[1]:
+            show(visit)
+    for visit in live.expected():
+        show(visit)
+    return live.log, live.finish(name)
 
 
 @dataclass(frozen=True, eq=False)

@@ -179,7 +179,7 @@ def interpreter_of(
     """Find out from some scans what the ranges of a log mean, as `interpret_log` does.
 
     Return a function that interprets a scan of the same lasers, also a later one, and notes. The
-    function interprets a scan of another laser as `interpret_scan` does.
+    function interprets a scan of another laser by the options alone.
     """
     lasers = len({scan.laser.mount for scan in scans})
     if options.mount is not None and lasers > 1:
@@ -217,12 +217,6 @@ def interpreter_of(
 def _key(scan: Scan) -> _Key:
     """The key that distinguishes the lasers of a log: reach, least range and mount."""
     return scan.laser.reach, scan.laser.nearest, scan.laser.mount
-
-
-def interpret_scan(scan: Scan, options: LaserOptions) -> Scan:
-    """Interpret the ranges of a single scan without its log, as `interpret_log` does."""
-    placed = options.placed(scan)
-    return _measured(placed, Meaning(options.reach(placed.laser.reach), np.zeros(0), options.free))
 
 
 def moving(scans: Iterable[Scan]) -> list[Scan]:

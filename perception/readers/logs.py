@@ -12,7 +12,7 @@ from typing import IO, cast
 
 from perception.errors import LogError
 from perception.readers import bag_files, bags, carmen
-from perception.readers.echoes import LaserOptions, interpret_log, interpret_scan, interpreter_of
+from perception.readers.echoes import LaserOptions, interpret_log, interpreter_of
 from perception.readers.lines import LONGEST_LINE, Piped, lines, piped, rereadable
 from perception.readers.scans import Damage, RobotLog, Scan, ScanTable, SurveyedLog
 from ssh_abduction.data.checks import a_list, a_path, a_text
@@ -100,56 +100,22 @@ def read_log(
     return log
 
 
-def stream_log(
-    path: str | os.PathLike[str],
-    format: str | None = None,
-    *,
-    scan_topic: str | Sequence[str] | None = None,
-    odom_topic: str | None = None,
-    fov: float | None = None,
-    mount: Pose | None = None,
-    no_return: float | None = None,
-    zero_is: str | None = None,
-    nearest: float | None = None,
-    blind: tuple[float, float] | None = None,
-) -> Iterator[Scan | Damage]:
-    """Read the scans of a robot's log one at a time, in the order of the file.
-
-    Arguments and errors are those of `read_log`. Each scan is interpreted without the rest of the
-    log. So a range that often repeats counts as a wall unless `no_return` is given, and ranges of 0
-    are unknown unless `zero_is` is given.
-
-    Yields:
-        Scans, and `Damage` for the parts that were skipped.
-    """
-    options = LaserOptions(fov, mount, no_return, zero_is, nearest, blind)
-    with _reading(path, format, scan_topic, odom_topic, options) as reading:
-        for item in reading.items:
-            yield interpret_scan(item, options) if isinstance(item, Scan) else item
-
-
 def live_log(
     stream: IO[bytes],
     source: str = "-",
-    *,
-    fov: float | None = None,
-    mount: Pose | None = None,
-    no_return: float | None = None,
-    zero_is: str | None = None,
-    nearest: float | None = None,
-    blind: tuple[float, float] | None = None,
+    options: LaserOptions | None = None,
     tell: Callable[[str], None] = lambda note: None,
 ) -> Iterator[Scan | Damage]:
     """Read the scans of a log of CARMEN from a pipe, packed or not, while they are written.
 
-    The first SURVEYED scans wait until they show what the poses and ranges of the log mean. The
-    arguments from `fov` to `blind` are those of `read_log`. `tell` takes each note on what
-    the reader assumed or found out. Yield scans, and `Damage` for the parts that were skipped.
-    Raises LogError if the pipe has no lines of CARMEN, or vertices, whose edges may come later.
+    The first SURVEYED scans wait until they show what the poses and ranges of the log mean. `tell`
+    takes each note on what the reader assumed or found out. Yield scans, and `Damage` for the parts
+    that were skipped. Raises LogError if the pipe has no lines of CARMEN, or vertices, whose edges
+    may come later.
     """
-    options = LaserOptions(fov, mount, no_return, zero_is, nearest, blind)
     if not hasattr(stream, "readline") or isinstance(stream, io.TextIOBase):
         raise LogError(f"stream: expected a stream of bytes, got {brief(stream)}; open a file")
+    options = options or LaserOptions()
     text = piped(stream, named(source))
     head = carmen.head_of(text, SURVEYED)
     if not carmen.looks_like(head) or carmen.VERTEX.search(head):

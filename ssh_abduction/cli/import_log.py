@@ -195,6 +195,7 @@ def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Rob
     Ctrl-C ends the log: the trace is that of the drive so far.
     """
     from perception.places.live import import_live
+    from perception.readers.echoes import LaserOptions
     from perception.readers.logs import live_log
 
     if options.format not in (None, "carmen") or options.scan_topic or options.odom_topic:
@@ -204,8 +205,8 @@ def _live(options: argparse.Namespace, tell: Callable[[str], None]) -> tuple[Rob
         )
     if sys.stdin is None:
         raise AbductionError("standard input: expected a log, got a closed stream; name a file")
-    asked = {name: getattr(options, name) for name in LASER}
-    items = live_log(sys.stdin.buffer, **asked, tell=tell)
+    asked = LaserOptions(**{name: getattr(options, name) for name in LASER})
+    items = live_log(sys.stdin.buffer, options=asked, tell=tell)
     numbers, output = count(), sys.stderr if options.output == "-" else sys.stdout
 
     def show(visit: Visit) -> None:
