@@ -35,9 +35,9 @@ def test_docstring_examples_become_blocks_of_code() -> None:
 def test_links_to_other_files_are_plain_text(link: str, shown: str) -> None:
     assert hooks.for_the_site(f"See [there]({link}).", "contributing.md") == f"See {shown}."
     assert hooks.for_the_site("[up](../index.md)", "tutorials/logs.md") == "[up](../index.md)"
-    measured = "![a](../docs/figures/a.png) [b](results/b.json) [c](logs.md)"
+    measured = "![a](../docs/figures/a.png) [b](results/b.json) [s](starts.py) [c](logs.md)"
     assert hooks.for_the_site(measured, "benchmarks/truth.md") == (
-        "![a](../figures/a.png) b [c](logs.md)"
+        "![a](../figures/a.png) b s [c](logs.md)"
     )
 
 

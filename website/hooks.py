@@ -200,4 +200,5 @@ def for_the_site(markdown: str, uri: str) -> str:
         target = posixpath.relpath(target.removeprefix("docs/"), posixpath.dirname(uri) or ".")
         return f"[{link[1]}]({target}{link[3]})"
 
-    return re.sub(r"\[([^][]*)\]\(((?:\.\.|results)/[^)#\s]*)(#[^)\s]*|)\)", mended, markdown)
+    target = r"(?:\.\.|results)/[^)#\s]*|[\w-]+\.py"
+    return re.sub(rf"\[([^][]*)\]\(({target})(#[^)\s]*|)\)", mended, markdown)
