@@ -25,7 +25,7 @@ from scipy.spatial.distance import cdist
 
 from perception.places.passages import resampled
 from ssh_abduction import Solution, SSHMap, Trace
-from ssh_abduction.building.travels import edges_of
+from ssh_abduction.building.edges import edges_of
 from ssh_abduction.evaluation import told_poses
 
 Array = NDArray[np.float64]

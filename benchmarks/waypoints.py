@@ -35,7 +35,7 @@ from skimage.morphology import skeletonize
 from perception.readers.logs import read_log
 from perception.readers.scans import RobotLog
 from ssh_abduction import SSHMap, Trace
-from ssh_abduction.building.travels import grouped
+from ssh_abduction.building.edges import grouped
 from ssh_abduction.data.odometry import Pose
 
 # Metres between nodes along the skeleton, along walls, and in free space.

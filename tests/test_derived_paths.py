@@ -15,8 +15,8 @@ import pytest
 from perception.places.passages import STEP, doors_in, openings_in, resampled
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.building.derive import buildings_of, with_building
-from ssh_abduction.building.derived_paths import PRICE, best_pairings, chains_of, sides_of
 from ssh_abduction.building.directions import directions_to
+from ssh_abduction.building.straight_paths import PRICE, best_pairings, chains_of, sides_of
 from ssh_abduction.building.telling import told
 from ssh_abduction.checker.buildings import faults_of_corridors, faults_of_paths
 from ssh_abduction.checker.checker import check

@@ -11,7 +11,7 @@ from courses import frechet
 
 from perception.places.passages import resampled
 from ssh_abduction import Trace
-from ssh_abduction.building.travels import edges_of
+from ssh_abduction.building.edges import edges_of
 from ssh_abduction.data import Action, DState, Step
 from ssh_abduction.data.map_parts import Fit, Pose
 from ssh_abduction.data.maps import SSHMap

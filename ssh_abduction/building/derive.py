@@ -17,9 +17,10 @@ from ssh_abduction.building.rooms import (
     room_of_places,
     rooms_of,
     spaces_of,
+    straightened,
+    widened,
     with_doors,
 )
-from ssh_abduction.building.slim_rooms import straightened, widened
 from ssh_abduction.building.straight_paths import paths_of, ways_of
 from ssh_abduction.data.building import Indoors
 from ssh_abduction.data.groups import gathered

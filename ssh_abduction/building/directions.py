@@ -15,11 +15,9 @@ import networkx as nx
 import numpy as np
 
 from perception.places.passages import STEP, WIDE, resampled
-from ssh_abduction.building.edges import FloorPlan, PlanEdge
-from ssh_abduction.building.free_space import FreeView
-from ssh_abduction.building.rooms import LONG
+from ssh_abduction.building.edges import Array, FloorPlan, PlanEdge
+from ssh_abduction.building.rooms import LONG, FreeView
 from ssh_abduction.building.straight_paths import leaving
-from ssh_abduction.building.travels import Array
 from ssh_abduction.data.building import Corridor
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap

@@ -2,27 +2,114 @@
 
 Rooms are what doors cut off. Corridors are the long and slim parts of paths. A fire door across a
 corridor parts rooms, but neither the path nor the corridor.
+
+The free space of a room is what lies between the walls on both sides of the edges there.
+
+In a wide corridor a robot drives from door to door, or in lanes. So its ways there bend at each
+place, and go on straight nowhere. The walls on both sides say how the corridor lies. One straight
+way is laid through each room that is long and slim.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations, groupby, pairwise
 
 import networkx as nx
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
-from perception.places.passages import DOOR
-from ssh_abduction.building.edges import FloorPlan
-from ssh_abduction.building.free_space import GRID, RoomSpace, drawn, strips_of
+from perception.places.passages import DOOR, STEP, WIDE, directions, resampled
+from ssh_abduction.building.edges import Array, FloorPlan, Gap, PlanEdge, Spot, walls_beside
 from ssh_abduction.building.straight_paths import PairedWay, branches, chain_points
-from ssh_abduction.building.travels import Array
 from ssh_abduction.data.building import Corridor, MapDoor, MapRoom, Point, WayOut
 from ssh_abduction.data.map_parts import MapPath
 from ssh_abduction.data.maps import SSHMap
+
+GRID = 0.1  # metres: a cell in which free space is drawn
+# A person keeps BODY metres from walls, where the robot itself did.
+BODY = 0.3
+
+
+def strips_of(edge: PlanEdge, begin: int, stop: int) -> Iterator[Array]:
+    """Yield the corners, (4, 2) metres, of the free space between any two points of a course."""
+    ahead = directions(edge.course)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    wide = ndimage.median_filter(edge.widths, (3, 1))
+    sides = edge.course + wide[:, [0]] * left, edge.course - wide[:, [1]] * left
+    for k in range(begin, stop):
+        corners = np.array([sides[0][k], sides[0][k + 1], sides[1][k + 1], sides[1][k]])
+        if np.isfinite(corners).all():
+            yield corners
+
+
+def drawn(strips: Sequence[Array], *more: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Draw strips: which cells of GRID metres are free, and the position of the first cell.
+
+    There are cells for more points, (n, 2) metres, too.
+    """
+    from skimage.draw import polygon
+
+    points = np.concatenate([*strips, *more])
+    corner = points.min(axis=0) - 2 * GRID
+    free = np.zeros(np.ceil((points.max(axis=0) - corner) / GRID).astype(int) + 3, dtype=bool)
+    for strip in strips:
+        free[polygon(*((strip - corner) / GRID).T, free.shape)] = True
+    return free, corner
+
+
+@dataclass(frozen=True, eq=False)
+class RoomSpace:
+    """The free space of a room: which cells are free, and the position of the first cell."""
+
+    free: NDArray[np.bool_]
+    corner: Array
+
+    def beside(self, course: Array) -> Array:
+        """How far the free space reaches left and right of a course, (n, 2) metres."""
+        ahead = directions(course)
+        left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+        off = np.arange(1, round(2 * WIDE / GRID) + 1)[:, None, None] * GRID * left
+        reach = []
+        for sign in (1, -1):
+            cells = np.rint((course + sign * off - self.corner) / GRID).astype(int)
+            inside = np.all((cells >= 0) & (cells < self.free.shape), axis=2)
+            x, y = np.where(inside[..., None], cells, 0).transpose(2, 0, 1)
+            reach.append(np.logical_and.accumulate(inside & self.free[x, y]).sum(axis=0) * GRID)
+        return np.stack(reach, axis=1)
+
+
+class FreeView:
+    """Which points of a route see each other: all that is between them is free."""
+
+    def __init__(self, edges: Sequence[PlanEdge]) -> None:
+        strips = [s for edge in edges for s in strips_of(edge, 0, len(edge.course) - 1)]
+        course = np.concatenate([edge.course for edge in edges])
+        walls = np.concatenate([walls_beside(edge) for edge in edges])
+        self._free, self._corner = drawn(strips, course, walls)
+        blocked = ~ndimage.binary_erosion(self._free, iterations=round(BODY / GRID))
+        blocked |= ndimage.binary_dilation(self._marked(walls), iterations=round(BODY / GRID))
+        self._free = ~blocked | ndimage.binary_dilation(self._marked(course), iterations=2)
+
+    def _marked(self, points: Array) -> NDArray[np.bool_]:
+        """The cells that have a point."""
+        found = np.zeros_like(self._free)
+        found[tuple(self._cells(points).T)] = True
+        return found
+
+    def _cells(self, points: Array) -> NDArray[np.int64]:
+        return np.rint((points - self._corner) / GRID).astype(int)
+
+    def from_point(self, point: Array, others: Array) -> NDArray[np.bool_]:
+        """Whether each of the others, (n, 2), is seen from a point."""
+        far = float(np.hypot(*(others - point).T).max(initial=GRID))
+        share = np.linspace(0, 1, int(np.ceil(far / GRID)) + 1)[:, None, None]
+        cells = self._cells(point + share * (others - point))
+        return np.asarray(self._free[cells[..., 0], cells[..., 1]].all(axis=0))
+
 
 # Two doors between the same rooms, less than HALF metres apart, are the halves of a double door.
 HALF = 1.5
@@ -274,3 +361,116 @@ def outlines_of(spaces: Mapping[int, RoomSpace]) -> dict[int, tuple[Point, ...]]
                 (round(float(x), 2), round(float(y), 2)) for x, y in corner + (ring - 1) * GRID
             )
     return found
+
+
+ONWARD = math.radians(45)  # An edge that leaves within this angle goes on straight.
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """The rectangle around a room, along its longer axis."""
+
+    middle: Array
+    ahead: Array  # the unit vector along it
+    length: float
+    width: float
+
+    @classmethod
+    def of(cls, space: RoomSpace) -> Box:
+        """Find the rectangle around the free cells of a room."""
+        cells = space.corner + GRID * np.argwhere(space.free)
+        frame = np.linalg.eigh(np.cov(cells.T))[1].T[::-1]
+        least, most = (cells @ frame.T).min(axis=0), (cells @ frame.T).max(axis=0)
+        length, width = most - least
+        return cls((least + most) / 2 @ frame, frame[0], float(length), float(width))
+
+    def along(self, point: Array) -> float:
+        """How far a point is along the box, from its middle."""
+        return float((point - self.middle) @ self.ahead)
+
+
+def straightened(
+    plan: FloorPlan,
+    room: Mapping[int, int],
+    spaces: Mapping[int, RoomSpace],
+) -> FloorPlan:
+    """Return the plan with one straight way through each room that is long and slim."""
+    spots, edges, corners = dict(plan.spots), list(plan.edges), plan.corners
+    for number, space in spaces.items():
+        inner = [e for e in edges if not e.doors and {room.get(p) for p in e.ends} == {number}]
+        box = Box.of(space) if inner and space.free.any() else None
+        if box is None or box.length < max(LONG, SLIM * box.width):
+            continue
+        others = [edge for edge in edges if all(edge is not e for e in inner)]
+        far = sorted((box.along(spots[p].at), p) for p in spots if room.get(p) == number)
+        frame = spots[far[0][1]].frame
+        for end, sign in ((far[0], -1), (far[-1], 1)):
+            more = box.length / 2 - sign * end[0]
+            if more > LONG / 4 and not _onward(others, end[1], sign * box.ahead):
+                corners += 1
+                far.append((end[0] + sign * more, -corners))
+                spots[-corners] = Spot(box.middle, STEP, frame)
+        far.sort()
+        at: list[float] = []
+        for metres, _ in far:  # Places beside each other are two places, too.
+            at.append(max(metres, at[-1] + 2 * STEP) if at else metres)
+        for metres, (_, p) in zip(at, far, strict=True):
+            spots[p] = replace(spots[p], at=box.middle + metres * box.ahead)
+        ends = [p for _, p in far]
+        edges = [*others, *_chain(box, space, ends, at, inner)]
+    edges.sort(key=lambda e: (min(e.travels), e.ends))
+    return FloorPlan(spots, edges, plan.name, plan.measured, corners)
+
+
+def widened(
+    ways: Sequence[PairedWay], room: Mapping[int, int], spaces: Mapping[int, RoomSpace]
+) -> list[PairedWay]:
+    """Return the ways, each as wide in a room as the free space of all ways there."""
+
+    def wide(edge: PlanEdge) -> PlanEdge:
+        p, q = edge.ends
+        if room.get(p) != room.get(q) or edge.doors or room.get(p) not in spaces:
+            return edge
+        beside = spaces[room[p]].beside(edge.course)
+        return replace(edge, widths=np.maximum(edge.widths, beside))
+
+    return [replace(way, edges=tuple(map(wide, way.edges))) for way in ways]
+
+
+def _onward(edges: Sequence[PlanEdge], place: int, ahead: Array) -> bool:
+    """Whether one of the edges leaves a place in a direction."""
+    for edge in edges:
+        if place in edge.ends:
+            way = edge.course if edge.ends[0] == place else edge.course[::-1]
+            off = way[min(round(LONG / 4 / STEP), len(way) - 1)] - way[0]
+            if off @ ahead > math.cos(ONWARD) * math.hypot(*off):
+                return True
+    return False
+
+
+def _chain(
+    box: Box,
+    space: RoomSpace,
+    ends: Sequence[int],
+    at: Sequence[float],
+    inner: Sequence[PlanEdge],
+) -> Iterator[PlanEdge]:
+    """Yield the edges of a straight way along a box, with the widths and openings of its room."""
+    seen: list[tuple[float, Gap]] = []
+    for edge in inner:
+        for gap in (p for p in edge.passages if p.side != "through"):
+            same = directions(edge.course)[gap.at] @ box.ahead > 0
+            side = gap.side if same else {"left": "right", "right": "left"}[gap.side]
+            metres = box.along(edge.course[gap.at])
+            if all(g.side != side or abs(m - metres) > BESIDE for m, g in seen):
+                seen.append((metres, replace(gap, side=side)))
+    travels = tuple(sorted({t for edge in inner for t in edge.travels}))
+    for (p, begin), (q, end) in pairwise(zip(ends, at, strict=True)):
+        line = box.middle + np.array([[begin], [end]]) * box.ahead
+        course = resampled(line, STEP)
+        passages = tuple(
+            replace(gap, at=min(round((m - begin) / STEP), len(course) - 1))
+            for m, gap in sorted(seen, key=lambda pair: pair[0])
+            if begin < m <= end
+        )
+        yield PlanEdge((p, q), course, travels, space.beside(course), passages)

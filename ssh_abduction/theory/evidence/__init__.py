@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.displacement import Displacement
-from ssh_abduction.theory.evidence.lifts import Floors, Landings
-from ssh_abduction.theory.evidence.of_steps import Alike, Asserted, Closures
+from ssh_abduction.theory.evidence.of_steps import Alike, Asserted, Closures, Floors, Landings
 from ssh_abduction.theory.evidence.planar import Planar
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
