@@ -28,7 +28,8 @@ from ssh_abduction.output.export import export_map
 from ssh_abduction.output.layout import drawable_poses, layout
 from ssh_abduction.solution import Status
 from ssh_abduction.solver.asp.facts import program
-from ssh_abduction.theory.evidence import Equality, Floors
+from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.evidence.of_steps import Floors
 from ssh_abduction.theory.settle import settle
 
 UP, DOWN = Action("up", "lift"), Action("down", "stairs")

@@ -34,8 +34,9 @@ import ssh_abduction
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.checker.claims import check_bound
 from ssh_abduction.cli import outcome as ending
-from ssh_abduction.explain import explain, explain_pair, explain_trace
+from ssh_abduction.explain import explain_pair, explain_trace
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
+from ssh_abduction.explain.no_map import explain
 from ssh_abduction.runtime import workers
 from ssh_abduction.solution import Status
 from ssh_abduction.solver import Search, check_rules, find_backbone

@@ -37,7 +37,8 @@ from ssh_abduction.solver.sources.exact.readable import StepEngine
 from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory import settle as problems
 from ssh_abduction.theory.encodings import Rules
-from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs, evidence_of
+from ssh_abduction.theory.evidence import Equality, evidence_of
+from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import SPEEDUPS, TABLE, row
 

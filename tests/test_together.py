@@ -33,20 +33,13 @@ from ssh_abduction import (
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.cost_claims import misfit
 from ssh_abduction.cli import main
-from ssh_abduction.data import (
-    Action,
-    Fault,
-    MapError,
-    Odometry,
-    TraceError,
-    drives_of,
-    together,
-)
+from ssh_abduction.data import Action, MapError, Odometry, TraceError, drives_of, together
 from ssh_abduction.data.drives import fingerprints_of, named_steps, pieces_in_words
+from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.odometry import Closure
 from ssh_abduction.explain import explain_trace
-from ssh_abduction.rivals import DrivePair, Listing, compare, difference, joins_of_drives
-from ssh_abduction.rivals.listing import DriveJoin
+from ssh_abduction.rivals import Listing, compare, difference, joins_of_drives
+from ssh_abduction.rivals.listing import DriveJoin, DrivePair
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.sources.metric.beam import Beam, Extending

@@ -13,7 +13,8 @@ from ssh_abduction import SSHMap, Trace
 from ssh_abduction.cli import main
 from ssh_abduction.data import DState, TraceError
 from ssh_abduction.data.trace import Action, Step
-from ssh_abduction.evaluation import Trajectory, TrajectoryWarning, evaluate_visits, told_poses
+from ssh_abduction.evaluation import Trajectory, evaluate_visits, told_poses
+from ssh_abduction.evaluation.trajectory import TrajectoryWarning
 
 HEAD = "# timestamp tx ty tz qx qy qz qw\n"
 # There and back along 20 m: steps 0 and 4 are at one place, and so are 1 and 3.

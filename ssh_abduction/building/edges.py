@@ -7,9 +7,9 @@ the poses may be one place whose join was missed, or lie behind a wall. So they 
 An edge is also cut where its course bends sharply between two places. Such a corner gets a negative
 number. An edge that runs beside others, with no wall between, is a lane of theirs, and is left out.
 
-A travel of a log has a course, which is laid into the map. Travels between the same two places are on one edge if their courses
-lie close together. So two ways that leave a place in nearly one direction are two edges, and a
-robot that cuts a corner is on the same edge as one that does not.
+A travel of a log has a course, which is laid into the map. Travels between the same two places are
+on one edge if their courses lie close together. So two ways that leave a place in nearly one
+direction are two edges, and a robot that cuts a corner is on the same edge as one that does not.
 """
 
 from __future__ import annotations

@@ -8,12 +8,10 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison as Comparison
     from ssh_abduction.rivals.comparison import compare as compare
     from ssh_abduction.rivals.differences import Difference as Difference
-    from ssh_abduction.rivals.differences import SharedSides as SharedSides
     from ssh_abduction.rivals.differences import difference as difference
     from ssh_abduction.rivals.differences import shared_sides as shared_sides
     from ssh_abduction.rivals.explore import Experiment as Experiment
     from ssh_abduction.rivals.explore import next_experiment as next_experiment
-    from ssh_abduction.rivals.listing import DrivePair as DrivePair
     from ssh_abduction.rivals.listing import Listing as Listing
     from ssh_abduction.rivals.listing import joins_of_drives as joins_of_drives
 

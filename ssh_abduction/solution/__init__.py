@@ -17,7 +17,6 @@ if TYPE_CHECKING:
         with_correction_warnings as with_correction_warnings,
     )
     from ssh_abduction.solution.corrected import with_names as with_names
-    from ssh_abduction.solution.recorded import drives_in as drives_in
     from ssh_abduction.solution.recorded import trace_in as trace_in
     from ssh_abduction.solution.result import Solution as Solution
     from ssh_abduction.solution.result import ending as ending

@@ -1,7 +1,6 @@
 """Theories: sets of axioms, the encodings of the axioms, and the speed-ups that a theory allows."""
 
-from ssh_abduction.theory.fields import CAUSAL, CHOICES, COUNTS, Count
 from ssh_abduction.theory.speedups import Speedups
-from ssh_abduction.theory.theory import PRESETS, Theory
+from ssh_abduction.theory.theory import Theory
 
-__all__ = ["CAUSAL", "CHOICES", "COUNTS", "PRESETS", "Count", "Speedups", "Theory"]
+__all__ = ["Speedups", "Theory"]

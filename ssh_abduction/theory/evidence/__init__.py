@@ -24,7 +24,7 @@ from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.of_steps import Alike, Asserted, Closures, Floors, Landings
 from ssh_abduction.theory.evidence.planar import Planar
 from ssh_abduction.theory.evidence.protocol import Equality, Evidence
-from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
+from ssh_abduction.theory.pairs import Pairs
 
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
@@ -39,23 +39,7 @@ KINDS: tuple[type[Evidence], ...] = (
     Planar,
 )
 
-__all__ = [
-    "KINDS",
-    "NO_PAIRS",
-    "Alike",
-    "Asserted",
-    "Closures",
-    "Displacement",
-    "Equality",
-    "Evidence",
-    "Floors",
-    "Landings",
-    "Pairs",
-    "Planar",
-    "evidence_of",
-    "pairs_of",
-    "said_by",
-]
+__all__ = ["Displacement", "Equality", "Evidence", "Planar", "evidence_of", "pairs_of", "said_by"]
 
 
 def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidence, ...]:

@@ -10,9 +10,10 @@ demands this for each closure alone. The probability `reject` of rejecting a tru
 among the returns that may be true, as for displacements. Closures together with displacements
 count in the misfit (`solver/geometry/fit.py`).
 
-A lift leads to another floor, and from one place to one place. A *stretch* is the steps of a drive between two lifts. The stretches before and after a lift are on
-different floors. So no two of their steps are at one place. Two stretches are on one floor if they
-have a dstate or a place in common, or if other stretches connect them in this way.
+A lift leads to another floor, and from one place to one place. A *stretch* is the steps of a drive
+between two lifts. The stretches before and after a lift are on different floors. So no two of their
+steps are at one place. Two stretches are on one floor if they have a dstate or a place in common,
+or if other stretches connect them in this way.
 """
 
 from __future__ import annotations
