@@ -135,6 +135,12 @@ class Passages:
         return walls, free
 
 
+def to_the_left(way: Array) -> Array:
+    """The directions to the left of a course at each point, (n, 2)."""
+    ahead = directions(way)
+    return np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+
+
 def directions(way: Array) -> Array:
     """The unit vectors, (n, 2), along a way of n points, over four steps each."""
     low, high = np.arange(len(way)) - 2, np.arange(len(way)) + 2

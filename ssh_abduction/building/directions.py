@@ -17,7 +17,7 @@ import numpy as np
 from perception.places.passages import STEP, WIDE, resampled
 from ssh_abduction.building.edges import Array, FloorPlan, PlanEdge
 from ssh_abduction.building.rooms import LONG, FreeView
-from ssh_abduction.building.straight_paths import leaving
+from ssh_abduction.building.straight_paths import edges_beside, leaving
 from ssh_abduction.data.building import Corridor
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
@@ -31,6 +31,7 @@ AHEAD, ASLANT, HALF, SHARP, BACK = 30, 45, 60, 120, 150
 # Two bends to one side that are less than CLOSE metres apart are one corner.
 CLOSE = 2.0
 STRIDE = 2  # points of a course from one possible bend to the next
+EACH = 1e6  # metres: what a leg costs, so that ways of fewer legs are shorter
 BEFORE = 1.0  # metres before and behind a door within which a course does not bend
 # Openings of one side that are nearer than this many metres are one opening.
 ONE = 1.0
@@ -321,19 +322,15 @@ def _bends(course: Array, sight: FreeView) -> Iterator[int]:
     """
     chosen = np.unique([*range(0, len(course), STRIDE), len(course) - 1])
     points = course[chosen]
-    best, before = [(0, 0.0)] + [(len(points), math.inf)] * (len(points) - 1), [0] * len(points)
+    legs: nx.DiGraph[int] = nx.DiGraph()
     for k, point in enumerate(points[:-1]):
         seen = sight.from_point(point, points[k + 1 :])
         seen[0] = True  # The robot drove there.
         for j in k + 1 + np.flatnonzero(seen):
-            by_way = best[k][0] + 1, best[k][1] + math.dist(point, points[j])
-            if by_way < best[j]:
-                best[j], before[j] = by_way, k
-    found, k = [], len(points) - 1
-    while k:
-        found.append(int(chosen[k]))
-        k = before[k]
-    yield from reversed(found)
+            legs.add_edge(k, int(j), cost=EACH + math.dist(point, points[j]))
+    if legs:
+        way = nx.dijkstra_path(legs, 0, len(points) - 1, weight="cost")
+        yield from (int(chosen[k]) for k in way[1:])
 
 
 def _turn(degrees: float) -> str:
@@ -357,15 +354,10 @@ def _beside(plan: FloorPlan, ends: Sequence[int], route: RouteCourse) -> Iterato
         if onward is None:
             return
         back, ahead = (leaving(plan, at).bearing for at in (e ^ 1, onward))
-        for x, other in enumerate(plan.edges):
-            for k in (0, 1):
-                if other.ends[k] == place and x not in own:
-                    turn = (leaving(plan, 2 * x + k).bearing - ahead) % math.tau
-                    side = "left" if turn < (back - ahead) % math.tau else "right"
-                    out = other.turned() if k else other
-                    door = out.course[out.doors[0].at] if out.doors else out.course[0]
-                    metres = route.beside(min(end, len(route.course) - 1), door)
-                    yield SideOpening(metres, side, bool(other.doors))
+        for side, out in edges_beside(plan, place, own, ahead, back):
+            door = out.course[out.doors[0].at] if out.doors else out.course[0]
+            metres = route.beside(min(end, len(route.course) - 1), door)
+            yield SideOpening(metres, side, bool(out.doors))
 
 
 def _merged(beside: Sequence[SideOpening]) -> list[SideOpening]:

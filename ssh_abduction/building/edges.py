@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import cdist
 
-from perception.places.passages import STEP, WIDE, directions, resampled
+from perception.places.passages import STEP, WIDE, resampled, to_the_left
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -282,8 +282,7 @@ class FloorPlan:
 
 def walls_beside(edge: PlanEdge) -> Array:
     """The points of walls beside an edge, (m, 2) metres."""
-    ahead = directions(edge.course)
-    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    left = to_the_left(edge.course)
     ends = [
         (edge.course + sign * edge.widths[:, [k]] * left)[edge.widths[:, k] < WIDE]
         for k, sign in enumerate((1, -1))

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from perception.places.passages import DOOR, STEP, WIDE, directions, resampled
+from perception.places.passages import DOOR, STEP, WIDE, directions, resampled, to_the_left
 from ssh_abduction.building.edges import Array, FloorPlan, Gap, PlanEdge, Spot, walls_beside
 from ssh_abduction.building.straight_paths import PairedWay, branches, chain_points
 from ssh_abduction.data.building import Corridor, MapDoor, MapRoom, Point, WayOut
@@ -36,8 +36,7 @@ BODY = 0.3
 
 def strips_of(edge: PlanEdge, begin: int, stop: int) -> Iterator[Array]:
     """Yield the corners, (4, 2) metres, of the free space between any two points of a course."""
-    ahead = directions(edge.course)
-    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    left = to_the_left(edge.course)
     wide = ndimage.median_filter(edge.widths, (3, 1))
     sides = edge.course + wide[:, [0]] * left, edge.course - wide[:, [1]] * left
     for k in range(begin, stop):
@@ -70,9 +69,7 @@ class RoomSpace:
 
     def beside(self, course: Array) -> Array:
         """How far the free space reaches left and right of a course, (n, 2) metres."""
-        ahead = directions(course)
-        left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
-        off = np.arange(1, round(2 * WIDE / GRID) + 1)[:, None, None] * GRID * left
+        off = np.arange(1, round(2 * WIDE / GRID) + 1)[:, None, None] * GRID * to_the_left(course)
         reach = []
         for sign in (1, -1):
             cells = np.rint((course + sign * off - self.corner) / GRID).astype(int)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import Any
@@ -317,25 +317,34 @@ def paths_of(plan: FloorPlan, ways: list[PairedWay]) -> tuple[MapPath, ...]:
 def branches(plan: FloorPlan, ways: list[PairedWay]) -> Iterator[tuple[int, int, str, PlanEdge]]:
     """Yield the edges that leave paths: the path, its place, the side, and the edge from there.
 
-    At a place of a path, an edge leaves on the left if its bearing is between that of the way ahead
-    and that of the way back, counterclockwise.
+    An edge leaves on the left if its bearing is between that of the way ahead and that of the way
+    back, counterclockwise.
     """
-    bearing = {
-        2 * x + k: leaving(plan, 2 * x + k).bearing for x in range(len(plan.edges)) for k in (0, 1)
-    }
     for n, way in enumerate(ways):
         own = {e // 2 for e in way.ends}
         for i, place in enumerate(way.places):
-            ahead = bearing[way.ends[i]] if i < len(way.ends) else None
-            back = bearing[way.ends[i - 1] ^ 1] if i else None
+            ahead = leaving(plan, way.ends[i]).bearing if i < len(way.ends) else None
+            back = leaving(plan, way.ends[i - 1] ^ 1).bearing if i else None
             ahead = wrapped((back or 0.0) + math.pi) if ahead is None else ahead
             back = wrapped(ahead + math.pi) if back is None else back
-            for x, edge in enumerate(plan.edges):
-                for k in (0, 1):
-                    if edge.ends[k] == place and x not in own:
-                        turn = (bearing[2 * x + k] - ahead) % math.tau
-                        side = "left" if turn < (back - ahead) % math.tau else "right"
-                        yield n, place, side, edge.turned() if k else edge
+            yield from (
+                (n, place, side, edge) for side, edge in edges_beside(plan, place, own, ahead, back)
+            )
+
+
+def edges_beside(
+    plan: FloorPlan, place: int, own: Collection[int], ahead: float, back: float
+) -> Iterator[tuple[str, PlanEdge]]:
+    """Yield the edges that leave a place, but for those numbered `own`, each with its side.
+
+    `ahead` and `back` are the bearings of the way on and of the way back, in radians.
+    """
+    for x, edge in enumerate(plan.edges):
+        for k in (0, 1):
+            if edge.ends[k] == place and x not in own:
+                turn = (leaving(plan, 2 * x + k).bearing - ahead) % math.tau
+                side = "left" if turn < (back - ahead) % math.tau else "right"
+                yield side, edge.turned() if k else edge
 
 
 def chain_points(line: Array) -> tuple[tuple[float, float], ...]:

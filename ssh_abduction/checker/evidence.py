@@ -31,17 +31,13 @@ def floors_of(m: Reading) -> dict[int, int]:
 
     The dstates of a floor are connected by common places, and by links that are not lifts.
     """
-    beside: dict[int, set[int]] = {s: set() for s in m.states}
     pairs = [(t.source.id, t.target.id) for t in m.moves if t.action.kind not in _LIFTS]
     for s in m.states.values():
         pairs += [
             (s.id, x.id) for x in m.states.values() if s.place is not None and s.place == x.place
         ]
-    for one, other in pairs:
-        beside[one].add(other)
-        beside[other].add(one)
-    in_order = sorted(beside, key=lambda label: m.first.get(label, len(m.trace)))
-    floors = parts(in_order, beside.__getitem__)
+    in_order = sorted(m.states, key=lambda label: m.first.get(label, len(m.trace)))
+    floors = parts(in_order, pairs)
     return {label: next(iter(floor)) for floor in floors for label in floor}
 
 

@@ -27,7 +27,7 @@ from ssh_abduction.checker.reading import (
     course_of,
     opposite,
 )
-from ssh_abduction.data.groups import reached
+from ssh_abduction.data.groups import linked, reached
 from ssh_abduction.data.map_parts import Region, course_named, list_in_words
 
 
@@ -224,7 +224,7 @@ def _behind(m: Reading) -> dict[_Places, int]:
     links = _links(m)
     parts: dict[_Places, int] = {}
     for node in [node for node in links if node[0] == "place"]:
-        others = {other: ends - {node} for other, ends in links.items()}
+        others = {other: ends.keys() - {node} for other, ends in links.items()}
         behind = {_places(reached([start], others.__getitem__)) for start in links[node]}
         whole = 1 + len(frozenset().union(*behind))
         parts |= {part: node[1] for part in behind if part and 2 * len(part) < whole}
@@ -235,9 +235,8 @@ def _behind(m: Reading) -> dict[_Places, int]:
     }
 
 
-def _links(m: Reading) -> dict[_Node, set[_Node]]:
+def _links(m: Reading) -> dict[_Node, dict[_Node, None]]:
     """Link places with their paths, and with places reached by lifts or travels along no path."""
-    links: dict[_Node, set[_Node]] = defaultdict(set)
     pairs: list[tuple[_Node, _Node]] = [
         (("place", s.place), ("path", course[0], s.floor))
         for s in m.states.values()
@@ -249,10 +248,7 @@ def _links(m: Reading) -> dict[_Node, set[_Node]]:
         p, q = move.source.place, move.target.place
         if p is not None and q is not None and p != q:
             pairs.append((("place", p), ("place", q)))
-    for one, other in pairs:
-        links[one].add(other)
-        links[other].add(one)
-    return links
+    return linked(pairs)
 
 
 def _places(nodes: Iterable[_Node]) -> _Places:

@@ -80,15 +80,22 @@ def way(start: Node, goal: Node, beside: Callable[[Node], Iterable[Node]]) -> li
     return found[::-1]
 
 
-def parts(
-    nodes: Iterable[Node], beside: Callable[[Node], Iterable[Node]]
-) -> list[Collection[Node]]:
-    """Group nodes that links connect. Links lead both ways."""
+def linked(pairs: Iterable[tuple[Node, Node]]) -> dict[Node, dict[Node, None]]:
+    """Return the nodes beside each node with a link. A pair is a link, which leads both ways."""
+    beside: dict[Node, dict[Node, None]] = {}
+    for one, other in pairs:
+        beside.setdefault(one, {})[other] = None
+        beside.setdefault(other, {})[one] = None
+    return beside
+
+
+def parts(nodes: Iterable[Node], pairs: Iterable[tuple[Node, Node]]) -> list[Collection[Node]]:
+    """Group nodes that links connect. A pair is a link, which leads both ways."""
     found: list[Collection[Node]] = []
-    known = set[Node]()
+    known, beside = set[Node](), linked(pairs)
     for node in nodes:
         if node not in known:
-            found.append(reached([node], beside).keys())
+            found.append(reached([node], lambda n: beside.get(n, ())).keys())
             known.update(found[-1])
     return found
 

@@ -240,14 +240,11 @@ class SSHMap:
         Links and common places connect the dstates of a piece. The map of one drive has one piece,
         unless an action slipped. A joint map may have one for each drive.
         """
-        beside: dict[int, list[int]] = {s.id: [] for s in self.dstates}
         at: dict[int, int] = {}  # the first dstate at each place
         pairs = [(s, x) for s, _, x in self.links]
         pairs += [(at.setdefault(s.place, s.id), s.id) for s in self.dstates if s.place is not None]
-        for one, other in pairs:
-            beside[one].append(other)
-            beside[other].append(one)
-        return tuple(tuple(sorted(piece)) for piece in parts(sorted(beside), beside.__getitem__))
+        ids = sorted(s.id for s in self.dstates)
+        return tuple(tuple(sorted(piece)) for piece in parts(ids, pairs))
 
     @property
     def piece_of(self) -> dict[int, int]:

@@ -40,7 +40,7 @@ def is_planar(around: Mapping[Place, Ends]) -> bool:
     """
     place_of = {end: place for place, ends in around.items() for end in ends}
     places = dict.fromkeys(place_of.values())
-    pieces = parts(places, lambda place: [place_of[end ^ 1] for end in around[place]])
+    pieces = parts(places, ((place, place_of[end ^ 1]) for end, place in place_of.items()))
     return len(places) - len(place_of) // 2 + _faces(around) == 2 * len(pieces)
 
 
