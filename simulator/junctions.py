@@ -172,7 +172,9 @@ class Pilot:
             turn = 0.0
             if min(off, default=math.pi) <= STRAIGHT:
                 street = streets[off.index(min(off))]
-                course, turn = robot.odometry[2] + street.bearing, _steer(street)
+                course = robot.odometry[2] + street.bearing
+                # This turn leads to the midline and along it.
+                turn = street.bearing - math.atan(1.5 * float(np.clip(street.offset, -0.5, 0.5)))
             self.driver.go(STRIDE, turn)
             if self.driver.on_travel is not None:
                 self.driver.on_travel(self.driver)
@@ -246,11 +248,6 @@ def _is_open(image: Array, side: int, reach: float) -> bool:
         image[-15:] * np.sin(BEARINGS[-15:]) if side > 0 else image[:15] * np.sin(-BEARINGS[:15])
     )
     return bool(np.median(beams) > OPEN * reach)
-
-
-def _steer(street: Street) -> float:
-    """Compute the turn in the next stride, in radians, that leads to the midline and along it."""
-    return street.bearing - math.atan(1.5 * float(np.clip(street.offset, -0.5, 0.5)))
 
 
 @dataclass(frozen=True)
@@ -466,7 +463,8 @@ def panorama(images: Iterable[tuple[float, Array]]) -> tuple[Array, float]:
     for turned, image in images:
         if rows:
             heading = compass(first, image, heading + turned, turned)
-        rows.append(_around(image, heading))
+        bearings = np.angle(np.exp(1j * (AROUND - heading)))
+        rows.append(np.interp(bearings, BEARINGS, image, left=np.nan, right=np.nan))
         first = np.where(np.isnan(first), rows[-1], first)
     shown = ~np.isnan(first)
     ranges = np.full(360, np.nan)
@@ -491,9 +489,3 @@ def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
         off = np.minimum(np.abs(known[:, shown] - image[shown]), 0.3)
         best = float(tried[int(off.mean(axis=1).argmin())])
     return best
-
-
-def _around(image: Array, heading: float) -> Array:
-    """Turn an image to ranges at each degree, (360,) metres; NaN in unseen directions."""
-    bearings = np.angle(np.exp(1j * (AROUND - heading)))
-    return np.asarray(np.interp(bearings, BEARINGS, image, left=np.nan, right=np.nan))

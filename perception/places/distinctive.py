@@ -240,7 +240,9 @@ class _Detector:
         while (at := self._next) is not None and recent.way(here) > recent.way(at) + WINDOW:
             self._look(at)
             yield from self._stays.add(self._released(self._horizon), self._horizon)
-            self._forget()
+            # Forget scans that are too old for any further visit.
+            oldest = recent.way(min(self._horizon, self._stays.done))
+            recent.drop_before(recent.at(oldest - AROUND))
 
     def finish(self) -> Iterator[Visit]:
         """End the drive, and yield all visits that are left."""
@@ -326,11 +328,6 @@ class _Detector:
         count = bisect_left(self._found, horizon, key=lambda found: found[0])
         released, self._found = self._found[:count], self._found[count:]
         return [visit for *_, visit in released]
-
-    def _forget(self) -> None:
-        """Forget scans that are too old for any further visit."""
-        oldest = self._recent.way(min(self._horizon, self._stays.done))
-        self._recent.drop_before(self._recent.at(oldest - AROUND))
 
     def _passes(self, chain: _Chain) -> Iterator[Visit]:
         """Yield a visit for each time that the robot drives through the disc of a junction."""

@@ -183,7 +183,8 @@ def with_doors(plan: FloorPlan, room: dict[int, int], ssh_map: SSHMap) -> tuple[
                     tuple(sorted({room[p] for p in edge.ends})),
                     tuple(sorted({ssh_map.dstate_at[t] for t in edge.travels})),
                 )
-                number = next((d.id for d in found if _halves(d, new)), new.id)
+                halves = (d for d in found if d.rooms == new.rooms)
+                number = next((d.id for d in halves if math.dist(d.at, new.at) < HALF), new.id)
                 found[number : number + 1] = [
                     _joined(found[number], new) if number < new.id else new
                 ]
@@ -193,10 +194,6 @@ def with_doors(plan: FloorPlan, room: dict[int, int], ssh_map: SSHMap) -> tuple[
         edges.append(replace(edge, passages=tuple(passages)))
     plan.edges = edges
     return tuple(found)
-
-
-def _halves(one: MapDoor, other: MapDoor) -> bool:
-    return one.rooms == other.rooms and math.dist(one.at, other.at) < HALF
 
 
 def _joined(one: MapDoor, other: MapDoor) -> MapDoor:

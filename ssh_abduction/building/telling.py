@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from ssh_abduction.data.building import Corridor, MapRoom, WayOut
 from ssh_abduction.data.map_parts import list_in_words
@@ -38,22 +38,16 @@ def corridor_in_words(ssh_map: SSHMap, corridor: Corridor) -> str:
     order = " – ".join(ssh_map.numbered("place", p) for p in corridor.order)
     parts = [
         f"{corridor.length:.0f} m, {corridor.width:.1f} m wide, places {order}",
-        *(
-            f"{side}: {_beside(ssh_map, [o for o in corridor.openings if o.side == side])}"
-            for side in ("left", "right")
-        ),
     ]
+    for side in ("left", "right"):
+        ways = [_way(ssh_map, o) for o in corridor.openings if o.side == side]
+        parts.append(f"{side}: {', '.join(ways) or 'nothing known'}")
     if corridor.doors:
         parts.append(f"{noun_of('door', corridor.doors)} {list_in_words(corridor.doors)} across it")
     sure = next((p.sure for p in ssh_map.paths if p.id == corridor.path), None)
     if sure is not None:
         parts.append(f"its path has probability {sure:.2f}")
     return f"{ssh_map.called('corridor', corridor.id)}: {'; '.join(parts)}"
-
-
-def _beside(ssh_map: SSHMap, openings: Iterable[WayOut]) -> str:
-    """List the ways on one side of a corridor."""
-    return ", ".join(_way(ssh_map, o) for o in openings) or "nothing known"
 
 
 def _way(ssh_map: SSHMap, opening: WayOut) -> str:

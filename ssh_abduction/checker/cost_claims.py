@@ -417,7 +417,8 @@ class _Errors:
         """Compute c(z), by how much loops and closures are off, for each row of unknowns."""
         pose, at = self._poses(z)
         doubt, motion = self._parts(z)[1], MISSING * self._parts(z)[3]
-        off = _seen_from(at, *self._loops)[..., self._counts]
+        begin, end = (at[..., steps, :] for steps in self._loops)
+        off = _from_to(begin, end)[..., self._counts]
         first, last = (pose[..., steps, :] for steps in self._closures)
         # Motion 0 is none.
         motion = np.concatenate([np.zeros_like(pose[..., :1, :]), motion], axis=-2)
@@ -461,11 +462,6 @@ def _turned(vectors: _Numbers, angle: _Numbers) -> _Numbers:
     """Turn vectors, whose last axis begins with x and y, counterclockwise by angles in radians."""
     x, y, cos, sin = vectors[..., 0], vectors[..., 1], np.cos(angle), np.sin(angle)
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-
-
-def _seen_from(pose: _Numbers, first: NDArray[np.int_], last: NDArray[np.int_]) -> _Numbers:
-    """Compute the poses of the last steps in the frames of the first ones."""
-    return _from_to(pose[..., first, :], pose[..., last, :])
 
 
 def _from_to(first: _Numbers, last: _Numbers) -> _Numbers:

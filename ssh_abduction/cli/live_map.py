@@ -105,7 +105,8 @@ def run_live(options: argparse.Namespace) -> int:
     if options.replay is None:
         _listen(options, session)
     else:
-        _replay(options, session)
+        with stages("log", "drive", "last map"):
+            _replay(options, session)
     _say_map(session.mapper)
     return 0
 
@@ -135,12 +136,6 @@ def _listen(options: argparse.Namespace, session: LiveSession) -> None:
 
 
 def _replay(options: argparse.Namespace, session: LiveSession) -> None:
-    """Give the scans of a log to a session, as fast as asked for. Ctrl-C ends the log."""
-    with stages("log", "drive", "last map"):
-        _replayed(options, session)
-
-
-def _replayed(options: argparse.Namespace, session: LiveSession) -> None:
     log = import_log.read(options.replay, options)
     for warning in log.warnings:
         warn([warning])

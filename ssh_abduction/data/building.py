@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from ssh_abduction.data.schema import FieldReader, Shape, SparseData
@@ -246,8 +245,7 @@ def read_building(read: FieldReader, value: Any, name: str) -> Indoors:
     line: Shape[Any] = read.several(point, "a list of points")
 
     def each(kind: type[Any], **shapes: Shape[Any]) -> Callable[[Any, str], Any]:
-        one: Shape[Any] = partial(_record, read, kind, shapes)
-        return read.several(one, "a list")
+        return read.several(lambda value, name: read.record(kind, value, name, **shapes), "a list")
 
     opening = {"side": read.one_of(SIDES[:2]), "metres": number}
     openings = each(WayOut, **opening, place=maybe, door=maybe, to=maybe)
@@ -278,7 +276,3 @@ def read_building(read: FieldReader, value: Any, name: str) -> Indoors:
         if ids != list(range(len(ids))):
             raise read.wrong(f"{name}.{kind}", "the ids 0, 1, 2, … in this order", ids)
     return found
-
-
-def _record(read: FieldReader, kind: type[Any], shapes: Any, value: Any, name: str) -> Any:
-    return read.record(kind, value, name, **shapes)

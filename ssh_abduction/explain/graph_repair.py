@@ -207,8 +207,13 @@ class _GraphAxioms:
             blamed = {e for e in blamed if not self._holds([(_wrong(e), False)], mode)}
         found = replace(found, complete=len(smallest) <= most, blamed=tuple(sorted(blamed)))
         yield found
-        for clash in self._clashes():
+        # Find clashes without a common edge, until the edges that are in none do not clash.
+        left = list(range(len(self.moves)))
+        while self._clash(left):
+            edges = minimal_part(self._clash, left)
+            clash = tuple(sorted(edges)), self._axioms_of(edges)
             yield (found := replace(found, clashes=(*found.clashes, clash)))
+            left = [e for e in left if e not in edges]
         for i, wrong in enumerate(found.repairs):
             turns = (*found.turns[:i], self._turns(wrong), *found.turns[i + 1 :])
             yield (found := replace(found, turns=turns))
@@ -225,14 +230,6 @@ class _GraphAxioms:
                 yield turned.arguments[1].string
 
         return tuple(tuple(sorted(actions(edge))) for edge in wrong)
-
-    def _clashes(self) -> Iterator[tuple[tuple[int, ...], tuple[str, ...]]]:
-        """Find clashes without a common edge, until the edges that are in none do not clash."""
-        left = list(range(len(self.moves)))
-        while self._clash(left):
-            edges = minimal_part(self._clash, left)
-            yield tuple(sorted(edges)), self._axioms_of(edges)
-            left = [e for e in left if e not in edges]
 
     def _clash(self, edges: Collection[int]) -> bool:
         """Whether these edges cannot all be right."""

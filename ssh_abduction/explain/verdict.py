@@ -178,7 +178,9 @@ class PairExplanation:
         ]
         counts = f", with {' and '.join(changed)}" if changed else ""
         loop = f": {self.loop}" if self.loop else ""
-        return f"{what} {_effect(lost.nats - won.nats)}{counts}{loop}"
+        nats = lost.nats - won.nats
+        effect = f"costs {nats:.1f} nats" if nats >= 0 else f"saves {-nats:.1f} nats"
+        return f"{what} {effect}{counts}{loop}"
 
     @property
     def assuming(self) -> dict[str, str]:
@@ -252,11 +254,6 @@ def _counted(number: float, name: str) -> str:
     if name == "faults":
         return f"faults for {number:g} {_noun('dstates', number)}"
     return f"{number:g} {_noun(name, number)}"
-
-
-def _effect(nats: float) -> str:
-    """Say in words that something costs, or saves, some nats."""
-    return f"costs {nats:.1f} nats" if nats >= 0 else f"saves {-nats:.1f} nats"
 
 
 def _difference(lost: Cost, won: Cost, theory: Theory) -> str:

@@ -102,7 +102,9 @@ class Keeper(ABC):
         `began` is when the step began, by `time.perf_counter`.
         """
         steps = len(self._problem.trace)
-        if not self._is_settled and steps >= self._next_search:
+        is_complete = self.is_complete or len(self.minimal) == self._options.max_maps
+        is_settled = self.is_impossible or (self.is_proven and is_complete)
+        if not is_settled and steps >= self._next_search:
             self.searches += 1
             was_stopped = self._ask() in ("work limit", "time limit", "interrupted")
             self._next_search = max(steps + PAUSE, int(self.retry * steps)) if was_stopped else 0
@@ -131,12 +133,6 @@ class Keeper(ABC):
     def minimal(self) -> list[ExtendedMap]:
         """The maps that are proven minimal; empty without a proof."""
         return [m for m in self.maps if m.cost == self._least] if self.is_proven else []
-
-    @property
-    def _is_settled(self) -> bool:
-        """Whether another search would find nothing new."""
-        is_complete = self.is_complete or len(self.minimal) == self._options.max_maps
-        return self.is_impossible or (self.is_proven and is_complete)
 
     @property
     def _status(self) -> Status:

@@ -562,7 +562,9 @@ class MoveGraph:
                 self._imply(facing.get(start, start), facing.get(end, end), travel)
         for nodes in at.values():
             for node, aside in permutations(nodes, 2):
-                self._imply(node, aside, around if self._is_around(node, aside) else None)
+                (_, path, way), (_, other, other_way) = self.course(node), self.course(aside)
+                is_around = path is not None and path == other and way != other_way
+                self._imply(node, aside, around if is_around else None)
 
     def _passes_closed(self, source: Node, target: Node) -> bool:
         """Whether a move leaves or enters a place by a gateway that was last seen closed."""
@@ -585,11 +587,6 @@ class MoveGraph:
             if at == place and any(abs((degrees + 180) % 360 - 180) <= FACING for degrees in off):
                 return True
         return False
-
-    def _is_around(self, source: Node, target: Node) -> bool:
-        """Whether two nodes at one place face the two directions of one path."""
-        (_, path, way), (_, other, other_way) = self.course(source), self.course(target)
-        return path is not None and path == other and way != other_way
 
     def _only_action(self, *, onward: bool) -> str | None:
         """Return the action that goes on along paths or, if not `onward`, turns around on them.

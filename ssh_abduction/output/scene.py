@@ -503,7 +503,9 @@ class _Drawing:
     def scale_bar(self, marks: Sequence[Mark]) -> list[Mark]:
         """Draw a scale bar of 1, 2 or 5 times a power of ten metres, below the map on the left."""
         left, lowest, _, _ = bounds(marks, self.scale)
-        u, metres = 1 / self.scale, _round_length(120 / self.scale)
+        u, most = 1 / self.scale, 120 / self.scale
+        ten = 10.0 ** math.floor(math.log10(most))
+        metres = max(ten * k for k in (1, 2, 5) if ten * k <= most * (1 + 1e-9))
         y, right = lowest - 24 * u, left + metres
         bar = (((left, y - 5 * u), (left, y + 5 * u)), ((left, y), (right, y)))
         end = ((right, y - 5 * u), (right, y + 5 * u))
@@ -592,9 +594,3 @@ def _scale(spots: Sequence[Point], nearest: float) -> tuple[float, float]:
     usual = max(median(gaps), extent / LARGEST)
     scale = min(nearest / max(min(gaps), 1e-9), APART / usual, LARGEST / extent)
     return scale, min(1.0, max(SMALLEST, usual * scale / NEAREST))
-
-
-def _round_length(metres: float) -> float:
-    """Round down to a number of the series …, 0.1, 0.2, 0.5, 1, 2, 5, 10, …"""
-    ten = 10.0 ** math.floor(math.log10(metres))
-    return max(ten * k for k in (1, 2, 5) if ten * k <= metres * (1 + 1e-9))

@@ -258,16 +258,14 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
     for classes in sorted(map(sorted, nx.connected_components(linked))):
         if (ones[0, classes] != ones[1, classes]).any():
             first, other = (
-                tuple(table.steps_of(group) for group in _groups(classes, row.tolist()))
+                tuple(
+                    table.steps_of(group)
+                    for group in gathered((row[c], c) for c in classes if row[c] != NONE).values()
+                )
                 for row in ones
             )
             nowhere = [table.steps_of([c for c in classes if row[c] == NONE]) for row in ones]
             yield Change(sort, first, other, nowhere[0], nowhere[1])
-
-
-def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
-    """Group classes that a map joins. `ones` is its row in `Table.ones`; NONE is left out."""
-    return list(gathered((ones[c], c) for c in classes if ones[c] != NONE).values())
 
 
 def _links_only_in(

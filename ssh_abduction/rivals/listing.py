@@ -47,7 +47,6 @@ from ssh_abduction.solution import (
     verdict_of,
 )
 from ssh_abduction.theory.joins import Join, joins_in_words
-from ssh_abduction.theory.theory import Theory
 
 # The fields by which the file of a solution is known. Other files have only maps.
 OF_SOLUTION = {"maps", "theory", "steps", "status", "complete"}
@@ -154,7 +153,7 @@ class Listing:
     @classmethod
     def _of(cls, solution: Solution, where: str = "maps") -> Listing:
         """Make a listing from a solution. `where` is its name in messages."""
-        minimal = solution.levels[0].count if solution.levels else solution.count
+        minimal, theory = len(solution.minimal_maps), solution.theory
         listing = cls(
             solution.maps,
             minimal if solution.status is Status.OPTIMAL else None,
@@ -166,7 +165,7 @@ class Listing:
             solution.by_minimality,
             solution.support.drives or solution.drives,  # those of a file have fingerprints
             solution.warnings,
-            _has_one_view(solution.theory),
+            "functional_view" not in theory.without and not theory.unknown_views,
         )
         return listing.checked()
 
@@ -288,11 +287,6 @@ class Listing:
 
 
 Maps: TypeAlias = Solution | Listing | SSHMap | Iterable[SSHMap]
-
-
-def _has_one_view(theory: Theory) -> bool:
-    """Tell whether each dstate has one view by this theory, and all views are known."""
-    return "functional_view" not in theory.without and not theory.unknown_views
 
 
 def _check_views(

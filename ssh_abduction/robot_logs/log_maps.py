@@ -412,7 +412,8 @@ def map_log(
         allowed, tries = allowed * LONGER, tries - 1
         tell(f"No map was found yet. The search goes on for up to {allowed:.0f} units of work.")
         solution = mapping.solve(trace, chosen, work_limit=allowed, **limits)
-    solution = _built(_with_poses(solution, trace), trace)
+    posed = _with_poses(solution, trace)
+    solution = replace(posed, maps=tuple(with_building(each, trace) for each in posed.maps))
     if corrections is not None:
         solution = with_correction_warnings(corrections, solution)
     seconds["maps"] = round(time.process_time() - begin, 3)
@@ -425,11 +426,6 @@ def _with_poses(solution: Solution, trace: Trace) -> Solution:
         return solution
     first, *others = solution.maps
     return replace(solution, maps=(Ranking(trace).fitted(first), *others))
-
-
-def _built(solution: Solution, trace: Trace) -> Solution:
-    """Derive the paths, corridors, doors and rooms of all maps."""
-    return replace(solution, maps=tuple(with_building(each, trace) for each in solution.maps))
 
 
 def _doubted(solution: Solution) -> Solution:

@@ -102,7 +102,6 @@ class Speedup:
     Attributes:
         name: The name of the row.
         switch: The field of `Speedups` that turns it on. Several rows may share a switch.
-        sentence: What it does.
         suits: Returns whether the row is made for a theory.
         rests_on: Axioms that it needs. If an axiom is about something that a theory has, such as
             paths, the theory must enforce it.
@@ -113,7 +112,6 @@ class Speedup:
 
     name: str
     switch: str
-    sentence: str
     suits: Callable[[Theory], bool] = lambda theory: True
     rests_on: frozenset[str] = NOTHING
     keeps: Callable[[], frozenset[str]] | None = EVERY
@@ -125,15 +123,6 @@ class Speedup:
             and not self.rests_on & theory.given_up
             and (self.keeps is EVERY or theory.demands <= self.keeps())
         )
-
-
-def _keeps_headings(theory: Theory) -> bool:
-    """Whether each dstate has at most one heading, if places have frames."""
-    return theory.star != "frame" or "one_heading" in theory.hard
-
-
-def _has_paths(theory: Theory) -> bool:
-    return theory.level == "topological"
 
 
 def _has_frames(theory: Theory) -> bool:
@@ -198,46 +187,46 @@ SURVIVE_A_CUT = encodings.names_in("causal", "topological", "boundary", "star") 
 }
 
 TABLE = (
+    # Solve for a prefix of the trace, replay its maps on the whole trace, and extend the prefix to
+    # where they fail.
     Speedup(
         "prefixes",
         "prefixes",
-        "Solve for a prefix of the trace, replay its maps on the whole trace, and extend the "
-        "prefix to where they fail.",
-        _keeps_headings,
+        # Each dstate has at most one heading, if places have frames.
+        lambda theory: theory.star != "frame" or "one_heading" in theory.hard,
         ONE_OF_EACH,
         lambda: SURVIVE_A_CUT,
     ),
+    # The same if stars agree within a tolerance. A replayed map must fit the stars of all steps.
     Speedup(
         "prefixes in tolerance",
         "prefixes",
-        "The same if stars agree within a tolerance. A replayed map must fit the stars of all "
-        "steps.",
         lambda theory: theory.star == "gateways",
         ONE_OF_EACH | {"gateway_heading"},
         lambda: SURVIVE_A_CUT | GATEWAYS,
     ),
+    # Begin with few names for paths, and add names when they are too few.
     Speedup(
         "path_names",
         "path_names",
-        "Begin with few names for paths, and add names when they are too few.",
-        _has_paths,
+        lambda theory: theory.level == "topological",
         TRAVELS_AND_TURNS,
     ),
+    # Causal theory: make some names. Clingo chooses one of them for each node.
     Speedup(
         "named dstates",
         "names",
-        "Causal theory: make some names. Clingo chooses one of them for each node.",
         lambda theory: (
             theory.level == "causal" and theory.prefer == ("dstates",) and not theory.has_faults
         ),
         CAUSAL,
         _kept_by("names", and_also=(*PAIRS_OF_STEPS, *OF_TRACES, "asserted same")),
     ),
+    # Causal theory with faults: give the dstates names, and give clingo only the steps that a map
+    # does not predict.
     Speedup(
         "named dstates with faults",
         "names",
-        "Causal theory with faults: give the dstates names, and give clingo only the steps that a "
-        "map does not predict.",
         lambda theory: (
             theory.level == "causal" and theory.has_faults and theory.prefer == ("dstates",)
         ),
@@ -254,11 +243,11 @@ TABLE = (
             ),
         ),
     ),
+    # Faults, with places or with displacements that may be wrong: guess the faults, mend the trace,
+    # and solve it without faults. Causal maps with faults show what is minimal.
     Speedup(
         "mending",
         "names",
-        "Faults, with places or with displacements that may be wrong: guess the faults, mend the "
-        "trace, and solve it without faults. Causal maps with faults show what is minimal.",
         lambda theory: (
             (theory.level == "topological" or theory.jumped > 0)
             and theory.has_faults
@@ -273,11 +262,11 @@ TABLE = (
             | {"path_in_one_piece"}
         ),
     ),
+    # Places with frames: first find which visits are at one place, and so the dstates. Then find
+    # places and paths.
     Speedup(
         "visits",
         "names",
-        "Places with frames: first find which visits are at one place, and so the dstates. Then "
-        "find places and paths.",
         _has_frames,
         FRAMES,
         _kept_by(
@@ -287,11 +276,11 @@ TABLE = (
             and_also=(*PAIRS_OF_STEPS, *OF_TRACES, "asserted same", "the field same_place"),
         ),
     ),
+    # Places without stars: if clingo takes long, first find the dstates, with names. Then find
+    # places and paths.
     Speedup(
         "ways",
         "ways",
-        "Places without stars: if clingo takes long, first find the dstates, with names. Then find "
-        "places and paths.",
         lambda theory: (
             theory.level == "topological"
             and theory.star in ("none", "alike")
@@ -305,43 +294,42 @@ TABLE = (
             and_also=(*PAIRS_OF_STEPS, *OF_TRACES, "asserted same", "the field same_place"),
         ),
     ),
+    # Find steps that are pairwise distinct, or such segments of paths. Give each its own name.
     Speedup(
         "clique",
         "clique",
-        "Find steps that are pairwise distinct, or such segments of paths. Give each its own name.",
         lambda theory: not theory.unknown_views and not theory.changed,
         CAUSAL,
     ),
+    # Places with frames: while dstates are sought, add what the order and the sides of paths
+    # forbid, path by path.
     Speedup(
         "sides",
         "sides",
-        "Places with frames: while dstates are sought, add what the order and the sides of paths "
-        "forbid, path by path.",
         _has_frames,
         FRAMES,
     ),
+    # Give clingo only some links, or visits, at first. Add others when an answer breaks them.
     Speedup(
         "lazy",
         "lazy",
-        "Give clingo only some links, or visits, at first. Add others when an answer breaks them.",
     ),
+    # Raise the lower bound by unsat cores, instead of improving a map step by step.
     Speedup(
         "core_guided",
         "core_guided",
-        "Raise the lower bound by unsat cores, instead of improving a map step by step.",
     ),
+    # Make a map without clingo, by sketches or by a beam of hypotheses about the displacements. The
+    # checker judges this map. Without it, the confidence of a map ignores maps that break axioms.
     Speedup(
         "greedy",
         "greedy",
-        "Make a map without clingo, by sketches or by a beam of hypotheses about the "
-        "displacements. The checker judges this map. Without it, the confidence of a map ignores "
-        "maps that break axioms.",
     ),
+    # To add a drive to an existing map, give the solver each link of the map once, instead of all
+    # old steps.
     Speedup(
         "digest",
         "digest",
-        "To add a drive to an existing map, give the solver each link of the map once, instead of "
-        "all old steps.",
         lambda theory: not theory.has_faults,
         ONE_OF_EACH,
         lambda: (
@@ -349,11 +337,11 @@ TABLE = (
             - {"one_pose", "closure"}
         ),
     ),
+    # Stars as patterns: if clingo takes long, search for a map in which places have frames. The
+    # checker judges this map.
     Speedup(
         "framing",
         "framing",
-        "Stars as patterns: if clingo takes long, search for a map in which places have frames. "
-        "The checker judges this map.",
         lambda theory: theory.star == "pattern" and row("visits").holds_for(theory.with_frames()),
     ),
 )

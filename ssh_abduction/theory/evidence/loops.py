@@ -380,14 +380,9 @@ def vectors_turned(vectors: Array, angles: Array | float) -> Array:
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def _quarter_turned(vectors: Array) -> Array:
-    """Turn vectors of shape (..., 2) counterclockwise by a right angle."""
-    return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
-
-
 def _moved_from_origin(positions: Array) -> Array:
     """Return how twists (see above) move poses at these positions (..., 2): (..., 3, 3)."""
     moved = np.zeros((*positions.shape[:-1], 3, 3))
     moved[..., range(3), range(3)] = 1.0
-    moved[..., :2, 2] = _quarter_turned(positions)
+    moved[..., 0, 2], moved[..., 1, 2] = -positions[..., 1], positions[..., 0]
     return moved
