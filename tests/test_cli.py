@@ -688,6 +688,10 @@ def test_a_theory_is_read_from_a_file(
         (["map", "x.log", "-o", "x", "--set", "misraed=4"], "did you mean --set misread=VALUE?"),
         (["map", "x.log", "-o", "x", "--misraed=4"], "did you mean --set misread=VALUE?"),
         (["solve", "x", "--strcit"], "did you mean --strict?"),
+        (
+            ["export", "x", "--to", "svg", "--set", "hide=1"],
+            "did you mean --set hide_undecided=VALUE?",
+        ),
     ],
 )
 def test_misspelt_option_gets_the_way_to_write_it(
@@ -695,7 +699,7 @@ def test_misspelt_option_gets_the_way_to_write_it(
 ) -> None:
     with pytest.raises(SystemExit):
         main(words)
-    assert capsys.readouterr().err.endswith(f"; {hint}\n")
+    assert f"; {hint} (options: ssh-abduction {words[0]} --help)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

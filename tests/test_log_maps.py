@@ -163,7 +163,7 @@ def test_explain_prints_the_probability_of_a_join(
         if (i, j) == (first, second):
             assert told["probability"] == pytest.approx(probability)
     main(["explain", str(runs / "hall"), str(first), str(second)])
-    assert capsys.readouterr().out.startswith("in map 1, the steps are at one place; the prob")
+    assert capsys.readouterr().out.startswith("in map 1, the steps are at one place, place ")
 
 
 def test_check_asks_for_a_trace_if_none_is_beside_the_maps(

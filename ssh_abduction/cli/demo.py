@@ -41,7 +41,7 @@ def run_demo(options: argparse.Namespace) -> int:
         if (code := int(chosen.act(chosen))) not in (0, EXIT_UNPROVEN):
             return code
     page = (house / "page.html").absolute()
-    print(f"the map: {named(page)}")
+    print(f"the map: {named(page)}\nnext, try: ssh-abduction show {named(house)} --paths")
     if options.open:
         webbrowser.open(page.as_uri())
     return 0

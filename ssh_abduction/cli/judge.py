@@ -422,7 +422,7 @@ def run_explain(options: argparse.Namespace) -> int:
             given["known"] = listing.maps[: listing.minimal or None]
         question = PlaceQuestion(trace, *of_place, theory, **given)
     elif options.steps:
-        first, second = (step_named(trace, step) for step in options.steps)
+        first, second = _two_steps(options.steps, trace, listing)
         if listing is not None:
             pair = PairInMap.of(listing, first, second)
         given["max_maps"] = options.maps or None
@@ -452,6 +452,16 @@ def run_explain(options: argparse.Namespace) -> int:
         answer = question.answer()
         guard.finish(_exit_code(answer), lambda: written(answer))
     return _exit_code(answer)
+
+
+def _two_steps(words: Sequence[str], trace: Trace, listing: Listing | None) -> list[int]:
+    """Return the numbers of two steps. An error hints at a name of the map that is similar."""
+    try:
+        return [step_named(trace, word) for word in words]
+    except AbductionError as error:
+        names = [name.text for name in listing.maps[0].names] if listing else []
+        hint = next(filter(None, (meant(word, names) for word in words)), "")
+        raise AbductionError(f"{error}{hint}") from None
 
 
 def _with_steps(words: Sequence[str], listing: Listing) -> Sequence[str]:

@@ -272,12 +272,14 @@ class Parser(argparse.ArgumentParser):
         """Make a hint for a misspelt option such as "--widht": a similar option or setting."""
         shown = {f"--{name.replace('_', '-')}": f"--set {name}=VALUE" for name in self.settings}
         shown |= {name: name for name in self.names}
-        near = difflib.get_close_matches(flag.replace("_", "-"), shown, n=1)
+        flag = flag.replace("_", "-")
+        near = [name for name in shown if name.startswith(flag)]
+        near += difflib.get_close_matches(flag, {*shown} - {"--help"}, n=1)
         return f"; did you mean {shown[near[0]]}?" if near else ""
 
     def error(self, message: str) -> NoReturn:
-        """Print the usage and a message, and exit with code 2."""
-        super().error(printable(message))  # the message repeats what the user typed
+        """Print a message, which repeats what the user typed, and exit with code 2."""
+        self.exit(2, f"{self.prog}: error: {printable(message)} (options: {self.prog} --help)\n")
 
 
 def _read_form(form: str) -> tuple[list[str], dict[str, Any]]:

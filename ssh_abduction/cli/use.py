@@ -273,7 +273,7 @@ def _tell_way(options: argparse.Namespace, listing: Listing) -> int:
     if options.json:
         print(json_line({"from": start, "to": goal, "words": list(told)}))
     else:
-        print(printable("; ".join(told)))
+        print(printable(f"from {start} to {goal}: {'; '.join(told)}"))
     return 0
 
 

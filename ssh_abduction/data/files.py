@@ -187,7 +187,8 @@ def _mend(path: str | os.PathLike[str]) -> str:
     """Say what to do if a file cannot be read: perhaps its folder is not one that map wrote."""
     folder, name = Path(path).parent, Path(path).name
     if name in ("maps.json", "trace.jsonl", "run.json") and folder.is_dir():
-        return "name a folder that the command map wrote, or a file"
+        inner = [f"; did you mean {named(p.parent)}?" for p in sorted(folder.glob(f"*/{name}"))]
+        return f"name a folder that the command map wrote, or a file{''.join(inner[:1])}"
     return "check the path"
 
 

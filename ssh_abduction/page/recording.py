@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ssh_abduction.data.checks import needed
+from ssh_abduction.data.errors import AbductionError
+from ssh_abduction.data.files import save_file
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.scene import colour_of
@@ -43,7 +45,7 @@ def save_recording(
         ground: What the laser saw, as the page of the map has it.
 
     Raises:
-        AbductionError: The package rerun-sdk is missing.
+        AbductionError: The package rerun-sdk is missing, or the file cannot be written.
     """
     with needed("rerun", "rerun-sdk", "'.[rerun]' in your clone"):
         import rerun as rr
@@ -51,6 +53,7 @@ def save_recording(
     spots = np.array(seen["spots"])
     way = _raised(np.array(seen["way"]), 1)
     recording = rr.RecordingStream(name)
+    save_file(file, b"", "recording", AbductionError)  # rerun ends in a traceback if it cannot
     recording.save(file)
 
     def log(path: str | list[str], *marks: Any) -> None:

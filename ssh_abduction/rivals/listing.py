@@ -323,7 +323,7 @@ def trusted(weighed: Weighed | None) -> Weighed | None:
 class PairInMap:
     """What the first map of a list says about the places of two steps."""
 
-    is_one_place: bool  # whether the two steps are at one place
+    places: tuple[str, ...]  # where the two steps are, such as "place 4 (kitchen)"; one if equal
     # The probability that they are; None if it is unknown, as without costs in nats, or if the
     # search did not finish.
     probability: float | None
@@ -331,22 +331,24 @@ class PairInMap:
     @classmethod
     def of(cls, listing: Listing, first: int, second: int) -> PairInMap | None:
         """Compare the places of two steps; None without places."""
-        at = [listing.maps[0].place_of(step) for step in (first, second)]
+        ssh_map = listing.maps[0]
+        at = dict.fromkeys(ssh_map.place_of(step) for step in (first, second))
         if None in at:
             return None
         weighed = trusted(listing.weighed)
         share = None if weighed is None else weighed.probability(first, second, "place")
-        return cls(at[0] == at[1], share)
+        return cls(tuple(ssh_map.called("place", p) for p in at if p is not None), share)
 
     def __str__(self) -> str:
-        text = f"in map 1, the steps are at {'one place' if self.is_one_place else 'two places'}"
+        number = "two places" if self.places[1:] else "one place"
+        text = f"in map 1, the steps are at {number}, {' and '.join(self.places)}"
         if self.probability is not None:
             text += f"; the probability of one place is {probability_in_words(self.probability)}"
         return text
 
     def to_dict(self) -> dict[str, Any]:
         """Return the pair as plain data."""
-        return {"same_place": self.is_one_place, "probability": self.probability}
+        return {"same_place": not self.places[1:], "probability": self.probability}
 
 
 @dataclass(frozen=True, slots=True)
