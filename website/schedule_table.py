@@ -15,12 +15,14 @@ HEAD = (
     "# The schedule of a search\n\n"
     "A search runs *sources*. Each source makes maps, or proves a lower bound on the cost of all "
     "maps. The sources run in the order of these tables until a map costs no more than the bound, "
-    "or no work is left. `ssh_abduction/solver/schedule.py` has the reason for each share.\n\n"
+    "or no work is left. The tables are made from `ssh_abduction/solver/schedule.py`, which is the "
+    "only place for these numbers.\n\n"
     "* **Share** is the share of the work left when the source begins. *By the share* means that "
     "the source ends when this share of the whole limit is used up.\n"
     "* A unit of work is about a second of a quiet core. Without a work limit, seconds count "
     "instead.\n"
 )
+COLUMNS = "| source | for which problems | share | why |"
 
 
 def share_of(turn: SourceTurn) -> str:
@@ -37,10 +39,12 @@ def page() -> str:
     for title, turns in TABLE.items():
         lines += [
             f"## {title}\n",
-            "| source | for which problems | share |",
-            "|---|---|---|",
+            "| source | for which problems | share | why |",
+            "|---|---|---|---|",
         ]
-        lines += [f"| {turn.name} | {turn.problems} | {share_of(turn)} |" for turn in turns]
+        lines += [
+            f"| {turn.name} | {turn.problems} | {share_of(turn)} | {turn.why} |" for turn in turns
+        ]
         lines.append("")
     return "\n".join(lines)
 

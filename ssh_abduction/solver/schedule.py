@@ -1,12 +1,11 @@
-"""The schedule of a search: its sources in order, each with its share of the work.
+"""The schedule of a search: its sources in order, each with its share of the work and the reason.
 
 A source puts maps or proven lower bounds on the board. `search.py` runs the sources in the order of
 this table, until a map costs no more than the bound, or no work is left. No other module says how
 much of the work a source gets. A unit of work is about a second of a quiet core; without a work
 limit, seconds count instead.
 
-The comment before a turn says why the source gets this share. The page docs/reference/schedule.md
-shows the table (`python website/schedule_table.py` writes it).
+The page docs/reference/schedule.md shows this table (`python website/schedule_table.py` writes it).
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ class SourceTurn:
     Attributes:
         name: The name of the source.
         problems: For which problems the source runs.
+        why: Why it gets this share.
         share: The source ends when this share of the work left at its begin is done.
         until: The source ends when this share of the whole limit is used up.
         most: The source ends after this many units of work in any case.
@@ -33,6 +33,7 @@ class SourceTurn:
 
     name: str
     problems: str
+    why: str
     share: float = 1.0
     until: float = 1.0
     most: float = math.inf
@@ -50,72 +51,147 @@ class SourceTurn:
 
 
 COUNTED = (
-    # It takes milliseconds, and clingo then only has to find a better map.
-    SourceTurn("greedy merging", "causal theories, more than 24 steps"),
-    # It finds the fewest faults by solving traces without them.
-    SourceTurn("mending", "theories with faults, more than 24 steps"),
-    # A trace that is not solved by then is seldom solved step by step.
-    SourceTurn("prefixes", "theories without frames, more than 24 steps", share=0.4, most=1.0),
-    # They are only candidates. Without any map they may take twice as long.
-    SourceTurn("maps with frames", "the same, with the speed-up `framing`", share=0.4, most=30.0),
-    # It proves the minimum and lists all maps: prefixes, dstates first, or names.
-    SourceTurn("exact search", "all"),
+    SourceTurn(
+        "greedy merging",
+        "causal theories, more than 24 steps",
+        "It takes milliseconds, and clingo then only has to find a better map.",
+    ),
+    SourceTurn(
+        "mending",
+        "theories with faults, more than 24 steps",
+        "It finds the fewest faults by solving traces without them.",
+    ),
+    SourceTurn(
+        "prefixes",
+        "theories without frames, more than 24 steps",
+        "A trace that is not solved by then is seldom solved step by step.",
+        share=0.4,
+        most=1.0,
+    ),
+    SourceTurn(
+        "maps with frames",
+        "the same, with the speed-up `framing`",
+        "They are only candidates. Without any map they may take twice as long.",
+        share=0.4,
+        most=30.0,
+    ),
+    SourceTurn(
+        "exact search",
+        "all",
+        "It proves the minimum and lists all maps: prefixes, dstates first, or names.",
+    ),
 )
 WEIGHED = (
-    # There must be a map before any long source begins.
-    SourceTurn("sketch", "all", share=0.4),
-    # After a long way, poses that fit all closures are better than a beam.
+    SourceTurn(
+        "sketch",
+        "all",
+        "There must be a map before any long source begins.",
+        share=0.4,
+    ),
     SourceTurn(
         "smoothing",
         "displacements, no lifts, no faults within a drive but misread views without stars",
+        "After a long way, poses that fit all closures are better than a beam.",
         until=0.3,
     ),
-    # If closures are false, beams have to know which ones.
     SourceTurn(
         "false closures",
         "traces with closures; logs of robots only if their map does not fit",
+        "If closures are false, beams have to know which ones.",
         share=0.3,
     ),
-    # It finds most true maps.
-    SourceTurn("beam of 1", "up to 2,000 steps", until=0.7),
-    # Joined maps of single drives show whether a narrow beam over all drives missed one.
-    SourceTurn("joint drives", "several drives; in logs of robots before the beam of 1", until=0.5),
-    # A map that a broad beam ends with is nearly always the best one.
-    SourceTurn("beam of 4", "up to 2,000 steps", until=0.6),
-    # With several drives or floors, a beam of 4 keeps as many hypotheses.
-    SourceTurn("beam of 16", "one drive on one floor", until=0.7),
-    # Smoothing has mostly found the best map there, and bounds need the work.
-    SourceTurn("beams of logs", "logs of robots: all beams", until=0.5),
-    # They often drop the best map. The search for wrong displacements finds it.
-    SourceTurn("beams with wrong displacements", "theories with `jumped`: all beams", until=0.4),
-    # It says how much cheaper a map that breaks axioms would be.
-    SourceTurn("beam without axioms", "a broad beam ended", until=0.8),
-    # A map that a beam has missed mostly differs in one visit, and what follows from it.
+    SourceTurn("beam of 1", "up to 2,000 steps", "It finds most true maps.", until=0.7),
     SourceTurn(
-        "local changes", "displacements, no faults but misread views without stars", share=0.3
+        "joint drives",
+        "several drives; in logs of robots before the beam of 1",
+        "Joined maps of single drives show whether a narrow beam over all drives missed one.",
+        until=0.5,
     ),
-    # It only finds the least number of dstates, if that is easy.
     SourceTurn(
-        "fewest dstates, map known", "a map is known, and no faults are allowed", share=0.05
+        "beam of 4",
+        "up to 2,000 steps",
+        "A map that a broad beam ends with is nearly always the best one.",
+        until=0.6,
     ),
-    # A map with the fewest dstates is the only one then.
-    SourceTurn("fewest dstates", "no map is known, or faults are allowed", share=0.4),
-    # They raise the bound most. If it is near, all cheap maps are listed: this is a proof.
     SourceTurn(
-        "forced joins", "no faults but misread views, up to 2,500 steps", share=0.9, most=10.0
+        "beam of 16",
+        "one drive on one floor",
+        "With several drives or floors, a beam of 4 keeps as many hypotheses.",
+        until=0.7,
     ),
-    # A local search over which displacements are wrong. No source proves such maps.
-    SourceTurn("wrong displacements", "theories with `jumped`, more than 60 steps"),
-    # Clingo lists maps by counts, and each misfit excludes many. This is the proof.
-    SourceTurn("Benders cuts", "all but long traces with faults"),
+    SourceTurn(
+        "beams of logs",
+        "logs of robots: all beams",
+        "Smoothing has mostly found the best map there, and bounds need the work.",
+        until=0.5,
+    ),
+    SourceTurn(
+        "beams with wrong displacements",
+        "theories with `jumped`: all beams",
+        "They often drop the best map. The search for wrong displacements finds it.",
+        until=0.4,
+    ),
+    SourceTurn(
+        "beam without axioms",
+        "a broad beam ended",
+        "It says how much cheaper a map that breaks axioms would be.",
+        until=0.8,
+    ),
+    SourceTurn(
+        "local changes",
+        "displacements, no faults but misread views without stars",
+        "A map that a beam has missed mostly differs in one visit, and what follows from it.",
+        share=0.3,
+    ),
+    SourceTurn(
+        "fewest dstates, map known",
+        "a map is known, and no faults are allowed",
+        "It only finds the least number of dstates, if that is easy.",
+        share=0.05,
+    ),
+    SourceTurn(
+        "fewest dstates",
+        "no map is known, or faults are allowed",
+        "A map with the fewest dstates is the only one then.",
+        share=0.4,
+    ),
+    SourceTurn(
+        "forced joins",
+        "no faults but misread views, up to 2,500 steps",
+        "They raise the bound most. If it is near, all cheap maps are listed: this is a proof.",
+        share=0.9,
+        most=10.0,
+    ),
+    SourceTurn(
+        "wrong displacements",
+        "theories with `jumped`, more than 60 steps",
+        "A local search over which displacements are wrong. No source proves such maps.",
+    ),
+    SourceTurn(
+        "Benders cuts",
+        "all but long traces with faults",
+        "Clingo lists maps by counts, and each misfit excludes many. This is the proof.",
+    ),
 )
 LATE = (
-    # The confidence counts rivals that no source found.
-    SourceTurn("estimated rivals", "maps are weighed by cost", most=0.5),
-    # What all minimal maps share needs a search of its own.
-    SourceTurn("backbone", "not all minimal maps are listed", share=0.2),
-    # The last part of the limit is for a sketch, so that there always is a map.
-    SourceTurn("reserve", "no map is known", share=RESERVE),
+    SourceTurn(
+        "estimated rivals",
+        "maps are weighed by cost",
+        "The confidence counts rivals that no source found.",
+        most=0.5,
+    ),
+    SourceTurn(
+        "backbone",
+        "not all minimal maps are listed",
+        "What all minimal maps share needs a search of its own.",
+        share=0.2,
+    ),
+    SourceTurn(
+        "reserve",
+        "no map is known",
+        "The last part of the limit is for a sketch, so that there always is a map.",
+        share=RESERVE,
+    ),
 )
 TABLE = {"If maps are counted": COUNTED, "If maps are weighed by cost": WEIGHED, "In the end": LATE}
 TURNS = {turn.name: turn for part in TABLE.values() for turn in part}
