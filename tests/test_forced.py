@@ -95,7 +95,7 @@ def test_forced_joins_are_in_all_cheap_maps_and_the_bound_holds(kind: str, seed:
     for ssh_map in {solution.maps[0], solution.maps[-1]}:
         forcing = forcing_of(trace, theory, ssh_map)
         assert max(forcing.bounds(2 * weighed.nats)) <= weighed.nats + EQUAL
-        forcing.force(most)
+        forcing.force(most, 2)
         assert forcing.low <= weighed.nats + EQUAL
         for rival in weighed.rivals:
             for join in forcing.returns if rival.nats < most and not rival.estimated else ():
@@ -120,7 +120,7 @@ def test_forced_joins_prove_a_maze_of_sixty_steps() -> None:
     known = truth.random_walk(4, 60, 3001, truth.Noise(Odometry(**FINE)))
     trace, theory, solution, weighed = solved(known.trace, Theory.topological())
     forcing = forcing_of(trace, theory, solution.maps[0])
-    forcing.force(weighed.nats + 1)
+    forcing.force(weighed.nats + 1, 1)
     assert [weighed.rivals[0].dstates, weighed.rivals[0].places] in map(
         list, forcing.courses(weighed.nats + 1) or ()
     )
@@ -210,7 +210,7 @@ def test_forced_bound_holds_if_views_may_be_misread(data: st.DataObject) -> None
     maps = solve(trace, theory, time_limit=100).maps
     for ssh_map in maps[:1]:
         forcing = forcing_of(trace, theory, ssh_map)
-        forcing.force(nats + 1e-3)
+        forcing.force(nats + 1e-3, 1)
         assert forcing.low <= nats + EQUAL
         assert max([0.0, *forcing.bounds(2 * nats)]) <= nats + EQUAL
 

@@ -160,7 +160,7 @@ WEIGHED = (
         "no faults but misread views, up to 2,500 steps",
         "They raise the bound most. If it is near, all cheap maps are listed: this is a proof.",
         share=0.9,
-        most=10.0,
+        most=30.0,
     ),
     SourceTurn(
         "wrong displacements",

@@ -44,7 +44,7 @@ import numpy as np
 
 from ssh_abduction.data.groups import firsts, gathered, indices_of, numbered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.runtime.clock import LONG_TURN, look_at_clock
+from ssh_abduction.runtime.clock import LONG_TURN, SHORT_TURN, look_at_clock
 from ssh_abduction.solver.costs.estimating import Course
 from ssh_abduction.solver.costs.joined import Gains, Ints, Joined, Visits
 from ssh_abduction.solver.costs.misfit import Misfit
@@ -66,7 +66,7 @@ PAIRS = 5000
 NEAR = 0.9
 # To list all cheap maps, make at most LISTED steps.
 LISTED = 100
-# Assume the lack of at most BRANCHES joins, one after the other, until F gets one of them.
+# After the lack of BRANCHES joins, one after the other, gave F none of them, assume no more lacks.
 BRANCHES = 3
 
 
@@ -124,9 +124,12 @@ class Forcing:
                 else:
                     high = middle
 
-    def force(self, most: float) -> None:
-        """Find joins that every map of a cost below `most` has, until no more are found."""
-        self._forced(self.visits, self.joins, most, 1, keep=True)
+    def force(self, most: float, depth: int) -> None:
+        """Find joins that every map of a cost below `most` has, until no more are found.
+
+        Up to `depth` joins at a time are assumed to be lacking.
+        """
+        self._forced(self.visits, self.joins, most, depth, keep=True)
 
     def courses(self, most: float) -> list[Course] | None:
         """List the dstates and places of all maps of a cost below `most`, and perhaps some more.
@@ -228,25 +231,35 @@ class Forcing:
         return Gains(nats - float(products[0, 0]), *gains)
 
     def _forced(
-        self, visits: Visits, joins: Ints, most: float, branches: int, *, keep: bool = False
+        self, visits: Visits, joins: Ints, most: float, depth: int, *, keep: bool = False
     ) -> bool:
         """Add joins that every map of a cost below `most` has. Return whether there is no such map.
 
-        `joins` has the joins found so far. Up to `branches` joins at a time are assumed to be
-        lacking. If `keep`, keep what is found.
+        `joins` has the joins found so far. Up to `depth` joins at a time are assumed to be lacking.
+        If `keep`, keep what is found.
         """
+        wanted = 1  # look for twice as many joins each time before what they imply
         while True:
             visits, joins, low, worth = self._grown(visits, joins, most, False)
             if keep:
                 self.visits, self.joins, self.low = visits, joins, low
             if low >= most:
                 return True
-            for i, j in worth[: BRANCHES if branches else 0]:
-                if self._forced(visits.lacking(i, j), joins, most, branches - 1):
-                    joins = visits.joined(joins, [(i, j)])
+            for less in range(depth):
+                found, failed = 0, 0
+                for i, j in worth:
+                    if found == wanted or failed == BRANCHES:
+                        break
+                    if joins[i] != joins[j]:
+                        if self._forced(visits.lacking(i, j), joins, most, less):
+                            joins, found, failed = visits.joined(joins, [(i, j)]), found + 1, 0
+                        else:
+                            failed += 1
+                if found:
                     break
             else:
                 return False
+            wanted *= 2
 
     def _grown(
         self, visits: Visits, joins: Ints, most: float, is_last: bool
@@ -275,7 +288,7 @@ class Forcing:
             )
             worth = dict[tuple[int, int], float]()
             for (a, b), pair in left.items():
-                look_at_clock()
+                look_at_clock(2 * SHORT_TURN)
                 worth[pair] = classes.low_lacking(ways, a, b)
             forced = [pair for pair, nats in worth.items() if nats >= most]
             joins = visits.joined(joins, forced)
@@ -301,7 +314,7 @@ class Forcing:
                 continue
             for other, i in first.items():
                 if i < t and at[i] == at[t] and classes.may_meet(other, p):
-                    look_at_clock()
+                    look_at_clock(4 * SHORT_TURN)
                     if classes.low_apart(ways, other, p) >= most:
                         found.append((i, t))
                         break

@@ -192,6 +192,7 @@ class _Cliques:
             some[clique(apart[np.ix_(some, some)], [0] * len(some))] for some in self._members
         ]
         self._may_join = np.tril(~apart, -1).sum(axis=1)
+        self._lost: dict[int, tuple[Array, dict[int, float]]] = {}
 
     @property
     def open(self) -> Flags:
@@ -211,16 +212,23 @@ class _Cliques:
         `gains` has what each node gains at most if it is joined with earlier ones. Nodes of a
         clique are not joined, so the nodes that gain least are taken to be these.
         """
+        # The gains are kept, so no other gains get their id.
+        _, whole = self._lost.setdefault(id(gains), (gains, {}))
         may_join = self._may_join.copy()
         for u, v in {(min(pair), max(pair)) for pair in pairs}:
             if not self.apart[u, v]:
                 may_join[v] -= 1
-        gains = np.where(may_join > 0, gains, 0.0)
-        return sum(
-            float(np.sort(gains[some])[len(kept) :].sum())
-            for some, kept in zip(self._members, self._larger(pairs), strict=True)
-            if len(some) > 1
-        )
+        cliques, changed = self._larger(pairs), {int(self._part[v]) for _, v in pairs}
+        lost = 0.0
+        for part, (some, kept) in enumerate(zip(self._members, cliques, strict=True)):
+            if part in whole and part not in changed:
+                lost += whole[part]
+                continue
+            left = np.sort(np.where(may_join[some] > 0, gains[some], 0.0))[len(kept) :]
+            lost += (of_part := float(left.sum()))
+            if part not in changed:
+                whole[part] = of_part
+        return lost
 
     def _larger(self, pairs: Sequence[tuple[int, int]]) -> list[Ints]:
         """Return a clique of each part if some more pairs are apart, too."""

@@ -210,13 +210,15 @@ class Weighing:
         task, best = self._task, self.candidates[0]
         forcing = Forcing(task.problem, task.log, self._misfit, best.map)
         try:
-            forcing.force(self._most)
-            if self._lists_all(forcing):
-                self.bound, self.proven = self._nats, True
-                self._parts.known.status = Status.OPTIMAL
-            elif forcing.low < best.nats - EQUAL:
-                for bound in forcing.bounds(best.nats, self.bound):
-                    self._raise_bound(bound)
+            for depth in (1, 2):
+                forcing.force(self._most, depth)
+                if self._lists_all(forcing):
+                    self.bound, self.proven = self._nats, True
+                    self._parts.known.status = Status.OPTIMAL
+                    return
+                if depth == 1 and forcing.low < best.nats - EQUAL:
+                    for bound in forcing.bounds(best.nats, self.bound):
+                        self._raise_bound(bound)
         finally:
             self._raise_bound(forcing.low)
             returns = forcing.returns

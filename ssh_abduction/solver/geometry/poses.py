@@ -553,7 +553,7 @@ def conditional(poses: Poses, entries: Sequence[int]) -> tuple[Array, Array]:
     of = np.array(entries, dtype=int)
     of = np.searchsorted(free, of + (of >= places) * (2 * poses._positions - places))
     jacobian = _dense(poses._jacobian(unknown, of_world=True))[:, free]
-    look_at_clock(poses._size**2)  # microunits: most of the time goes to filling matrices
+    look_at_clock(poses._size**2 // 4)  # microunits: most of the time goes to filling matrices
     # The columns of this root are a basis of the unknowns, in which they have unit covariance.
     root = np.linalg.inv(np.linalg.cholesky(jacobian.T @ jacobian)).T
     lower = np.linalg.cholesky(root[of] @ root[of].T)
