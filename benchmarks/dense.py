@@ -94,13 +94,19 @@ def walls_seen(segments: Array, pose: Array, reach: float, bearings: Array = BEA
     return np.asarray(found.min(axis=2, initial=np.inf)[0])
 
 
-def circles(people: Array, pose: Array, bearings: Array = BEARINGS) -> Array:
+def circles(
+    people: Array,
+    pose: Array,
+    bearings: Array = BEARINGS,
+    radii: Array | float = RADIUS,
+    nearest: float = NEAR,
+) -> Array:
     """The distances in metres to people along beams. They step aside for the robot."""
     off = people - pose[:2]
-    off *= np.maximum(1.0, NEAR / np.maximum(np.hypot(*off.T), 1e-9))[:, None]
+    off *= np.maximum(1.0, nearest / np.maximum(np.hypot(*off.T), 1e-9))[:, None]
     beams = np.stack([np.cos(bearings + pose[2]), np.sin(bearings + pose[2])])
     along = off @ beams
-    square = RADIUS**2 - (off**2).sum(axis=1)[:, None] + along**2
+    square = (np.square(radii) - (off**2).sum(axis=1))[:, None] + along**2
     hit = (square > 0) & (along > 0)
     ranges = np.where(hit, along - np.sqrt(np.maximum(square, 0)), np.inf)
     return np.asarray(ranges.min(axis=0, initial=np.inf))

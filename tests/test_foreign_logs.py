@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 from coarse import hall
 from scipy.spatial.transform import Rotation
-from test_bags import notes, written
+from test_bags import notes, two_lasers, written
 from test_readers import LASER, SMALL, Messages, bag, drive
 
 from perception.errors import LogError
 from perception.places.following import follow
+from perception.places.log_checks import refuse_mixed
 from perception.places.odometers import lag_of, with_lag
+from perception.readers.bag_frames import RecordedTrack, flat_pose
 from perception.readers.bag_geometry import Mount, believed
 from perception.readers.echoes import LaserOptions, interpret_log
 from perception.readers.lines import zstd_module
@@ -183,8 +185,15 @@ def test_beams_on_the_robot_itself_are_unknown() -> None:
     assert np.isnan(meant[0].ranges[:11]).all()
 
 
-def test_repeated_scans_are_left_out(tmp_path: Path) -> None:
-    log = read_log(bag(tmp_path / "bag", lambda m: [one for one in ahead(m) for _ in range(2)]))
+@pytest.mark.parametrize("late", [0.0, 0.002])
+def test_repeated_scans_are_left_out(tmp_path: Path, late: float) -> None:
+    def twice(m: Messages) -> Listed:
+        again = [(topic, t + late, one) for topic, t, one in ahead(m) if topic == "/scan"]
+        for _, t, scan in again:
+            scan.header.stamp = m.scan(t).header.stamp
+        return [*ahead(m), *again]
+
+    log = read_log(bag(tmp_path / "bag", twice))
     assert len(log) == 60
     assert "60 of 120 scans repeat an earlier one" in notes(log)
 
@@ -229,6 +238,39 @@ def test_odometry_with_swapped_frames_or_axes_is_read(tmp_path: Path, kind: str)
     assert {"inverted": "inverted", "exchanged": "exchanged", "about x": "turn about x"}[
         kind
     ] in notes(log)
+
+
+def test_turns_about_y_by_more_than_a_quarter_are_read() -> None:
+    track, said = RecordedTrack(), list[str]()
+    for i in range(60):
+        half = 0.05 * i
+        turn = SimpleNamespace(x=0.0, y=math.sin(half), z=0.0, w=math.cos(half))
+        place = SimpleNamespace(x=0.1 * i, y=0.0, z=0.0)
+        track.add(i, i, flat_pose(place, turn), turn)
+    assert track.upright("/odom", said).table()[:, 4] == pytest.approx(0.1 * np.arange(60))
+    assert "turn about y" in said[0]
+
+
+def test_laser_without_a_transform_is_left_out_if_others_have_one(tmp_path: Path) -> None:
+    path = bag(tmp_path / "bag", lambda m: [one for one in two_lasers(m, "/scan") if one[1] != 0.5])
+    assert "(rear, front): the laser is taken to sit" in notes(read_log(path))
+    path = bag(tmp_path / "one", lambda m: two_lasers(m, "/scan")[1:])
+    log = read_log(path)
+    assert [scan.laser.mount[0] for scan in log.scans] == [-0.2] * 4
+    assert "to front: 4 scans from there are left out" in notes(log)
+
+
+@pytest.mark.parametrize("beams", [180, 121])
+def test_scans_of_two_lasers_with_one_mount_are_refused(beams: int) -> None:
+    scans = hall(every=0.5)[:60]
+    refuse_mixed(RobotLog(scans))
+    back = [
+        replace(scan, ranges=scan.ranges[:beams] / 2, laser=replace(scan.laser, beams=beams))
+        for scan in scans
+    ]
+    mixed = [one for pair in zip(scans, back, strict=True) for one in pair]
+    with pytest.raises(LogError, match="expected the scans of one laser, got those of several"):
+        refuse_mixed(RobotLog(tuple(mixed)))
 
 
 def test_gap_in_the_odometry_is_named(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from perception.errors import LogError
 from perception.places import odometers
 from perception.places.following import FAILING, contradicting_scans, follow, share_failing
+from perception.places.odometers import change_between
 from perception.places.track import Track, odometer_covariance, wrapped
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.errors import named
@@ -41,6 +42,9 @@ AHEAD, SIDEWAYS, LEAST_WAY = 0.9, 0.5, 10.0
 # their distances differ by at most this factor. In a drive, they grow with the number of steps. If
 # two sources of odometry alternate, the lower quartile is that of one source.
 LAGS, ALIKE = (2, 4, 8), 1.3
+# If several lasers scan in turn, more than the share MIXED of MIXED_TRIED scans resemble the second
+# to fourth scan before them much more than the last one.
+MIXED_TRIED, MIXED, IN_TURN = 100, 0.5, (1, 2, 3, 4)
 # In good logs, matches contradict the odometer in at most 2 % of the steps. A contradiction is a
 # chi-square above CONTRADICTS (three degrees of freedom).
 OVERRIDING, CONTRADICTS = 0.08, 25.0
@@ -103,6 +107,23 @@ def refuse_shuffled(log: RobotLog) -> None:
     )
 
 
+def refuse_mixed(log: RobotLog) -> None:
+    """Raise a LogError if scans of several lasers come in turn, as if they were of one."""
+    if len(log) <= max(IN_TURN):
+        return
+    some = np.unique(np.linspace(max(IN_TURN), len(log) - 1, MIXED_TRIED).astype(int)).tolist()
+    mixed = 0
+    for k in some:
+        last, *earlier = (change_between(log.scans[k - n], log.scans[k]) for n in IN_TURN)
+        mixed += last > odometers.MOVED and min(earlier) < last / 2
+    if mixed > MIXED * len(some):
+        raise LogError(
+            f"{named(log.source)}: expected the scans of one laser, got those of several in turn, "
+            "with one mount: most scans are unlike the one before, and like an earlier one; keep "
+            "the scans of one laser, or give each laser a frame of its own"
+        )
+
+
 def checked(log: RobotLog) -> tuple[RobotLog, list[str], list[str]]:
     """Check whether a log is one drive in order, before its scans are matched. Raises LogError.
 
@@ -111,6 +132,7 @@ def checked(log: RobotLog) -> tuple[RobotLog, list[str], list[str]]:
     """
     refuse_lengths(log)
     refuse_shuffled(log)
+    refuse_mixed(log)
     log, alternating = odometers.keep_one_source(log)
     units, converted = units_of(log)
     log = units.convert(log)

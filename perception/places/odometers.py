@@ -401,7 +401,7 @@ def _moved_while_still(
         carried |= {
             k
             for k in range(begin + 1, end + 1)
-            if paused[k - 1] and _change(log.scans[k - 1], log.scans[k]) > MOVED_UNSEEN
+            if paused[k - 1] and change_between(log.scans[k - 1], log.scans[k]) > MOVED_UNSEEN
         }
     return carried, found
 
@@ -424,23 +424,28 @@ def moves_unseen(log: RobotLog) -> bool:
 
 def shows_motion(first: Scan, last: Scan) -> bool:
     """Whether enough beams changed between two scans to show that the robot moved."""
-    return _change(first, last) > MOVED
+    return change_between(first, last) > MOVED
 
 
-def _change(first: Scan, last: Scan) -> float:
-    """The share of the beams that changed between two scans; 0 for scans of different lasers.
+def change_between(first: Scan, last: Scan) -> float:
+    """The share of the beams that changed between two scans; 0 for lasers with different mounts.
 
     The share is of the beams that were measured in both scans and hit something in at least one.
     """
-    if first.laser != last.laser:
+    if first.laser.mount != last.laser.mount:
         return 0.0
     before, after = (
         np.minimum(np.nan_to_num(scan.ranges, nan=0.0, posinf=NO_RANGE), NO_RANGE)
         for scan in (first, last)
     )
+    if first.laser != last.laser:  # Compare the nearest beams.
+        at = (last.laser.bearings - first.laser.first) / first.laser.step
+        beams = np.rint(at).astype(int)
+        inside = (beams >= 0) & (beams < len(before))
+        before, after = before[beams[inside]], after[inside]
     valid = ((before < NO_RANGE) | (after < NO_RANGE)) & (before > 0) & (after > 0)
-    changed = np.abs(before - after) > CHANGED + CHANGED_SHARE * np.minimum(before, after)
-    return float(changed[valid].mean()) if valid.any() else 0.0
+    unlike = np.abs(before - after) > CHANGED + CHANGED_SHARE * np.minimum(before, after)
+    return float(unlike[valid].mean()) if valid.any() else 0.0
 
 
 def _far(log: RobotLog, steps: int) -> Array:
@@ -478,7 +483,7 @@ LEAST_PARTED = 3
 # (GAP) or radians (TURN_OF_PAIR).
 GAP, TURN_OF_PAIR = (0.8, 2.4), (0.35, 1.2)
 # Number of pairs to compare, and about how many points of the second scan of each pair.
-PAIRS, POINTS = 60, 90
+PAIRS, POINTS = 40, 90
 # Points coincide within MEET metres; points beyond NEAR metres are ignored.
 MEET, NEAR = 0.3, 8.0
 # Directions of the laser, in degrees, and fields of view to try. In all good logs, points coincide
@@ -643,13 +648,14 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
         points = np.stack([seen.real, seen.imag], axis=-1)
         nearest, _ = tree.query(points, distance_upper_bound=MEET)
         apart.append(np.minimum(nearest, MEET).mean(axis=0))
-    return np.mean(apart, axis=0) if len(apart) >= PAIRS / 4 else None
+    return np.mean(apart, axis=0) if len(apart) >= PAIRS / 2 else None
 
 
 def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
     """Choose at most PAIRS pairs of scans so near to each other that they see the same walls.
 
-    The odometry between near scans is accurate.
+    The odometry between near scans is accurate. Each pair comes in both orders: a laser that looks
+    ahead sees again what it saw, and one that looks back sees later what it will not see again.
     """
     kept = moving(log.scans)
     pairs = []
@@ -661,7 +667,7 @@ def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
                     pairs.append((scan, later))
                 break
     some = np.unique(np.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).astype(int))
-    return [pairs[i] for i in some]
+    return [pair for i in some for pair in (pairs[i], pairs[i][::-1])]
 
 
 def _points(scan: Scan, stretch: float) -> NDArray[np.complex128]:

@@ -44,7 +44,9 @@ class RecordedTrack:
         """If the poses turn about x or y and not about z, read headings about that, with a note."""
         table, tilts = self.table().copy(), np.unwrap(np.array(self.tilts).reshape(-1, 2), axis=0)
         axis = int(np.ptp(tilts, axis=0).argmax())
-        if np.ptp(np.unwrap(table[:, 4])) > STRAIGHT or np.ptp(tilts[:, axis]) < TURNS:
+        # A turn about y by more than a quarter looks like one by half a circle about z.
+        turned = np.abs(np.sin(table[:, 4] - table[0, 4])).max()
+        if turned > STRAIGHT or np.ptp(tilts[:, axis]) < TURNS:
             return self
         notes.append(
             f"The quaternions of {called} turn about {'xy'[axis]}, and not about z: headings are "
@@ -198,14 +200,10 @@ def ancestors(frames: Frames, frame: str) -> list[str]:
     return chain
 
 
-def mount_of(
-    frames: Frames, odom: str, base: str, frame: str, notes: list[str], assumed: dict[str, str]
-) -> Mount:
-    """Return where the laser is on the robot, with its tilt.
+def mount_of(frames: Frames, odom: str, base: str, frame: str, notes: list[str]) -> Mount | None:
+    """Return where the laser is on the robot, with its tilt; None if no transform leads there.
 
-    `notes` receives notes on transforms that contradict each other. `assumed` receives, by the
-    key "mount", a note if no transform leads to the laser. Then the laser is taken to be in the
-    middle of the robot.
+    `notes` receives notes on transforms that contradict each other.
     """
     if base == frame:
         return Mount()
@@ -222,12 +220,7 @@ def mount_of(
     top = parents.index(odom) - 1 if odom in parents else None
     top = parents.index(base) if base in parents else top
     if top is None:
-        assumed["mount"] = (f"{assumed['mount']} " if "mount" in assumed else "") + (
-            f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser "
-            f"({frame}): the laser is taken to sit in the robot's middle and to look ahead. "
-            "If it does not, say where it sits: --set mount=X,Y,DEGREES."
-        )
-        return Mount()
+        return None
     translation, rotation = np.zeros(3), np.eye(3)
     for child in reversed(chain[: top + 1]):
         edge = parent_of(frames, child)
@@ -252,6 +245,15 @@ def mount_of(
     x, y, angle = (round(float(v), 6) for v in (translation[0], translation[1], heading))
     rows = tuple(tuple(map(float, row)) for row in rotation)
     return Mount((x, y, angle), bool(rotation[2, 2] < 0), rows, float(translation[2]))
+
+
+def describe_unmounted(base: str, frame: str) -> str:
+    """Say in a note that the place of a laser on the robot is assumed."""
+    return (
+        f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser "
+        f"({frame}): the laser is taken to sit in the robot's middle and to look ahead. If it does "
+        "not, say where it sits: --set mount=X,Y,DEGREES."
+    )
 
 
 def flat_pose(position: Any, orientation: Any) -> Pose:

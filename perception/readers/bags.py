@@ -36,6 +36,7 @@ from perception.readers.bag_frames import (
     Frames,
     RecordedTrack,
     ancestors,
+    describe_unmounted,
     flat_pose,
     frame_name,
     mount_of,
@@ -57,7 +58,7 @@ from perception.readers.scans import (
 )
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.odometry import Pose, moved
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import counted, first_few
 
 # Seconds beyond the ends of the odometry at which a scan still gets a pose.
 BESIDE = 1.0
@@ -246,8 +247,9 @@ ODOMETRY = ("nav_msgs/msg/Odometry",)
 # Each EACH-th scan of a frame is kept to judge the tilt of its laser, at most SAMPLES.
 EACH, SAMPLES = 10, 100
 # Scans that repeat earlier ones are left out if they are this many, and this share of all. Scans
-# without times in front of a still robot come more often than LOOPS times.
-LEAST_REPEATED, REPEATED, LOOPS = 20, 0.2, 5
+# without times in front of a still robot come more often than LOOPS times. Times within AT_ONCE
+# seconds are one.
+LEAST_REPEATED, REPEATED, LOOPS, AT_ONCE = 20, 0.2, 5, 0.01
 # The odometry has a gap if the robot moved by more than UNSEEN metres or radians in a pause of more
 # than GAP seconds, and LONGER times the usual interval.
 GAP, LONGER, UNSEEN = 1.0, 10.0, 0.1
@@ -280,18 +282,25 @@ def read(
         called = f"the transforms from {odom} to {base}"
     odometer = _of_one_source(odometer.upright(called, notes), called, notes)
 
-    # 2. Where each frame of scans is on the robot.
+    # 2. Where each frame of scans is on the robot. Frames without a transform are left out, if
+    # others have one.
     assumed = {"fov": text} if (text := survey.doubt) else {}
-    mounts = {
-        frame: believed(
-            mount_of(frames, odom, base, frame, notes, assumed),
-            survey.some[frame],
-            frame,
-            bag.source,
-            told.mount is not None,
-            notes,
+    found = {frame: mount_of(frames, odom, base, frame, notes) for frame in seen}
+    unknown = [frame for frame, mount in found.items() if mount is None]
+    listed = first_few(unknown, 3)
+    if unknown and len(unknown) < len(seen) and told.mount is None:
+        lost = counted(sum(seen[frame] for frame in unknown), "scans")
+        notes.append(
+            f"No transform leads from the robot ({base}) to {listed}: {lost} from there are left "
+            "out. Record the transforms of all lasers."
         )
-        for frame in seen
+        found = {frame: found[frame] for frame in seen if frame not in unknown}
+    elif unknown:
+        assumed["mount"] = describe_unmounted(base, listed)
+    is_told = told.mount is not None
+    mounts = {
+        frame: believed(mount or Mount(), survey.some[frame], frame, bag.source, is_told, notes)
+        for frame, mount in found.items()
     }
 
     # 3. Corrected poses: from the transforms above the frame of the odometry.
@@ -304,7 +313,7 @@ def read(
     by_stamp, contradictions = clock_of(clocks)
     notes += contradictions
     sources = [f"Scans come from {' and '.join(scans)}, odometry from {called}."]
-    if len(seen) > 1:
+    if len(mounts) > 1:
         sources.append(
             "The scans are of several frames "
             f"({', '.join(f'{count} of {name}' for name, count in seen.most_common())}): each "
@@ -396,11 +405,18 @@ def _survey(bag: Bag, topics: Sequence[str], told: LaserOptions, notes: list[str
     found = _FirstPass({}, Counter(), {}, set(), None)
     doubts: Counter[str] = Counter()
     known: Counter[int] = Counter()
+    last: dict[str, tuple[float, int]] = {}  # of each frame
     for connection, number, recorded, message in bag.messages(set(topics)):
         if isinstance(message, Damage):
             continue
         frame, stamp = frame_name(message.header.frame_id), stamp_of(message.header)
-        content = hash((frame, stamp, ranges_of(message).tobytes()))
+        ranges = hash(ranges_of(message).tobytes())
+        # The second message of two may have a time of its own.
+        before, same = last.get(frame, (-math.inf, 0))
+        content = hash(
+            (frame, before if ranges == same and stamp - before < AT_ONCE else stamp, ranges)
+        )
+        last[frame] = stamp, ranges
         if content in known:
             found.repeated.add((connection.topic, number))
         known[content] += 1
@@ -569,8 +585,10 @@ def _scans(
     for connection, number, recorded, message in bag.messages(topics):
         if (connection.topic, number) in repeated:
             continue
+        is_damaged = isinstance(message, Damage)
+        if not is_damaged and frame_name(message.header.frame_id) not in where.mounts:
+            continue
         try:
-            is_damaged = isinstance(message, Damage)
             yield message if is_damaged else where.scan(message, recorded, number)
         except Damaged as damage:
             yield Damage(number, f"{connection.topic}: {damage}")

@@ -25,6 +25,7 @@ import numpy as np
 from perception.errors import LogError
 from perception.readers.bag_frames import (
     Frames,
+    describe_unmounted,
     flat_pose,
     frame_name,
     mount_of,
@@ -164,13 +165,13 @@ class LaserFrames:
             return Mount((x, y, math.radians(degrees)))
         if frame in self._mounts:
             return self._mounts[frame]
-        notes, assumed = list[str](), dict[str, str]()
-        mount = mount_of(self.known, self.odom, self.base, frame, notes, assumed)
-        if assumed:
+        notes = list[str]()
+        mount = mount_of(self.known, self.odom, self.base, frame, notes)
+        if mount is None:
             if may_wait:
                 return None
-            say(f"/tf_static: {assumed['mount']}")
-            return mount
+            say(f"/tf_static: {describe_unmounted(self.base, frame)}")
+            return Mount()
         try:
             mount = believed(mount, [message], frame, "/tf_static", False, notes)
         except LogError as error:
