@@ -245,9 +245,10 @@ def test_note_names_scans_that_turn_unlike_the_odometry(
     scans: tuple[Scan, ...], metres: float
 ) -> None:
     track, notes = track_and_notes(
-        stepwise(scans, lambda i, step: (step[0], step[1], step[2] + (2.0 if i == 70 else 0.0)))
+        stepwise(scans, lambda i, step: (step[0], step[1], step[2] + (1.2 if i == 70 else 0.0)))
     )
     assert "Scans turn differently from the odometry, once: at scan 70" in notes
+    assert "by 69 degrees" in notes
     assert track.way[-1] == pytest.approx(metres, abs=3)
 
 
