@@ -272,7 +272,7 @@ def test_arguments_after_an_option_get_a_hint(
 def test_setting_without_a_value_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["solve", "trace.jsonl", "--set", "level"])
-    assert capsys.readouterr().err.endswith(", got 'level'; write level=VALUE\n")
+    assert ", got 'level'; write level=VALUE (options: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -122,12 +122,12 @@ READING: Rows = {
     ),
     "--set nearest METRES": (
         "a range of at most this length shows the robot itself, and is unknown; 0 if none does "
-        "(default: beams that return one short range in nearly all scans)",
+        "(default: beams that return one short range in nearly all scans are unknown)",
         {"type": partial(_laser_value, "nearest")},
     ),
     "--set blind A:B": (
-        "the robot blocks the beams from A to B, in degrees to the left of where the laser looks, "
-        "counterclockwise; they are unknown",
+        "the robot blocks the beams from A to B, so they are unknown; in degrees to the left of "
+        "where the laser looks",
         {"type": partial(_laser_value, "blind")},
     ),
 }

@@ -388,9 +388,9 @@ def run_explain(options: argparse.Namespace) -> int:
 
     Explain why two steps of a trace are one dstate in every map, or different dstates in every map,
     and name the axioms that force it. If maps disagree, say in which maps they are one dstate, in
-    which two, and what either costs. Without steps, explain why the trace has no map, and which
-    single observation could be wrong. With a place such as p7, and perhaps a path such as path2,
-    say on which side of the path the place lies, and which turn shows it.
+    which ones they are two, and what each costs. Without steps, explain why the trace has no map,
+    and which single observation could be wrong. With a place such as p7, and perhaps a path such as
+    path2, say on which side of the path the place lies, and which turn shows it.
 
     Exit codes: 0 explained; 20 the trace has no map; 30 no explanation in time; 1, 2, 130 and 143
     as for the other commands.

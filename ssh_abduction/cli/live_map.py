@@ -73,8 +73,8 @@ def positive(text: str) -> float:
 def run_live(options: argparse.Namespace) -> int:
     """Map a building while the robot drives.
 
-    Take laser scans one at a time. Say when a place is new, moved, or joined with another one. The
-    map follows in another process.
+    Take laser scans one at a time. Say when a place is new, moved, or joined with another one.
+    Another process searches for the map.
     """
     from perception.errors import LogError
     from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper

@@ -282,8 +282,7 @@ class MapQuestion(jobs.FileQuestion):
         "--work-limit W": (
             "units of work for the search. A unit is about a second of a quiet core, and equal "
             "limits give equal maps on each machine (default: until the time limit or, without "
-            "one, a unit for 40 seconds of driving, and at least 8; up to 64 times as many if no "
-            "map is found by then)"
+            "one, a unit for 40 seconds of driving, and at least 8; more while no map is found)"
         ),
         "--time-limit S": "end the search after S seconds in any case",
         **shared.STRICT,

@@ -39,9 +39,9 @@ def run_repair(options: argparse.Namespace) -> int:
 
     A language model, a person or a program made a graph of places and of the moves between them.
     Find every smallest set of edges to drop, or to turn into another action, after which the axioms
-    hold: one action leads to one place, the opposite action leads back and only there, and going
-    north only never leads around. The edges that all smallest repairs blame are wrong, if any so
-    small set is.
+    hold: one action leads to one place, the opposite action leads back and only there, and a way
+    that only goes north never ends where it began. If the graph has no more wrong edges than a
+    smallest repair, then the edges that all smallest repairs blame are wrong.
 
     Exit codes: 0 done; 10 with --strict, if a limit ended the search.
     """

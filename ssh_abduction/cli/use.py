@@ -66,8 +66,8 @@ NOWHERE = "–"
     {
         "maps": shared.MAPS_SAID,
         "other": (
-            "trace of a robot in the mapped world that uses the same names of views and actions; "
-            "- for standard input; or a folder that the command 'map' wrote",
+            "trace of another drive there, with the same names of views and actions; - for "
+            "standard input; or a folder that the command 'map' wrote",
             {"type": trace_path},
         ),
         **shared.MAP,
@@ -312,8 +312,8 @@ def _names(words: list[str] | None, given: Collection[str]) -> list[str]:
         "maps": shared.MAPS_SAID,
         "--map I": "show only the map with this number, from 1, or this id (default: all)",
         "--paths": (
-            "show only the paths, corridors, doors and rooms, of the first map unless --map names "
-            "another. A map that has none gets them from its trace"
+            "show only the paths, corridors, doors and rooms of one map (the first, unless --map "
+            "names another). If the file lacks them, they are derived from the trace"
         ),
         "--trace TRACE": (
             "with --paths, the trace that was mapped (default: the trace that solve -o or map "

@@ -187,7 +187,7 @@ class Corrections:
     def of_names(cls, ssh_map: SSHMap, drives: Sequence[Drive]) -> Corrections:
         """Return the names of a map as corrections, each for the first step that it is about.
 
-        A second name of a place is for the second step there, as a step has one name.
+        A step can have only one name. So a second name of a place goes to the second step there.
 
         Args:
             ssh_map: The map whose places, paths and regions have names.

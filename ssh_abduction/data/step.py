@@ -367,7 +367,7 @@ class Step:
         return openings
 
     def to_json(self) -> dict[str, Any]:
-        """Return the step as a dict, as a line of a trace file has it."""
+        """Return the step as a dict with the fields of a line of a trace file."""
         known: dict[str, Any] = {
             "view": self.view,
             "image": list(self.image) if isinstance(self.image, tuple) else self.image,

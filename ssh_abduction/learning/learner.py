@@ -64,7 +64,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         clusterer: A ViewClusterer or a clusterer of scikit-learn, which groups images into views.
             It is cloned. The default is ViewClusterer(random_state=0). If the theory allows
             misread views, the default also has `isolated=10`: an image that is like no other one
-            gets no view, and to treat it as misread costs little.
+            gets no view, and treating it as misread costs little.
         choose: Index, from 0, of the minimal map to take. None takes the first map, but learns only
             from the labels on which all minimal maps agree.
         time_limit: Seconds for finding the map; None for no limit.

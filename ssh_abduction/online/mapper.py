@@ -156,7 +156,7 @@ class OnlineMapper:
 
     @property
     def theory(self) -> Theory:
-        """The theory for the steps so far, in which no field is "auto"."""
+        """The theory of the mapper. Each field "auto" has its value for the steps so far."""
         return self._problem.theory
 
     @property

@@ -185,8 +185,8 @@ class Experiment:
     def actions(self) -> tuple[str, ...]:
         """The actions to do next, up to the first difference in predictions.
 
-        If no known links distinguish the rivals, these are the way to the untried action, and then
-        that action. Empty if there is nothing to do.
+        If no known link distinguishes the rivals, the actions lead to an untried action, which is
+        the last of them. Empty if there is nothing to do.
         """
         untried = self.plan.untried
         return self.plan.actions or ((*untried.way, untried.action) if untried else ())

@@ -82,13 +82,13 @@ Made = TypeVar("Made")
 class Control(clingo.Control):
     """A clingo control without warnings, which grounds under limits.
 
-    Of all controls in this process, only one at a time reads or grounds. Two threads that ground at
-    once would wait for each other at each symbol and take three times as long.
+    Only one control in this process reads or grounds at a time. Two threads that ground at once
+    would wait for each other at each symbol and take three times as long.
 
     Attributes:
         preparing: The time and the memory that clasp needs to prepare the program, as multiples of
             what grounding took. The default is PREPARING.
-        seconds: What grounding took since clingo last solved, on the clock of the search.
+        seconds: The time of grounding since clingo last solved, on the clock of the search.
         mebibytes: The memory in MiB that this grounding added.
     """
 

@@ -93,9 +93,10 @@ _Shown = tuple[dict[_Seen, int], frozenset[tuple[_Seen, _Seen, Action]]]
 
 
 def sketches_of(first: Step, theory: Theory) -> list[Sketch]:
-    """Begin a sketch (a map without a search) of each kind, those with small maps first.
+    """Begin a sketch of each kind. A sketch is a map that is made without a search.
 
-    The kinds differ in `homing` and, if the theory leaves it open, in `framed`.
+    The kinds differ in `homing` and, if the theory leaves it open, in `framed`. Kinds that mostly
+    give smaller maps come first.
     """
     if _is_gated(theory):
         return [GatewaySketch(first, theory, homing) for homing in (True, False)]
