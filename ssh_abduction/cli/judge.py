@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 from ssh_abduction.checker.checker import Violation, check, unchecked
 from ssh_abduction.checker.claims import ProvenBound, check_bound, false_claims
 from ssh_abduction.cli import shared
-from ssh_abduction.cli.correct import as_corrected
+from ssh_abduction.cli.correct import SavedMap, as_corrected
 from ssh_abduction.cli.outcome import Guard, on_ctrl_c, warn
 from ssh_abduction.cli.parsing import maps_path, trace_path, verb
 from ssh_abduction.cli.text import counted
@@ -411,9 +411,9 @@ def run_explain(options: argparse.Namespace) -> int:
     if maps and options.steps and data and data.get("maps"):
         listing = Listing.from_dict(data, named(maps)).named_beside(maps)
         listing = listing if listing.steps == len(trace) else None
-    if listing is not None:
+    if listing is not None and maps:
         given["known"] = listing.maps
-        options.steps = _with_steps(options.steps, listing)
+        options.steps = _with_steps(options.steps, maps)
     of_place = _place_asked(options.steps, listing)
     question: PairQuestion | TraceQuestion | PlaceQuestion
     pair: PairInMap | None = None
@@ -422,7 +422,7 @@ def run_explain(options: argparse.Namespace) -> int:
             given["known"] = listing.maps[: listing.minimal or None]
         question = PlaceQuestion(trace, *of_place, theory, **given)
     elif options.steps:
-        first, second = _two_steps(options.steps, trace, listing)
+        first, second = (step_named(trace, step) for step in options.steps)
         if listing is not None:
             pair = PairInMap.of(listing, first, second)
         given["max_maps"] = options.maps or None
@@ -454,32 +454,13 @@ def run_explain(options: argparse.Namespace) -> int:
     return _exit_code(answer)
 
 
-def _two_steps(words: Sequence[str], trace: Trace, listing: Listing | None) -> list[int]:
-    """Return the numbers of two steps. An error hints at a name of the map that is similar."""
-    try:
-        return [step_named(trace, word) for word in words]
-    except AbductionError as error:
-        names = [name.text for name in listing.maps[0].names] if listing else []
-        hint = next(filter(None, (meant(word, names) for word in words)), "")
-        raise AbductionError(f"{error}{hint}") from None
-
-
-def _with_steps(words: Sequence[str], listing: Listing) -> Sequence[str]:
-    """Replace each of two places, in a question without a path, by the first step there."""
-    ssh_map = listing.maps[0]
-    found = [thing_named(word, ssh_map.names) or ("", 0) for word in words]
-    if len(words) != 2 or "path" in (kinds := [kind for kind, _ in found]) or "place" not in kinds:
+def _with_steps(words: Sequence[str], maps: str) -> Sequence[str]:
+    """Replace each of two places, in a question without a path, by a step there."""
+    if len(words) != 2 or all(word.isdecimal() for word in words):
         return words
-    first = {ssh_map.dstates[s].place: t for t, s in reversed([*enumerate(ssh_map.dstate_at)])}
-    steps = []
-    for word, (kind, number) in zip(words, found, strict=True):
-        if kind == "place" and number not in first:
-            raise AbductionError(
-                f"{word}: expected a place of the map, got {brief(word)}, but the map has none of "
-                "this number; ssh-abduction show lists them"
-            )
-        steps.append(f"step{first[number]}" if kind == "place" else word)
-    return steps
+    saved = SavedMap.load(maps)
+    found = [("place", word) if word.isdecimal() else saved.thing(word) for word in words]
+    return words if "path" in dict(found) else [step for _, step in found]
 
 
 def _place_asked(words: Sequence[str], listing: Listing | None) -> tuple[int, int | None] | None:

@@ -194,7 +194,7 @@ def _check(name: str, number: int, known: Iterable[int]) -> None:
     """Raise MapError if the first map has no such place or path."""
     known = [*known]
     if number not in known:
-        some = f"{name}s {list_in_words(known)}" if known else f"no {name}s"
+        some = f"{name}s {list_in_words(known)}" if known else f"no {name}s by its axioms"
         raise MapError(
             f"{name}: expected a {name} of the first minimal map, got {number}; the map has {some}"
         )
