@@ -264,7 +264,7 @@ def test_report_shows_drives_and_their_joins(folder: Path) -> None:
     found = ground_in(folder / "page.html", len(Trace.load(folder / "trace.jsonl")))
     assert found is not None
     report = {section.title: section for section in found.sections}
-    assert report["Drives"].lines == ["The map joins all 2 drives: monday, tuesday."]
+    assert report["Drives"].lines == ["The map joins the 2 drives: monday, tuesday."]
     assert [row[0] for row in report["Drives"].table] == ["drive", "monday", "tuesday"]
     joins = report["Joins between drives"].table[1:]
     assert joins

@@ -180,7 +180,7 @@ def test_solve_onto_adds_a_drive_in_the_shell(
     capsys.readouterr()
     assert main(["solve", tuesday, "--onto", maps, "-o", maps]) == 0
     told = capsys.readouterr().out
-    assert "the map of monday is kept; the map joins all 2 drives: monday, tuesday" in told
+    assert "the map of monday is kept; the map joins the 2 drives: monday, tuesday" in told
     assert "0 (kitchen)" in told
     loaded = Solution.load(maps)
     assert [drive.name for drive in loaded.drives] == ["monday", "tuesday"]
@@ -193,7 +193,7 @@ def test_solve_onto_adds_a_drive_in_the_shell(
     assert main(["solve", tuesday, "--onto", maps]) == 0
     told = capsys.readouterr()
     assert "have the same steps (tuesday, tuesday); give each drive once" in told.err
-    assert "joins all 3 drives: monday, tuesday, tuesday-2" in told.out
+    assert "joins the 3 drives: monday, tuesday, tuesday-2" in told.out
 
 
 def test_onto_obeys_corrections_beside_the_map_and_keeps_its_names(

@@ -645,7 +645,7 @@ def test_page_of_a_joint_map_shows_its_drives(browser: Any, tmp_path: Path) -> N
     joint = together([monday, tuesday])
     solution = solve(joint, Theory.causal())
     content = content_of(solution, joint)
-    assert content["joined"] == "the map joins all 2 drives: monday, <b>tuesday</b>"
+    assert content["joined"] == "the map joins the 2 drives: monday, <b>tuesday</b>"
     assert [joined["joins"] for joined in content["between"]] == [[(2, 3, "all maps")]]
     Page(content).save(tmp_path / "page.html")
     page = Shown(browser, (tmp_path / "page.html").as_uri())

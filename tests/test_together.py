@@ -218,7 +218,7 @@ def test_drives_with_a_common_place_get_one_map() -> None:
     assert len(ssh_map.pieces) == 1
     assert {action for _, action, _ in ssh_map.links} == {"travel", "around"}
     assert (
-        pieces_in_words(solution.drives, ssh_map) == "the map joins all 2 drives: monday, tuesday"
+        pieces_in_words(solution.drives, ssh_map) == "the map joins the 2 drives: monday, tuesday"
     )
 
 
@@ -266,7 +266,7 @@ def test_solve_together_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixtu
         replace(trace, name=None).save(file)
     maps = str(tmp_path / "maps.json")
     assert main(["solve", *files, "--together", "-o", maps]) == 0
-    assert "the map joins all 2 drives: monday, tuesday" in capsys.readouterr().out
+    assert "the map joins the 2 drives: monday, tuesday" in capsys.readouterr().out
     assert [drive.name for drive in Solution.load(maps).drives] == ["monday", "tuesday"]
     assert main(["solve", *files, "--together", "--jobs", "2"]) == 1
     assert "--jobs: expected no such option with --together" in capsys.readouterr().err

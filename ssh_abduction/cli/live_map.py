@@ -162,5 +162,5 @@ def _say_map(mapper: OnlineLogMapper) -> None:
         name = f" ({place['name']})" if place["name"] else ""
         print(f"place {place['place']}{name} at ({place['x']:.1f}, {place['y']:.1f}) m")
     places = counted(len(found["places"]), "places")
-    visits = counted(found["visits"], "visits")
+    visits = counted(sum(len(place["scans"]) for place in found["places"]), "visits")
     print(f"{places} after {counted(found['scans'], 'scans')} and {visits}: {found['said']}")

@@ -228,7 +228,7 @@ def pieces_in_words(drives: Sequence[Drive], ssh_map: SSHMap) -> str:
     if len(drives) < 2:
         return ""
     if len(groups) == 1:
-        return f"the map joins all {len(drives)} drives: {', '.join(groups[0])}"
+        return f"the map joins the {len(drives)} drives: {', '.join(groups[0])}"
     pieces = "; ".join(", ".join(names) + (" alone" if len(names) == 1 else "") for names in groups)
     return f"the map is in {len(groups)} pieces that share no place: {pieces}"
 
