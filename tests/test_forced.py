@@ -94,7 +94,7 @@ def test_forced_joins_are_in_all_cheap_maps_and_the_bound_holds(kind: str, seed:
     most = weighed.nats + (1e-3, 4.0)[seed % 2]
     for ssh_map in {solution.maps[0], solution.maps[-1]}:
         forcing = forcing_of(trace, theory, ssh_map)
-        assert max(forcing.bounds(2 * weighed.nats)) <= weighed.nats + EQUAL
+        assert max(forcing.bounds(2 * weighed.nats, depth=1)) <= weighed.nats + EQUAL
         forcing.force(most, 2)
         assert forcing.low <= weighed.nats + EQUAL
         for rival in weighed.rivals:
@@ -212,7 +212,7 @@ def test_forced_bound_holds_if_views_may_be_misread(data: st.DataObject) -> None
         forcing = forcing_of(trace, theory, ssh_map)
         forcing.force(nats + 1e-3, 1)
         assert forcing.low <= nats + EQUAL
-        assert max([0.0, *forcing.bounds(2 * nats)]) <= nats + EQUAL
+        assert max([0.0, *forcing.bounds(2 * nats, depth=1)]) <= nats + EQUAL
 
 
 def test_a_view_that_is_misread_twice_costs_twice() -> None:

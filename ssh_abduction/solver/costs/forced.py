@@ -38,6 +38,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import lru_cache
 from itertools import chain, combinations
 
 import numpy as np
@@ -66,6 +67,8 @@ PAIRS = 5000
 NEAR = 0.9
 # To list all cheap maps, make at most LISTED steps.
 LISTED = 100
+# Keep the poses of the last KEPT sets of classes.
+KEPT = 8
 # After the lack of BRANCHES joins, one after the other, gave F none of them, assume no more lacks.
 BRANCHES = 3
 
@@ -94,6 +97,8 @@ class Forcing:
         ]
         self.joins = self.visits.joined(np.arange(len(self.visits.place)), [])
         self.low = 0.0
+        # A map is bounded again if two of its classes are apart, or by its poses.
+        self._explanations = lru_cache(maxsize=KEPT)(lambda *of: tuple(misfit.explanations(*of)))
 
     @staticmethod
     def holds_for(problem: Problem) -> bool:
@@ -109,20 +114,19 @@ class Forcing:
         """The returns that every cheap map is proven to have."""
         return self.visits.returns(self.joins)
 
-    def bounds(self, most: float, low: float = 0.0) -> Iterator[float]:
+    def bounds(self, most: float, low: float = 0.0, depth: int = 0) -> Iterator[float]:
         """Yield rising lower bounds, above `low` and at most `most`, on the cost of all maps.
 
-        The first bounds come without branching, which takes much longer. `joins` does not change.
+        Up to `depth` joins at a time are assumed to be lacking. `joins` does not change.
         """
-        for branches, top in ((0, 2 * most), (1, most)):
-            high = top
-            while low < most and high - low > NEARLY * most:
-                middle = (low + high) / 2
-                if self._forced(self.visits, self.joins, middle, branches):
-                    low = middle
-                    yield low
-                else:
-                    high = middle
+        high = 2 * most
+        while low < most and high - low > NEARLY * most:
+            middle = (low + high) / 2
+            if self._forced(self.visits, self.joins, middle, depth):
+                low = middle
+                yield low
+            else:
+                high = middle
 
     def force(self, most: float, depth: int) -> None:
         """Find joins that every map of a cost below `most` has, until no more are found.
@@ -182,7 +186,7 @@ class Forcing:
             for of, some in enumerate(named)
         ]
         new = [prior.new[[steps[0] for steps in some], of] for of, some in enumerate(named)]
-        ways = self._misfit.explanations(classes.node.tolist(), classes.place.tolist())
+        ways = self._explanations(tuple(classes.node.tolist()), tuple(classes.place.tolist()))
         for i, (poses, alias) in enumerate(ways):
             look_at_clock(LONG_TURN)
             seen = [some * (not i) for some in shown]

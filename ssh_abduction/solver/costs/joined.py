@@ -189,7 +189,8 @@ class _Cliques:
         self._part: Ints = part
         self._members = [np.flatnonzero(part == p) for p in range(part.max() + 1)]
         self._cliques = [
-            some[clique(apart[np.ix_(some, some)], [0] * len(some))] for some in self._members
+            some[clique(apart[np.ix_(some, some)], [0] * len(some))] if len(some) > 1 else some
+            for some in self._members
         ]
         self._may_join = np.tril(~apart, -1).sum(axis=1)
         self._lost: dict[int, tuple[Array, dict[int, float]]] = {}

@@ -210,15 +210,15 @@ class Weighing:
         task, best = self._task, self.candidates[0]
         forcing = Forcing(task.problem, task.log, self._misfit, best.map)
         try:
-            for depth in (1, 2):
-                forcing.force(self._most, depth)
-                if self._lists_all(forcing):
-                    self.bound, self.proven = self._nats, True
-                    self._parts.known.status = Status.OPTIMAL
-                    return
-                if depth == 1 and forcing.low < best.nats - EQUAL:
-                    for bound in forcing.bounds(best.nats, self.bound):
+            forcing.force(self._most, 1)
+            if not self._lists_all(forcing):
+                self._raise_bound(forcing.low)
+                for depth in (0, 1):
+                    for bound in forcing.bounds(best.nats, self.bound, depth):
                         self._raise_bound(bound)
+                # This takes longer, but may be a proof.
+                forcing.force(self._most, 2)
+                self._lists_all(forcing)
         finally:
             self._raise_bound(forcing.low)
             returns = forcing.returns
@@ -226,12 +226,14 @@ class Weighing:
             self._base = max(self._base, self._misfit.of_returns(returns) / 2)
 
     def _lists_all(self, forcing: Forcing) -> bool:
-        """Whether all maps that are worth finding are known. Add those that are not known yet."""
+        """Add all maps that are worth finding. Return whether this is a proof."""
         courses = forcing.courses(self._most)
         known = {dstates_and_places(candidate.map) for candidate in self.candidates}
-        return courses is not None and all(
-            course in known or self._knows(course) for course in courses
-        )
+        if courses is None or not all(one in known or self._knows(one) for one in courses):
+            return False
+        self.bound, self.proven = self._nats, True
+        self._parts.known.status = Status.OPTIMAL
+        return True
 
     def _knows(self, course: Course) -> bool:
         """Add a map with these dstates and places, if there is one. Return whether this is sure."""
