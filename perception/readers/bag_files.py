@@ -35,6 +35,7 @@ from perception.readers.lines import (
     zstd_module,
 )
 from perception.readers.scans import Damage
+from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.words import first_few
 
@@ -458,13 +459,8 @@ def format_of(head: bytes) -> str | None:
 def bag_opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
     """Open a bag of the format `ros1`, `ros2` or `mcap`, or a folder. Raises LogError."""
     path = Path(path)
-    try:
+    with needed(named(path), "rosbags to read it with", "'.[ros]' in your clone", LogError):
         from rosbags import rosbag1, rosbag2  # noqa: F401 - only whether they are installed
-    except ImportError:
-        raise LogError(
-            f"{named(path)}: expected the package rosbags to read it with, got none; pip "
-            "install '.[ros]' in your clone"
-        ) from None
     with ExitStack() as stack:
         try:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))

@@ -35,6 +35,7 @@ import numpy as np
 from perception.errors import LogError
 from perception.readers.bag_files import TRANSFORMS, typestore
 from perception.readers.scans import Array, LaserScanner, Scan
+from ssh_abduction.data.checks import needed
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import save_file
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
@@ -172,12 +173,8 @@ def _numbers(pose: Pose) -> str:
 
 def _write_bag(path: Path, scans: Iterable[Scan], covariances: Array | None) -> Path:
     """Write a bag to a new path; return the file or folder that is the result."""
-    try:
+    with needed("bag", "rosbags", "'.[ros]' in your clone", LogError):
         from rosbags import rosbag1, rosbag2
-    except ImportError:
-        raise LogError(
-            "bag: expected the package rosbags, got none; pip install '.[ros]' in your clone"
-        ) from None
     is_ros1 = path.suffix == ".bag"
     store = typestore(is_ros1)
     kinds = {

@@ -29,6 +29,7 @@ from ssh_abduction.checker.reading import (
 )
 from ssh_abduction.data.groups import linked, reached
 from ssh_abduction.data.map_parts import Region, course_named, list_in_words
+from ssh_abduction.data.words import noun_of
 
 
 @dataclass(frozen=True)
@@ -261,7 +262,8 @@ def _missing(m: Reading, expected: Mapping[_Places, str]) -> Found:
     there = {frozenset(region.places) for region in m.map.regions or ()}
     for places, why in expected.items():
         if places not in there:
-            yield _steps(m, places), f"The map lists no region of {_listed(places)}. {why}"
+            named = f"{noun_of('place', places)} {list_in_words(sorted(places))}"
+            yield _steps(m, places), f"The map lists no region of {named}. {why}"
 
 
 def _wrong(m: Reading, region: Region) -> Iterator[str]:
@@ -310,11 +312,6 @@ def region_behind(m: Reading) -> Found:
 def _steps(m: Reading, places: Iterable[int]) -> list[int]:
     """List the first step at each of these places."""
     return [step for place in places for step in m.steps_at(place)]
-
-
-def _listed(places: _Places) -> str:
-    """Name places in words."""
-    return f"place{'' if len(places) == 1 else 's'} {list_in_words(sorted(places))}"
 
 
 REGIONS: dict[str, Check] = {

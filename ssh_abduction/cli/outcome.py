@@ -311,7 +311,9 @@ class _StderrHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         seconds, source = time.monotonic() - self._began, record.name.removeprefix(f"{PACKAGE}.")
-        _say(f"{seconds:.2f} s: {source}: {record.getMessage()}")
+        text = printable(f"{seconds:.2f} s: {source}: {record.getMessage()}")
+        with contextlib.suppress(OSError, ValueError):  # if its reader quits, the command goes on
+            print(f"ssh-abduction: {text}", file=sys.stderr, flush=True)
 
 
 class _ProgressLine(logging.Handler):
@@ -381,12 +383,6 @@ class _Wiping:
     def __getattr__(self, name: str) -> Any:
         self._wipe()
         return getattr(self._stream, name)
-
-
-def _say(text: str) -> None:
-    # If the reader of stderr quits, the command goes on.
-    with contextlib.suppress(OSError, ValueError):
-        print(f"ssh-abduction: {printable(text)}", file=sys.stderr, flush=True)
 
 
 # A search is ended after the first number times its time limit, plus the second in seconds.

@@ -20,7 +20,7 @@ from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.output.cards import table_of_dstates
 from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.solution import Backbone, Solution, Status, stretches, summary_of
+from ssh_abduction.solution import Backbone, Solution, Status, steps_in_words, stretches, summary_of
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Choice, Comparison
@@ -244,8 +244,3 @@ def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
         f"the {NOUNS[sort][len(steps) > 1]} of {steps_in_words(steps)}"
         for sort, steps in shown.items()
     )
-
-
-def steps_in_words(steps: Sequence[int]) -> str:
-    """Write step numbers in words, such as "step 40" or "steps 12–15 and 40"."""
-    return f"{noun_of('step', steps)} {stretches(steps)}"

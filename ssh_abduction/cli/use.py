@@ -21,7 +21,7 @@ from ssh_abduction.cli import shared
 from ssh_abduction.cli.correct import as_corrected, correct_pair
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import pose, trace_path, verb
-from ssh_abduction.cli.text import describe, steps_in_words, table
+from ssh_abduction.cli.text import describe, table
 from ssh_abduction.data.corrections import beside
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.errors import (
@@ -41,6 +41,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.runtime import program
 from ssh_abduction.runtime.workers import end_all
+from ssh_abduction.solution import steps_in_words
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

@@ -416,8 +416,8 @@ def course_named(course: tuple[int, int]) -> str:
 
 def list_in_words(parts: Iterable[object]) -> str:
     """List things in words: "1, 2 and 3"."""
-    *first, last = map(str, parts)
-    return f"{', '.join(first)} and {last}" if first else last
+    words = [*map(str, parts)]
+    return " and ".join([", ".join(words[:-1]), *words[-1:]] if words[1:] else words)
 
 
 def write_map(path: str | os.PathLike[str], text: str, what: str = "map") -> None:

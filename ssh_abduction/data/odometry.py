@@ -337,13 +337,10 @@ def checked_closures(value: Any, steps: int, source: str | None) -> tuple[Closur
     Each pair of steps may have only one closure.
     """
     where = named(source or "trace")
-    if not isinstance(value, Sequence) or isinstance(value, str | bytes):
-        raise TraceError(
-            f"{where}: closures: expected a list of Closure, got {brief(value)}; make them with "
-            f"Closure.of"
-        )
+    what, mend = "a list of Closure", "make them with Closure.of"
+    given = a_list(f"{where}: closures", value, TraceError, what=what, mend=mend)
     known: set[tuple[int, int]] = set()
-    for i, closure in enumerate(value):
+    for i, closure in enumerate(given):
         at = f"{where}: closures[{i}]"
         an_instance(at, closure, Closure, TraceError, mend="make one with Closure.of")
         if closure.last >= steps:
@@ -357,7 +354,7 @@ def checked_closures(value: Any, steps: int, source: str | None) -> tuple[Closur
                 f"{closure.last} twice; leave one out"
             )
         known.add((closure.first, closure.last))
-    return tuple(value)
+    return tuple(given)
 
 
 def closures_among(closures: Sequence[Closure], steps: Sequence[int]) -> tuple[Closure, ...]:

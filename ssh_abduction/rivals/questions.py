@@ -59,7 +59,7 @@ from ssh_abduction.data.groups import indices_of, minimal_part
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.words import noun_of
-from ssh_abduction.solution import SORTS, Sort, key_of, sorts_of, stretches
+from ssh_abduction.solution import SORTS, Sort, key_of, sorts_of, steps_in_words, stretches
 
 Matter: TypeAlias = Literal["faults", "dstates", "places", "paths", "courses"]
 
@@ -97,9 +97,10 @@ class Question:
         verb = "is" if len(self.there) == 1 else "are"
         if self.first == self.later:
             what = "at a place" if self.sort == "places" else "along a path"
-            return f"{_steps(self.there)} {verb} {what}"
+            return f"{steps_in_words(self.there)} {verb} {what}"
         here, there = (
-            f"{_steps(steps)}{self._at(k)}" for k, steps in enumerate((self.here, self.there))
+            f"{steps_in_words(steps)}{self._at(k)}"
+            for k, steps in enumerate((self.here, self.there))
         )
         same = {
             "dstates": f"at the dstate of {here}",
@@ -187,11 +188,6 @@ def _about_faults(maps: Sequence[SSHMap]) -> dict[bytes, AnsweredQuestion]:
 def _key(column: Bools) -> bytes:
     """Return a key for the answer of each map. The opposite answers have the same key."""
     return np.packbits(column ^ column[0]).tobytes()
-
-
-def _steps(steps: Sequence[int]) -> str:
-    """Put the numbers of steps into words: "step 1", or "steps 1–3 and 7"."""
-    return f"{noun_of('step', steps)} {stretches(steps)}"
 
 
 class Table:

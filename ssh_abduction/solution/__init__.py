@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solution.sharing import Sort as Sort
     from ssh_abduction.solution.sharing import key_of as key_of
     from ssh_abduction.solution.sharing import sorts_of as sorts_of
+    from ssh_abduction.solution.sharing import steps_in_words as steps_in_words
     from ssh_abduction.solution.sharing import stretches as stretches
     from ssh_abduction.solution.values import Bound as Bound
     from ssh_abduction.solution.values import Cost as Cost

@@ -27,9 +27,10 @@ from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.drives import Drive, DriveStep, named_steps
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.groups import first_index_of, indices_of, numbered
+from ssh_abduction.data.map_parts import list_in_words
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.schema import FieldReader
-from ssh_abduction.data.words import counted
+from ssh_abduction.data.words import counted, noun_of
 
 Pair: TypeAlias = tuple[int, int]
 Sort: TypeAlias = Literal["dstates", "places", "paths", "courses"]
@@ -157,7 +158,7 @@ class Backbone:
         if "paths" in differing:  # a step along another path is along another course
             differing.pop("courses", None)
         same = [sort for sort in self.sorts if sort not in differing and sort != "courses"]
-        parts = [f"the same {_listed(same)}"] if same else []
+        parts = [f"the same {list_in_words(same)}"] if same else []
         steps = named_steps(self.drives, len(self.dstates.always))
         return "; ".join(
             parts + [_differing_in_words(sort, shared, steps) for sort, shared in differing.items()]
@@ -409,9 +410,9 @@ def stretches(steps: Sequence[int]) -> str:
         in_drive = last - last.first if isinstance(last, DriveStep) else last
         parts.append(str(first) if first == last else f"{first}–{in_drive}")
     more = sum(map(len, runs[NAMED:]))
-    return _listed([*parts, f"{more} more"] if more else parts)
+    return list_in_words([*parts, f"{more} more"] if more else parts)
 
 
-def _listed(words: Sequence[str]) -> str:
-    """Join words by commas, and the last one by "and"."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+def steps_in_words(steps: Sequence[int]) -> str:
+    """Write step numbers in words, such as "step 40" or "steps 12–15 and 40"."""
+    return f"{noun_of('step', steps)} {stretches(steps)}"

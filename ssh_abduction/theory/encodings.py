@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+from ssh_abduction.data.checks import a_list
 from ssh_abduction.data.errors import TheoryError, brief, is_writable
 from ssh_abduction.data.files import read_at_most, shipped
 
@@ -347,12 +348,8 @@ class Rules:
             value = [part.strip() for part in value.split(",") if part.strip()]
         elif isinstance(value, Rules | os.PathLike | Mapping):
             value = [value]
-        if not isinstance(value, Iterable):
-            raise TheoryError(
-                f"rules: expected a list of files of rules, got {brief(value)}; give their paths, "
-                "as in rules=['own.lp']"
-            )
-        return tuple(map(cls.of, value))
+        what, mend = "a list of files of rules", "give their paths, as in rules=['own.lp']"
+        return tuple(map(cls.of, a_list("rules", value, TheoryError, what=what, mend=mend)))
 
 
 def _stray(text: str) -> int:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any, Literal, TypeAlias, get_args, get_origin, get_type_hints
 
-from ssh_abduction.data.checks import a_flag, a_whole_number, one_of
+from ssh_abduction.data.checks import a_flag, a_list, a_whole_number, one_of
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.errors import TheoryError, brief, is_finite
 from ssh_abduction.theory import encodings
@@ -321,10 +321,8 @@ def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
     mend = f"write {field}=[(3, 12)] (--{field.replace('_', '-')} 3,12)"
     if isinstance(value, str):
         value = [value]
-    if not isinstance(value, Iterable) or isinstance(value, Mapping | bytes):
-        raise TheoryError(f"{field}: expected pairs of steps, got {brief(value)}; {mend}")
     found: dict[Pair, None] = {}
-    for given in value:
+    for given in a_list(field, value, TheoryError, what="pairs of steps", mend=mend):
         pair = given.split(",") if isinstance(given, str) else given
         try:
             steps = [int(step) if isinstance(step, str) else step.__index__() for step in pair]

@@ -441,9 +441,7 @@ PRESETS: dict[str, Callable[[], Theory]] = {
 
 def checked_theory(value: object) -> Theory:
     """Return a theory; Theory.topological() for None. Raise TheoryError for other values."""
-    if not isinstance(value, Theory | None):
-        raise TheoryError(
-            f"theory: expected a Theory, got {brief(value)}; take Theory.topological(), "
-            "Theory.causal() or Theory(…)"
-        )
-    return value or Theory.topological()
+    if value is None:
+        return Theory.topological()
+    mend = "take Theory.topological(), Theory.causal() or Theory(…)"
+    return an_instance("theory", value, Theory, TheoryError, mend=mend)
