@@ -344,6 +344,7 @@ def test_export_command_writes_the_output_of_python(
     square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert tuple(verb.FORMATS) == (*formats.FORMATS, "rerun")
+    assert f"--to {{{','.join(verb.FORMATS)}}}!" in verb.run_export.rows
     file = f"{tmp_path}/map.json"
     square.save(file)
     assert main(["export", file, "--to", "nav2", "-o", f"{tmp_path}/graph.geojson"]) == 0

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from perception.errors import LogError
+from perception.readers.echoes import MEANINGS
 from perception.readers.lines import LONGEST_LINE
 from perception.readers.logs import FORMATS, live_log, read_log
 from perception.readers.scans import Damage, LaserScanner, RobotLog, Scan
@@ -783,7 +784,8 @@ def broken(tmp_path: Path) -> dict[str, bytes]:
 
 
 def test_import_takes_all_formats_of_logs() -> None:
-    assert tuple(FORMATS) == import_log.FORMATS
+    assert f"--format {{{','.join(FORMATS)}}}" in import_log.READING
+    assert f"--set zero_is {{{','.join(MEANINGS)}}}" in import_log.READING
 
 
 @pytest.mark.parametrize("what", broken(Path()))

@@ -7,7 +7,7 @@ import re
 import sys
 
 from ssh_abduction.cli.parsing import verb
-from ssh_abduction.cli.shared import TRACE_SAID, theory_of, theory_rows
+from ssh_abduction.cli.shared import theory_of, theory_rows
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import AbductionError, printable
 from ssh_abduction.data.trace import Trace
@@ -17,7 +17,7 @@ from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import PRESETS
 
 
-@verb({})
+@verb()
 def run_theory(options: argparse.Namespace) -> int:
     """List the axioms.
 
@@ -53,7 +53,7 @@ def _state(name: str, preset: str) -> str:
     )
 
 
-@verb({"trace": TRACE_SAID, **theory_rows()})
+@verb(theory_rows=theory_rows())
 def run_facts(options: argparse.Namespace) -> int:
     """Print a trace as .lp facts.
 
@@ -67,10 +67,7 @@ def run_facts(options: argparse.Namespace) -> int:
     return 0
 
 
-SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")
-
-
-@verb({f"shell {{{','.join(SHELLS)}}}": "the shell to print the script for"})
+@verb()
 def run_completion(options: argparse.Namespace) -> int:
     """Print completions for a shell.
 

@@ -34,20 +34,7 @@ if TYPE_CHECKING:
 UNSTEADY = ("seconds", "limit", "drove", "log.source")
 
 
-@verb(
-    {
-        "maps": (shared.MAPS_SAID, {"type": str}),
-        "[other]": (
-            "other maps of the same trace; shows which maps are in both files, and how the first "
-            "maps of the files differ"
-        ),
-        "--diff I J": (
-            "only describe how maps I and J differ. Give each by its number, from 1, or its id. "
-            "With OTHER, map J is in that file"
-        ),
-        **shared.JSON,
-    }
-)
+@verb({"maps": {"type": str}})
 def run_compare(options: argparse.Namespace) -> int:
     """Show what rival maps share, and where they differ.
 
@@ -179,13 +166,9 @@ EXIT_NOTHING = 30  # the exit code if a limit ended the search without a plan
 
 
 @verb(
-    {
-        **shared.maps_and_trace(),
-        **shared.limits("the best plan so far"),
-        **shared.STRICT,
-        **shared.JSON,
-        **shared.theory_rows("the theory in the file of maps"),
-    }
+    maps_and_trace=shared.maps_and_trace(),
+    limits=shared.limits("the best plan so far"),
+    theory_rows=shared.theory_rows("the theory in the file of maps"),
 )
 def run_next(options: argparse.Namespace) -> int:
     """Find the actions after which rival maps disagree.
@@ -288,24 +271,7 @@ THINGS = ("dstates", "places", "paths")
 HEAD = ("map", "isomorphic", *THINGS, "accuracy", "same place", "edges", "links")
 
 
-@verb(
-    {
-        **shared.maps_and_trace(" with truth"),
-        "--set near METRES": (
-            "judge by true poses, too: visits within this distance count as one place (if no step "
-            "names its true place, this is done anyway, with 2 metres)"
-        ),
-        "--set relations FILE": (
-            "also judge by hand-checked relative poses in this file: lines of time1 time2 x y z "
-            "roll pitch yaw"
-        ),
-        "--truth FILE": (
-            "judge by the robot's true trajectory in this file, in TUM format: lines of timestamp "
-            "tx ty tz qx qy qz qw"
-        ),
-        **shared.JSON,
-    }
-)
+@verb(maps_and_trace=shared.maps_and_trace(" with truth"))
 def run_evaluate(options: argparse.Namespace) -> int:
     """Compare maps with the truth.
 

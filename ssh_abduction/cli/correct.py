@@ -245,21 +245,6 @@ def sentences_of(corrections: Corrections) -> Iterator[str]:
     yield from map(str, (*corrections.names, *corrections.pairs, *corrections.gateways))
 
 
-HELPS = {
-    "same": "steps I and J, such as monday:12,tuesday:3, are one dstate",
-    "different": "steps I and J are different dstates",
-    "elsewhere": (
-        "steps I and J are at different places; I and J may also be places, such as p4 or kitchen"
-    ),
-    "same_place": "steps I and J are at one place; I and J may also be places, as with --elsewhere",
-    "open": (
-        "a gateway is open: a place and a direction on the drawn map, such as 'kitchen north', or "
-        "a step and a direction from the robot, such as 'monday:12 left'"
-    ),
-    "closed": "a gateway, named as with --open, is closed",
-}
-
-
 class _InOrder(argparse.Action):
     """Appends an option and its value to `said`. So a later option can replace an earlier one."""
 
@@ -275,15 +260,8 @@ class _InOrder(argparse.Action):
 
 @verb(
     {
-        "maps": shared.MAPS_SAID,
-        **{
-            f"--{name.replace('_', '-')} {'I,J' if name in ASSERTIONS else 'GATEWAY'}": (
-                said,
-                {"action": _InOrder},
-            )
-            for name, said in HELPS.items()
-        },
-        **shared.ONE_MAP,
+        name: {"action": _InOrder}
+        for name in ("--same", "--different", "--elsewhere", "--same-place", "--open", "--closed")
     }
 )
 def run_correct(options: argparse.Namespace) -> int:
@@ -382,18 +360,7 @@ def _pair(saved: SavedMap, kind: str, pair: str) -> tuple[str, str]:
     return steps[0], steps[1]
 
 
-@verb(
-    {
-        "maps": shared.MAPS_SAID,
-        "what": (
-            "a place such as p4, a path such as path2, a region such as region3, a corridor, room "
-            "or door such as room4, or its name so far; or a step such as monday:12, or a dstate "
-            "such as d7, for its place"
-        ),
-        "name": 'the name, such as "kitchen"; write -- before a name that begins with -',
-        **shared.ONE_MAP,
-    }
-)
+@verb()
 def run_name(options: argparse.Namespace) -> int:
     """Name a place, path, region, corridor, room or door.
 

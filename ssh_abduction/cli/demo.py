@@ -15,12 +15,7 @@ WORLD = "doors"  # a corridor with rooms
 WORK = 5
 
 
-@verb(
-    {
-        "-o --output FOLDER=demo": "folder to write",
-        "--set open true|false=true": "whether to open the page in the browser",
-    }
-)
+@verb()
 def run_demo(options: argparse.Namespace) -> int:
     """Simulate a drive, map it, and open the map.
 

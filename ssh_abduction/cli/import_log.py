@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c, unwritten, warn
-from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, verb
-from ssh_abduction.cli.shared import OUTPUT_TRACE, check_ending, check_output, write_trace
+from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, rows_of, verb
+from ssh_abduction.cli.shared import check_ending, check_output, write_trace
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.data.files import write_file
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-# Repeats perception.readers.logs, whose import would delay all verbs.
-FORMATS = ("carmen", "g2o", "ros1", "ros2", "mcap")
 # Repeats perception.places.distinctive.
 WIDTH = 0.5
 # Endings of file names: first those of compression, then those of formats.
@@ -47,8 +45,6 @@ ENDINGS = (
     ("gz", "bz2", "xz", "zst", "zstd", "lz4"),
     ("log", "clf", "carmen", "txt", "g2o", "graph", "toro", "bag", "mcap", "db3"),
 )
-# Repeats perception.readers.echoes.
-MEANINGS = ("free", "unknown")
 
 
 def metres(text: str) -> float:
@@ -84,53 +80,17 @@ def _laser_value(field: str, text: str) -> Any:
     return value
 
 
-LOG_SAID = (
-    "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be compressed "
-    "by gzip, bzip2, xz or zstd"
-)
 # How to read a log, and how wide the robot is.
-READING: Rows = {
-    "# reading logs": "",
-    f"--format {{{','.join(FORMATS)}}}": "format of the log (default: guessed from its content)",
-    "--width METRES": (
-        f"width of the robot in metres; it cannot pass narrower gaps (default: {WIDTH:g})",
-        {"type": metres},
-    ),
-    "--set fov DEGREES": (
-        "the angle from the first to the last beam of the laser; negative for a laser mounted "
-        "upside down (default: from the log, else 180)",
-        {"type": partial(_laser_value, "fov")},
-    ),
-    "--set scan_topic TOPIC...": (
-        "topic of the scans, if a bag has several; may be given again to read several lasers"
-    ),
-    "--set odom_topic TOPIC": "topic of the odometry, if a bag has several",
-    "--set mount X,Y,DEGREES": (
-        "where the laser is on the robot: metres ahead of the centre, metres to the left, and "
-        "degrees to the left of straight ahead (default: from the log, else 0,0,0)",
-        {"type": partial(_laser_value, "mount")},
-    ),
-    "--set no_return METRES": (
-        "a range of at least this length means that the beam hit nothing (default: the "
-        "laser's maximum range, or a shorter range that often repeats and is no wall)",
-        {"type": partial(_laser_value, "no_return")},
-    ),
-    f"--set zero_is {{{','.join(MEANINGS)}}}": (
-        "how to read ranges that are NaN, at most 0, or below the laser's minimum: free means "
-        "that the beam hit nothing, unknown that nothing is known (default: free if "
-        "scans from nearby see hardly any walls there, else unknown)"
-    ),
-    "--set nearest METRES": (
-        "a range of at most this length shows the robot itself, and is unknown; 0 if none does "
-        "(default: beams that return one short range in nearly all scans are unknown)",
-        {"type": partial(_laser_value, "nearest")},
-    ),
-    "--set blind A:B": (
-        "the robot blocks the beams from A to B, so they are unknown; in degrees to the left of "
-        "where the laser looks",
-        {"type": partial(_laser_value, "blind")},
-    ),
-}
+READING = rows_of(
+    "READING",
+    {
+        "--width": {"type": metres},
+        **{
+            name: {"type": partial(_laser_value, name)}
+            for name in ("fov", "mount", "no_return", "nearest", "blind")
+        },
+    },
+)
 
 # The options that are fields of perception.readers.echoes.LaserOptions.
 LASER = ("fov", "mount", "no_return", "zero_is", "nearest", "blind")
@@ -148,16 +108,7 @@ def reading_of(options: argparse.Namespace) -> dict[str, Any]:
     return {name: getattr(options, name) for name in ("format", "scan_topic", "odom_topic", *LASER)}
 
 
-@verb(
-    {
-        "log": (
-            f"{LOG_SAID}. '-' reads a CARMEN log from standard input, with little memory, and "
-            "shows each place when it is final"
-        ),
-        **OUTPUT_TRACE,
-        **READING,
-    }
-)
+@verb(READING=READING)
 def run_import(options: argparse.Namespace) -> int:
     """Make a trace from a robot's log.
 

@@ -167,15 +167,8 @@ class _Judgement:
 
 
 @verb(
-    {
-        **shared.maps_and_trace(),
-        "--bound": (
-            "also check the other claims of the file: the proof that no map has fewer dstates, the "
-            "fits of maps, and what all maps share"
-        ),
-        **shared.JSON,
-        **shared.theory_rows("the theory of the maps, or topological"),
-    }
+    maps_and_trace=shared.maps_and_trace(),
+    theory_rows=shared.theory_rows("the theory of the maps, or topological"),
 )
 def run_check(options: argparse.Namespace) -> int:
     """Judge maps by the axioms.
@@ -358,30 +351,10 @@ Answer: TypeAlias = PairExplanation | TraceExplanation | PlaceExplanation
 
 
 @verb(
-    {
-        "trace": (
-            f"{shared.TRACE_SAID}. Or a file of maps that solve -o wrote, or a folder that the "
-            "command 'map' wrote: then the trace and theory of these maps are used",
-            {"type": str},
-        ),
-        "[steps step...]": (
-            "what to explain. Two steps (numbers from 0, or DRIVE:STEP in a joint trace): why they "
-            "are one dstate or two. In a file of maps, a place stands for its first step. A place "
-            "and a path, such as p7 path2: on which side of the path the place lies. A place "
-            "alone: its side of each path, and its regions. Nothing: why the trace has no map. "
-            "Numbers of places and paths are those of the first minimal map, or of the first map "
-            "in a file of maps. In a file, places and paths may also be given by name",
-            {"default": ()},
-        ),
-        **shared.max_maps("minimal maps, to count those in which the two steps are one dstate"),
-        "--json": "print the explanation as JSON",
-        **shared.limits("what is known", SECONDS),
-        "--corrections FILE": (
-            "obey the corrections in this file, or in corrections.yaml of this folder (default: "
-            "corrections.yaml in the folder of the file that --theory names, if there is one)"
-        ),
-        **shared.theory_rows(),
-    }
+    {"trace": {"type": str}, "steps": {"default": ()}},
+    max_maps=shared.max_maps("minimal maps, to count those in which the two steps are one dstate"),
+    limits=shared.limits("what is known", SECONDS),
+    theory_rows=shared.theory_rows(),
 )
 def run_explain(options: argparse.Namespace) -> int:
     """Say why two steps are one dstate or two, or why there is no map.

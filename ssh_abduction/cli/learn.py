@@ -29,27 +29,7 @@ if TYPE_CHECKING:
 IMAGES = "images.npz"  # the common sidecar file of traces that are clustered together
 
 
-@verb(
-    {
-        "traces trace...": ("trace file with images, or - for standard input", {"type": str}),
-        "--together": "the traces are drives through one building: give them common views",
-        "-o --output FILE!": (
-            "trace file to write, or - for standard output; with --together, the folder to write, "
-            "where each trace keeps its file name"
-        ),
-        "--k K": "number of views (default: the number that the measure M of the paper rates best)",
-        "--set k_max K": "largest number of views to try (default: 20)",
-        "--set by {M,trimmed}=M": (
-            "choose k by M, or by trimmed M, which uses medians instead of the smallest and "
-            "largest distances, so that no single image decides"
-        ),
-        "--seed SEED=0": "random seed of k-means",
-        "--plot PNG": (
-            "draw the measure M against the number of views, into this file. If the truth is "
-            "known, also draw U, which says how well the views agree with the true dstates"
-        ),
-    }
-)
+@verb({"traces": {"type": str}})
 def run_cluster(options: argparse.Namespace) -> int:
     """Cluster images into views.
 
@@ -182,16 +162,7 @@ def true_dstate_names(traces: Sequence[Trace]) -> list[str] | None:
     return [str(name) for name in found] if all(name is not None for name in found) else None
 
 
-@verb(
-    {
-        **shared.maps_and_trace(" with images"),
-        "--map I": (
-            "the number of the map that gives the labels, from 1, or its id (default: use only "
-            "labels on which all maps agree)"
-        ),
-        "-o --output FILE.skops!": "file for the trained recogniser",
-    }
-)
+@verb(maps_and_trace=shared.maps_and_trace(" with images"))
 def run_train(options: argparse.Namespace) -> int:
     """Train a recogniser on the labels of a map.
 
@@ -221,13 +192,7 @@ def run_train(options: argparse.Namespace) -> int:
     return 0
 
 
-@verb(
-    {
-        "recogniser": "file that train wrote",
-        "trace": "trace file with images",
-        "--json": "print the dstates as a JSON list, null for nowhere",
-    }
-)
+@verb()
 def run_recognise(options: argparse.Namespace) -> int:
     """Recognise dstates from images.
 

@@ -34,41 +34,13 @@ def positive(text: str) -> float:
 
 @verb(
     {
-        "--replay LOG": f"replay a log instead of listening to ROS 2: {import_log.LOG_SAID}",
-        "--speed X": (
-            "replay this many times as fast as the robot drove (default: as fast as possible)",
-            {"type": positive},
-        ),
-        "--scan TOPIC=/scan": "topic of the LaserScan",
-        "--odom TOPIC=/odom": (
-            "topic of the Odometry; /tf takes the transforms from the frame odom instead"
-        ),
-        "--ros-args ARG": (
-            "all that follows is for ROS 2, such as -p use_sim_time:=true",
-            {"nargs": argparse.REMAINDER, "default": []},
-        ),
-        "--set idle S": (
-            "end when no message came for S seconds (default: never)",
-            {"type": positive},
-        ),
-        "--save FOLDER": (
-            "folder to save the state to, each second, with the files of the last map; if it has a "
-            "state, the drive goes on from there"
-        ),
-        "--onto FOLDER": (
-            "continue the map that was saved in this folder; the robot may be anywhere, and has no "
-            "position until the scans show it; saves to this folder unless --save is given"
-        ),
-        "--page PORT": (
-            "serve a page on this computer that follows the robot; 0 takes any free port",
-            {"type": int},
-        ),
-        "--work-limit W": (
-            "units of work for each search, each about a second of a quiet core (default: 5)",
-            {"type": positive, "default": 5.0},
-        ),
-        **import_log.READING,
-    }
+        "--speed": {"type": positive},
+        "--ros-args": {"nargs": argparse.REMAINDER, "default": []},
+        "idle": {"type": positive},
+        "--page": {"type": int},
+        "--work-limit": {"type": positive, "default": 5.0},
+    },
+    READING=import_log.READING,
 )
 def run_live(options: argparse.Namespace) -> int:
     """Map a building while the robot drives.

@@ -270,30 +270,13 @@ class MapQuestion(jobs.FileQuestion):
 
 
 @verb(
-    {
-        "logs log...": import_log.LOG_SAID,
-        "--together": "the logs are drives through one building: find their joint maps",
-        "--add": (
-            "the logs are further drives through the building whose map is in the folder: map them "
-            "with its logs. Names stay with their places, and the answer says how many numbers stay"
-        ),
-        "-o --output FOLDER!": "folder to write; each of several logs gets a folder inside it",
-        **shared.max_maps("minimal maps", 300),
-        "--work-limit W": (
-            "units of work for the search. A unit is about a second of a quiet core, and equal "
-            "limits give equal maps on each machine (default: until the time limit or, without "
-            "one, a unit for 40 seconds of driving, and at least 8; more while no map is found)"
-        ),
-        "--time-limit S": "end the search after S seconds in any case",
-        **shared.STRICT,
-        "--set again true|false=false": "whether to map also logs that are already mapped",
-        **shared.many("map", "logs"),
-        **import_log.READING,
-        **shared.theory_rows(
-            "topological, but without the axioms of stars, sides and paths, as logs do not show "
-            "these reliably"
-        ),
-    }
+    max_maps=shared.max_maps("minimal maps", 300),
+    many=shared.many("map", "logs"),
+    READING=import_log.READING,
+    theory_rows=shared.theory_rows(
+        "topological, but without the axioms of stars, sides and paths, as logs do not show "
+        "these reliably"
+    ),
 )
 def run_map(options: argparse.Namespace) -> int:
     """Map a building from a robot's log.

@@ -7,14 +7,7 @@ import argparse
 from ssh_abduction.cli.parsing import verb
 
 
-@verb(
-    {
-        "folders folder...": "folder that map wrote, or that live saves to",
-        "--set write true|false=false": (
-            "whether agents may name things and correct joins, in corrections.yaml of the folders"
-        ),
-    }
-)
+@verb()
 def run_mcp(options: argparse.Namespace) -> int:
     """Answer the questions of agents about maps.
 

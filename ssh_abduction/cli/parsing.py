@@ -1,7 +1,7 @@
 """Parse the command line, with groups of verbs, settings, and hints for misspelt names.
 
-Each verb is a function with a table of rows, one for each argument and option. Its docstring is the
-help text.
+Each verb is a function with rows, one for each argument and option, in a section of options.txt.
+Its docstring is the help text.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import math
 import re
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
@@ -26,6 +27,7 @@ Rows: TypeAlias = Mapping[str, str | tuple[str, Mapping[str, Any]]]
 
 NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
 
+OPTIONS = Path(__file__).with_name("options.txt")
 # The names of the files in a folder that map wrote.
 MAPS, TRACE, RUN = "maps.json", "trace.jsonl", "run.json"
 
@@ -124,9 +126,46 @@ class Verb:
         return (first[:1].lower() + first[1:]).removesuffix(".")
 
 
-def verb(rows: Rows) -> Callable[[Callable[[argparse.Namespace], int]], Verb]:
-    """Make a verb of the function `run_NAME`, with a table of its arguments and options."""
-    return lambda run: Verb(run, rows)
+def verb(
+    details: Mapping[str, Mapping[str, Any]] | None = None, **more: Rows
+) -> Callable[[Callable[[argparse.Namespace], int]], Verb]:
+    """Make a verb of the function `run_NAME`, with the rows of the section NAME, as `rows_of`."""
+    return lambda run: Verb(run, rows_of(run.__name__.removeprefix("run_"), details, **more))
+
+
+def rows_of(
+    section: str, details: Mapping[str, Mapping[str, Any]] | None = None, **more: Rows
+) -> Rows:
+    """Read the rows of a section of options.txt.
+
+    Below the form of a row is its help text, indented. A line $NAME stands for the rows `more` of
+    this name, or else for those of the section NAME. `details` has arguments of `add_argument` for
+    some rows, by the first word of the form, without --set.
+    """
+    found: dict[str, str | tuple[str, Mapping[str, Any]]] = {}
+    for form, text in _sections().get(section, ()):
+        found |= (more.get(form[1:]) or rows_of(form[1:])) if form[0] == "$" else {form: text}
+    for form, said in found.items():
+        name = form.removeprefix("--set ").split()[0].strip("[]")
+        if details and name in details and isinstance(said, str):
+            found[form] = said, details[name]
+    return found
+
+
+@cache
+def _sections() -> dict[str, list[tuple[str, str]]]:
+    """Read the sections of options.txt: pairs of a form and a text, by the name of the section."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    rows: list[tuple[str, str]] = []
+    for line in OPTIONS.read_text(encoding="utf-8").splitlines():
+        if line.startswith("== "):
+            rows = found.setdefault(line[3:], [])
+        elif line.startswith(" "):
+            form, text = rows.pop()
+            rows.append((form, f"{text} {line.strip()}".lstrip()))
+        elif line:
+            rows.append((line, ""))
+    return found
 
 
 class _Set(argparse.Action):

@@ -17,23 +17,7 @@ from ssh_abduction.runtime.program import interrupted_code
 LIMITS = {"time": "seconds", "work": "units of work", "memory": "MiB"}
 
 
-@verb(
-    {
-        "graph": (
-            "graph of places and moves: GraphML, node-link JSON, or a JSON list of edges such as "
-            '{"source": "hall", "action": "east", "target": "kitchen"}'
-        ),
-        "--set most K=20": "list at most K smallest repairs",
-        "--set without NAMES": (
-            "axioms to leave out, separated by commas, such as ordered for a maze in which going "
-            "north leads around to where you began",
-            {"default": ""},
-        ),
-        **shared.limits("the best answer so far", work=True),
-        **shared.STRICT,
-        **shared.JSON,
-    }
-)
+@verb({"without": {"default": ""}}, limits=shared.limits("the best answer so far", work=True))
 def run_repair(options: argparse.Namespace) -> int:
     """Find the wrong edges of a graph that contradicts itself.
 

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, maps_path
+from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, maps_path, rows_of
 from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS, load_corrections
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
@@ -36,18 +36,6 @@ WRITTEN = ("output", "joint_trace")
 ENDINGS = re.compile(
     r"\.(bag|mcap|log|clf|html?|png|pdf|svg|jsonl|ya?ml|geojson|osm|graphml|dot|gv)"
 )
-
-MAPS_SAID = (
-    "file of maps that solve -o wrote, a file of a single map, or a folder that the command "
-    "'map' wrote; - for standard input"
-)
-TRACE_SAID = "trace file (JSON Lines), or - for standard input"
-JSON: Rows = {"--json": "print the answer as JSON"}
-# One of the maps in a file.
-ONE_MAP: Rows = {"--map I=1": "the number of the map, from 1, or its id"}
-STRICT: Rows = {"--strict": "exit with code 10 if the answer is not proven to be the best"}
-MAP: Rows = {"--map I": "the number of the map, from 1, or its id (default: 1)"}
-OUTPUT_TRACE: Rows = {"-o --output TRACE!": "trace file to write, or - for standard output"}
 
 
 def theory_rows(default: str = "topological") -> Rows:
@@ -145,7 +133,7 @@ def maps_and_trace(needs: str = "") -> Rows:
     """
     by = "map" if needs else "solve -o or map"
     return {
-        "maps": MAPS_SAID,
+        **rows_of("MAPS"),
         "[trace]": (
             f"trace file (JSON Lines){needs}, or - for standard input (default: the trace that "
             f"{by} wrote with the maps)"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import simulator
 from ssh_abduction.cli.parsing import verb
-from ssh_abduction.cli.shared import OUTPUT_TRACE, check_ending, write_trace
+from ssh_abduction.cli.shared import check_ending, write_trace
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named, printable
 from ssh_abduction.data.files import save_file, shipped, write_file
@@ -26,49 +26,7 @@ FORMATS = {".log": "carmen", ".clf": "carmen", ".bag": "bag", ".mcap": "bag"}
 SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").glob("*.json"))
 
 
-@verb(
-    {
-        "world": (
-            f"the world: {', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or "
-            "a floor plan (.xml)"
-        ),
-        "--format {carmen,bag}": (
-            "write a robot's log instead of a trace: a CARMEN log, or a ROS bag (.bag, .mcap, or "
-            "a folder) (default: as the ending of the file says)"
-        ),
-        "--tours N=1": "drive the route N times",
-        "--seed SEED=0": "random seed of all noise",
-        "--route ACTIONS": (
-            "drive this route instead of the world's own: actions (travel, right, left, around, or "
-            "the name of a lift) or, with --format, names of places, separated by commas"
-        ),
-        "--set stars true|false=true": "whether to log the openings seen at each place",
-        "--set every METRES": (
-            "log an image each time that the robot has driven this far, instead of an image at "
-            "each dstate; with --format, metres from one scan to the next (default: 0.25)"
-        ),
-        "--set start X,Y,DEGREES": (
-            "start here instead of at the world's own start: x and y in metres, and the heading "
-            "in degrees counterclockwise from the x axis"
-        ),
-        "--set reach METRES": (
-            "half the width of a corridor: the distance that the robot keeps from a wall that it "
-            "follows (default: the world's own)"
-        ),
-        "--set odometry_noise SHARE": (
-            "standard deviation of the odometry, as a share of each motion (default: 0.02); with "
-            "--format, standard deviation in metres after one metre (default: 0.05); the errors "
-            "of headings grow with it"
-        ),
-        "--set scale_error SHARE=0": (
-            "the odometry reports distances that are too long by this share"
-        ),
-        "--set bend_error DEGREES=0": (
-            "drift of the reported heading to the left, in degrees per metre"
-        ),
-        **OUTPUT_TRACE,
-    }
-)
+@verb()
 def run_simulate(options: argparse.Namespace) -> int:
     """Drive a robot through a world.
 
@@ -170,7 +128,7 @@ def scans_of(drive: RecordedDrive) -> Iterator[Scan]:
         yield Scan(ranges, laser, tuple(odometry), tuple(pose), time, line)
 
 
-@verb({"-o --output FOLDER=examples": "folder to write"})
+@verb()
 def run_examples(options: argparse.Namespace) -> int:
     """Copy the examples into a folder.
 

@@ -42,44 +42,25 @@ HELD_DSTATES = 500_000
 
 
 @verb(
-    {
-        "traces trace...": shared.TRACE_SAID,
-        **shared.max_maps("maps"),
-        "--json": "print the solution as JSON; for many traces, one line each",
-        "--together": "the traces are drives through one building: find their joint maps",
-        "-o --output FILE": "also write the solution to this file, as JSON",
-        "--onto MAPS": (
-            "add the trace to the first map in this file, which solve -o wrote, and keep its "
-            "dstates and places; takes about as long as solving the new trace alone"
-        ),
-        "--corrections FILE": (
-            "obey the names and corrections in this file, or in corrections.yaml of this folder "
-            "(default: corrections.yaml in the folder of the file of --output or, if there is "
-            "none, of --onto)"
-        ),
-        **shared.limits("the best answer so far", work=True),
-        **shared.STRICT,
-        **shared.many(
-            "solve",
-            "traces",
-            "With several traces, or with one of these options, each result is one line, in the "
-            "order of the traces. If a trace fails, its line says why, and the others are still "
-            "solved. The exit code is 1 if there was an error, else the highest code of the "
-            "traces. Limits hold for each trace. The memory limit is for the whole process: it "
-            "includes other threads of a Dask worker and, except on Linux, earlier traces.",
-        ),
-        **shared.theory_rows(),
-        "--set within K=0": (
-            "also list maps with up to K dstates more than the minimum; for each number of "
-            "dstates, only the best maps. With displacements, K is in nats"
-        ),
-        "--set joint_trace FILE": "with --together: also write the joint trace to this file",
+    max_maps=shared.max_maps("maps"),
+    limits=shared.limits("the best answer so far", work=True),
+    many=shared.many(
+        "solve",
+        "traces",
+        "With several traces, or with one of these options, each result is one line, in the "
+        "order of the traces. If a trace fails, its line says why, and the others are still "
+        "solved. The exit code is 1 if there was an error, else the highest code of the "
+        "traces. Limits hold for each trace. The memory limit is for the whole process: it "
+        "includes other threads of a Dask worker and, except on Linux, earlier traces.",
+    ),
+    theory_rows=shared.theory_rows(),
+    without_speedups={
         "--set without_speedups NAMES": (
             "speed-ups to turn off, separated by commas, to measure what they save. None of them "
             f"changes an answer: {', '.join(SPEEDUPS)}",
             {"default": ""},
-        ),
-    }
+        )
+    },
 )
 def run_solve(options: argparse.Namespace) -> int:
     """Find the minimal maps of a trace, or of many.

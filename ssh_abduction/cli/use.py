@@ -51,45 +51,11 @@ if TYPE_CHECKING:
 
 HEAD = ("step", "action", "seen", "", "dstate")
 NUMBERS = ("probability", "nowhere", "entropy", "normaliser")
-# For each chance, what has this probability.
-CHANCES = {
-    "misread": "at a step, the view or image does not fit the dstate where the robot is (default: "
-    "0.01)",
-    "slipped": "an action fails, or the robot is kidnapped during it (default: 0.01)",
-    "unmapped": "the robot is outside the map at the start, after a slip, or after an action for "
-    "which the map has no link (default: 0.1)",
-    "reentered": "a robot outside the map is back on it after its next action (default: 0.1)",
-}
+CHANCES = ("misread", "slipped", "unmapped", "reentered")
 NOWHERE = "–"
 
 
-@verb(
-    {
-        "maps": shared.MAPS_SAID,
-        "other": (
-            "trace of another drive there, with the same names of views and actions; - for "
-            "standard input; or a folder that the command 'map' wrote",
-            {"type": trace_path},
-        ),
-        **shared.MAP,
-        "--trace TRACE": (
-            "the trace that was mapped; its steps tell which stars were seen at each dstate, and "
-            "how reliable views and links are (default: the trace that solve -o or map wrote with "
-            "the maps)"
-        ),
-        "--recogniser FILE.skops": (
-            "recogniser that train wrote for this map, to use images instead of views (default: "
-            "in a folder that map wrote, one for the images of its trace)"
-        ),
-        **{f"--set {name} P": f"the probability that {said}" for name, said in CHANCES.items()},
-        "--set zero_one true|false=false": (
-            "whether views and actions never fail: the defaults of misread, slipped and unmapped "
-            "are then 0, and that of reentered is 1"
-        ),
-        "--plot PNG": "draw into this file how unsure the belief is at each step",
-        **shared.JSON,
-    }
-)
+@verb({"other": {"type": trace_path}})
 def run_localise(options: argparse.Namespace) -> int:
     """Follow a robot in a known map.
 
@@ -179,34 +145,7 @@ def _found(belief: Mapping[str, Any], ssh_map: SSHMap) -> list[object]:
     return [*cells, *shares, f"{belief['entropy']:.2f}", f"{belief['normaliser']:.3g}"]
 
 
-@verb(
-    {
-        "maps": shared.MAPS_SAID,
-        "--from A": (
-            "start: a dstate such as d7, a step such as monday:12, or a place, region, corridor, "
-            "room, door or path by number or name, such as p3, room2 or kitchen (default: the "
-            "robot's last dstate)",
-            {"dest": "start"},
-        ),
-        "--to B!": ("goal: a dstate, place or room, named as for --from", {"dest": "goal"}),
-        "--avoid X...": "what the route must not visit, named as for --from",
-        "--by {actions,places,metres}": (
-            "what to minimise. With actions or metres, a route uses only moves that the robot has "
-            "made. With places, it may also follow any path of the map, and drive back where the "
-            "robot came from (default: actions if such moves lead there, else places)"
-        ),
-        "--words": (
-            "tell the shortest way in words: distances, turns, doors, and counted openings; needs "
-            "the trace of the map"
-        ),
-        "--trace TRACE": (
-            "with --words, the trace that was mapped (default: the trace that solve -o or map "
-            "wrote with the maps)"
-        ),
-        **shared.ONE_MAP,
-        **shared.JSON,
-    }
-)
+@verb({"--from": {"dest": "start"}, "--to": {"dest": "goal"}})
 def run_route(options: argparse.Namespace) -> int:
     """Find the actions that lead to a place.
 
@@ -308,20 +247,7 @@ def _names(words: list[str] | None, given: Collection[str]) -> list[str]:
     ]
 
 
-@verb(
-    {
-        "maps": shared.MAPS_SAID,
-        "--map I": "show only the map with this number, from 1, or this id (default: all)",
-        "--paths": (
-            "show only the paths, corridors, doors and rooms of one map (the first, unless --map "
-            "names another). If the file lacks them, they are derived from the trace"
-        ),
-        "--trace TRACE": (
-            "with --paths, the trace that was mapped (default: the trace that solve -o or map "
-            "wrote with the maps)"
-        ),
-    }
-)
+@verb()
 def run_show(options: argparse.Namespace) -> int:
     """Print the dstates, places, paths and links of maps.
 
@@ -385,41 +311,7 @@ FORMATS = {
 }
 
 
-@verb(
-    {
-        "maps": shared.MAPS_SAID,
-        f"--to {{{','.join(FORMATS)}}}!": (
-            "the format to write: nav2 and tmap2 are for programs that drive a robot, osm has the "
-            "rooms and doors of a robot's log, svg is a picture, rerun is a recording of a log for "
-            "the viewer of that name, and the others are graphs"
-        ),
-        **shared.ONE_MAP,
-        "--trace TRACE": (
-            "the trace that was mapped; its turns give a better layout of a map without poses, and "
-            "osm needs it for maps without rooms"
-        ),
-        "-o --output FILE": ("file to write (default: standard output)", {"default": "-"}),
-        "--set level {places,dstates}": (
-            "what a node is: a place or a dstate (default: places for nav2 and tmap2 if the map "
-            "has places, else dstates)"
-        ),
-        "--set hide_undecided true|false=false": (
-            "whether to leave out each place that the robot only passed, always between the same "
-            "two neighbours (nav2 and tmap2 only)"
-        ),
-        "--set name TEXT=ssh-abduction": "the name of the map in nav2 and tmap2 files",
-        "--set frame TEXT=map": "the name of the coordinate frame in nav2 and tmap2 files",
-        "--frame-of CSV": (
-            "put the map into the frame of the poses in this file: lines place,x,y or step,x,y or "
-            "time,x,y, each perhaps with yaw in radians, or map_x,map_y,x,y, as the page writes "
-            "them. How far the points are off is printed"
-        ),
-        "--origin X,Y,DEGREES": (
-            "put the map into another frame, in which its first dstate has this pose",
-            {"type": pose},
-        ),
-    }
-)
+@verb({"-o": {"default": "-"}, "--origin": {"type": pose}})
 def run_export(options: argparse.Namespace) -> int:
     """Write a map for Nav2, tmap2, OpenStreetMap, GraphML, DOT, networkx or rerun.
 
@@ -507,29 +399,7 @@ def write_frame(maps: str, points: Sequence[Sequence[float]]) -> str:
     )
 
 
-@verb(
-    {
-        "maps": shared.MAPS_SAID,
-        "[trace]": (
-            "the trace that was mapped; adds actions and laser images, and is needed for --serve "
-            "(default: the trace in the folder of the maps, if map wrote it, or in the file of "
-            "maps, if solve -o wrote it)"
-        ),
-        "-o --output FILE": "write the page to this file and do not open it",
-        "--run TRACE": (
-            "a second trace from the mapped world. The page replays it, with a belief about where "
-            "the robot is at each step. It may be the trace that was mapped"
-        ),
-        "--serve": (
-            "serve the page, on this computer only, so that it can explain why two steps are one "
-            "dstate or not, and solve again with assumptions; needs the trace. Ctrl-C ends the "
-            "server"
-        ),
-        "--time-limit S=30": "with --serve, seconds for each answer",
-        "--set port N": ("with --serve, the port (default: any free port)", {"default": "0"}),
-        "--set open true|false=true": "whether to open the page in the browser",
-    }
-)
+@verb({"port": {"default": "0"}})
 def run_view(options: argparse.Namespace) -> int:
     """See rival maps in the browser.
 
