@@ -25,8 +25,9 @@ from scipy.spatial.distance import cdist
 
 from perception.places.passages import resampled
 from ssh_abduction import Solution, SSHMap, Trace
-from ssh_abduction.building.edges import edges_of
+from ssh_abduction.building.edges import grouped, laid_course
 from ssh_abduction.evaluation import told_poses
+from ssh_abduction.output.roads import place_of_steps
 
 Array = NDArray[np.float64]
 # Two visits are at one place if their middles are within ONE metres. Within SURE metres, no
@@ -65,6 +66,20 @@ def counts_of(trace: Trace, ssh_map: SSHMap | None, poses: Array) -> dict[str, A
     edges = edges_of(trace, ssh_map) if ssh_map is not None and ssh_map.places else {}
     travels = [edges.get(after - 1) for after in starts[1:]]
     return counted(poses, middles, scans, radii, places, travels)
+
+
+def edges_of(trace: Trace, ssh_map: SSHMap) -> dict[int, int]:
+    """Return the edge of each travel, by the step at which the travel begins.
+
+    Edges are numbered by first use. Travels of a log have a `course`. Others count as straight.
+    """
+    places = place_of_steps(ssh_map)
+    travels = {
+        t: (places[t], places[t + 1], laid_course(trace, ssh_map, t))
+        for t, action in enumerate(trace.actions)
+        if action.kind == "travel" and places[t] is not None and places[t + 1] is not None
+    }
+    return dict(zip(travels, grouped(travels.values()), strict=True))
 
 
 def counted(

@@ -20,8 +20,9 @@ from collections.abc import Hashable, Mapping, Sequence
 from itertools import combinations, pairwise
 from typing import Any
 
+from courses import edges_of
+
 from ssh_abduction import SSHMap, Trace
-from ssh_abduction.building.edges import edges_of
 
 # The middles of the halves of a double door are less than this many metres apart.
 HALF = 1.5

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from courses import frechet
+from courses import edges_of, frechet
 
 from perception.places.passages import resampled
 from ssh_abduction import Trace
-from ssh_abduction.building.edges import edges_of
 from ssh_abduction.data import Action, DState, Step
 from ssh_abduction.data.map_parts import Fit, Pose
 from ssh_abduction.data.maps import SSHMap

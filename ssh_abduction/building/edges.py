@@ -42,20 +42,6 @@ APART = 1.5
 HEADING, CHORD = 0.2, 0.3
 
 
-def edges_of(trace: Trace, ssh_map: SSHMap) -> dict[int, int]:
-    """Return the edge of each travel, by the step at which the travel begins.
-
-    Edges are numbered by first use. Travels of a log have a `course`. Others count as straight.
-    """
-    places = place_of_steps(ssh_map)
-    travels = {
-        t: (places[t], places[t + 1], laid_course(trace, ssh_map, t))
-        for t, action in enumerate(trace.actions)
-        if action.kind == "travel" and places[t] is not None and places[t + 1] is not None
-    }
-    return dict(zip(travels, grouped(travels.values()), strict=True))
-
-
 def grouped(travels: Iterable[tuple[Any, Any, Array]]) -> list[int]:
     """Number the edges of travels, each given by its first and last place and its course.
 

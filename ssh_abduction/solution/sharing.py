@@ -249,18 +249,6 @@ class Sharing:
         for kept in self._kept.values():
             kept.split([before for before, _ in number])
 
-    def firsts(self) -> list[int]:
-        """List the first step of each class, in the order of the numbers of classes."""
-        return list(first_index_of(self.classes).values())
-
-    def sorts(self) -> Iterable[Sort]:
-        """Return the sorts that are compared, such as "dstates"; none before the first map."""
-        return self._kept
-
-    def kept(self, sort: Sort) -> Kept:
-        """For one sort, such as places, return which classes are one in all or in some maps."""
-        return self._kept[sort]
-
     def backbone(self, *, proven: bool) -> Backbone:
         """Make the backbone of the maps so far. `proven`: it holds for all minimal maps."""
         found = {sort: self._shared(kept) for sort, kept in self._kept.items()}
