@@ -424,7 +424,7 @@ def test_explain_prints_that_the_time_limit_ended_it(
     assert "undecided within 0.05 s; --time-limit gives it more time" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         main(["explain", "--help"])
-    assert "(default: 60; inf for no limit)" in " ".join(capsys.readouterr().out.split())
+    assert "inf for no limit (default: 60)" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(

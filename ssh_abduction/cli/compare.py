@@ -165,11 +165,7 @@ SHOWN_LINES = 40  # of a plan; --json prints all
 EXIT_NOTHING = 30  # the exit code if a limit ended the search without a plan
 
 
-@verb(
-    maps_and_trace=shared.maps_and_trace(),
-    limits=shared.limits("the best plan so far"),
-    theory_rows=shared.theory_rows("the theory in the file of maps"),
-)
+@verb(theory_rows=shared.theory_rows("the theory in the file of maps"))
 def run_next(options: argparse.Namespace) -> int:
     """Find the actions after which rival maps disagree.
 
@@ -271,7 +267,7 @@ THINGS = ("dstates", "places", "paths")
 HEAD = ("map", "isomorphic", *THINGS, "accuracy", "same place", "edges", "links")
 
 
-@verb(maps_and_trace=shared.maps_and_trace(" with truth"))
+@verb()
 def run_evaluate(options: argparse.Namespace) -> int:
     """Compare maps with the truth.
 

@@ -166,10 +166,7 @@ class _Judgement:
             self.holds &= fewest >= total
 
 
-@verb(
-    maps_and_trace=shared.maps_and_trace(),
-    theory_rows=shared.theory_rows("the theory of the maps, or topological"),
-)
+@verb(theory_rows=shared.theory_rows("the theory of the maps, or topological"))
 def run_check(options: argparse.Namespace) -> int:
     """Judge maps by the axioms.
 
@@ -345,15 +342,11 @@ def _is_near(said: Any, right: Any) -> bool:
 
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
-SECONDS = 60.0  # the default time limit: joint maps with changes may need hours for a proof
-
 Answer: TypeAlias = PairExplanation | TraceExplanation | PlaceExplanation
 
 
 @verb(
     {"trace": {"type": str}, "steps": {"default": ()}},
-    max_maps=shared.max_maps("minimal maps, to count those in which the two steps are one dstate"),
-    limits=shared.limits("what is known", SECONDS),
     theory_rows=shared.theory_rows(),
 )
 def run_explain(options: argparse.Namespace) -> int:

@@ -162,7 +162,7 @@ def true_dstate_names(traces: Sequence[Trace]) -> list[str] | None:
     return [str(name) for name in found] if all(name is not None for name in found) else None
 
 
-@verb(maps_and_trace=shared.maps_and_trace(" with images"))
+@verb()
 def run_train(options: argparse.Namespace) -> int:
     """Train a recogniser on the labels of a map.
 

@@ -270,8 +270,6 @@ class MapQuestion(jobs.FileQuestion):
 
 
 @verb(
-    max_maps=shared.max_maps("minimal maps", 300),
-    many=shared.many("map", "logs"),
     READING=import_log.READING,
     theory_rows=shared.theory_rows(
         "topological, but without the axioms of stars, sides and paths, as logs do not show "

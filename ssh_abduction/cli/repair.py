@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 
-from ssh_abduction.cli import shared
 from ssh_abduction.cli.outcome import EXIT_UNPROVEN, Guard, on_ctrl_c
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted
@@ -17,7 +16,7 @@ from ssh_abduction.runtime.program import interrupted_code
 LIMITS = {"time": "seconds", "work": "units of work", "memory": "MiB"}
 
 
-@verb({"without": {"default": ""}}, limits=shared.limits("the best answer so far", work=True))
+@verb({"without": {"default": ""}})
 def run_repair(options: argparse.Namespace) -> int:
     """Find the wrong edges of a graph that contradicts itself.
 

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, maps_path, rows_of
+from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, maps_path
 from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS, load_corrections
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
@@ -85,62 +85,6 @@ def helps() -> dict[str, str]:
     return {**{name: text[0].lower() + text[1:] for name, text in words.items()}, "rules": rules}
 
 
-def limits(printed: str, seconds: float | None = None, work: bool = False) -> Rows:
-    """Make the rows that limit a search. The command prints `printed` at a limit.
-
-    `seconds` is the default time limit; None for no limit. `work` says whether work can be limited.
-    """
-    default = "" if seconds is None else f" (default: {seconds:g}; inf for no limit)"
-    said = (
-        "stop after W units of work, each about a second of a quiet core; the same answer on "
-        "each machine and under each load"
-    )
-    return {
-        "--time-limit S": (
-            f"stop after S seconds and print {printed}{default}",
-            {"default": seconds},
-        ),
-        **({"--work-limit W": said} if work else {}),
-        "--memory-limit MIB": f"stop when the process has used this many MiB, and print {printed}",
-    }
-
-
-def max_maps(listed: str, default: int = 100) -> Rows:
-    """Make the row that limits how many maps are listed. The help calls them `listed`."""
-    return {f"-n --maps K={default}": f"list at most K {listed}; 0 for all"}
-
-
-def many(act: str, things: str, said: str = "") -> Rows:
-    """Make the rows that spread work on processes or a cluster, such as "solve" of "traces"."""
-    return {
-        f"# many {things}": said,
-        "--jobs N": (
-            f"{act} N {things} at a time, each in its own process; -1 for one per core (default: "
-            "1; with --scheduler, two per core of its workers)"
-        ),
-        "--scheduler ADDRESS": (
-            f"{act} on the workers of the Dask scheduler at this address, tcp://host:port"
-        ),
-    }
-
-
-def maps_and_trace(needs: str = "") -> Rows:
-    """Make the rows `maps` and `trace`. If the user names no trace, the one beside the maps counts.
-
-    `needs` says in the help what the trace must have, such as " with images". The copy of the trace
-    in a file of maps has no images and no truth, so such a verb calls `trace_of`. If `needs` is
-    empty, the copy suffices, and the verb calls `solved_trace`.
-    """
-    by = "map" if needs else "solve -o or map"
-    return {
-        **rows_of("MAPS"),
-        "[trace]": (
-            f"trace file (JSON Lines){needs}, or - for standard input (default: the trace that "
-            f"{by} wrote with the maps)"
-        ),
-    }
-
-
 def check_output(target: str, what: str) -> None:
     """Raise AbductionError before long work if a file cannot be written into its folder."""
     folder, path = Path(target).absolute().parent, Path(target)
@@ -202,7 +146,7 @@ def write_trace(trace: Trace, target: str, said: str) -> None:
 
 
 def trace_of(options: argparse.Namespace) -> str:
-    """Return the trace file of a verb with `maps_and_trace`.
+    """Return the trace file of a verb whose trace may stand beside its maps.
 
     Raises AbductionError if there is no trace, or the file of maps cannot be read.
     """

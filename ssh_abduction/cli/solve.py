@@ -42,17 +42,6 @@ HELD_DSTATES = 500_000
 
 
 @verb(
-    max_maps=shared.max_maps("maps"),
-    limits=shared.limits("the best answer so far", work=True),
-    many=shared.many(
-        "solve",
-        "traces",
-        "With several traces, or with one of these options, each result is one line, in the "
-        "order of the traces. If a trace fails, its line says why, and the others are still "
-        "solved. The exit code is 1 if there was an error, else the highest code of the "
-        "traces. Limits hold for each trace. The memory limit is for the whole process: it "
-        "includes other threads of a Dask worker and, except on Linux, earlier traces.",
-    ),
     theory_rows=shared.theory_rows(),
     without_speedups={
         "--set without_speedups NAMES": (
