@@ -474,8 +474,8 @@ class Run:
 
     # The trace of the robot. It may be the trace that was mapped.
     trace: Trace
-    # A function that takes a map and returns the belief at each step, as Belief objects or as dicts
-    # from `Belief.to_dict`. It returns None for a map in which the robot was not localised.
+    # A function that takes a map and returns the belief at each step, as Belief objects. It
+    # returns None for a map in which the robot was not localised.
     beliefs: Callable[[SSHMap], Iterable[Any] | None] = field(repr=False)
 
 
@@ -535,8 +535,8 @@ def _step(step: Step, view: str) -> dict[str, Any]:
 def _beliefs(maps: Sequence[SSHMap], labelings: Sequence[int], run: Run) -> dict[str, Any]:
     """Compute the beliefs of a run in the maps, by labeling, as far as there is time.
 
-    Maps with the same labeling have the same links, and therefore the same beliefs. Malformed
-    beliefs raise MapError.
+    Maps with the same labeling have the same links, and therefore the same beliefs. Raises MapError
+    if there is not one for each step.
     """
     found: dict[str, Any] = {}
     end = time.process_time() + BELIEVING
@@ -548,32 +548,19 @@ def _beliefs(maps: Sequence[SSHMap], labelings: Sequence[int], run: Run) -> dict
         beliefs = run.beliefs(ssh_map)
         if beliefs is None:
             continue
-        listed = [belief if isinstance(belief, dict) else belief.to_dict() for belief in beliefs]
+        found[str(labeling)] = listed = [*map(_belief, beliefs)]
         if len(listed) != len(run.trace):
             raise MapError(
                 f"beliefs: expected {len(run.trace)}, one for each step of the run, "
                 f"got {len(listed)}; localise this run"
             )
-        found[str(labeling)] = [_belief(belief, len(ssh_map.dstates)) for belief in listed]
     return found
 
 
-def _belief(belief: dict[str, Any], count: int) -> list[Any]:
-    """Check and shorten a belief to [verdict, nowhere, [[dstate, probability], …]]."""
-    try:
-        likely = sorted(
-            ((int(s), float(p)) for s, p in belief["probabilities"]), key=lambda pair: -pair[1]
-        )
-        verdict, nowhere = str(belief["verdict"]), float(belief["nowhere"])
-        if not all(0 <= s < count and 0 <= p <= 1 for s, p in likely) or not 0 <= nowhere <= 1:
-            raise ValueError
-    except (KeyError, TypeError, ValueError):
-        raise MapError(
-            f"beliefs: expected verdict, nowhere and probabilities of dstates 0 to {count - 1}, as "
-            f"localise --json prints them, got something else; run localise with these maps"
-        ) from None
-    shown = [[s, round(p, 3)] for s, p in likely[:BELIEVED] if p >= LEAST]
-    return [verdict, round(nowhere, 3), shown]
+def _belief(belief: Any) -> list[Any]:
+    """Shorten a belief to [verdict, nowhere, [[dstate, probability], …]]."""
+    shown = [[s, round(p, 3)] for s, p in belief.above(LEAST)[:BELIEVED]]
+    return [belief.verdict.value, round(belief.nowhere, 3), shown]
 
 
 def beams_of(trace: Trace, count: int) -> tuple[float, float]:
