@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 from worlds import TOURS, drive, rectangle
 
+import simulator
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.cli import main, outcome, parser
 from ssh_abduction.cli.about import run_completion
+from ssh_abduction.cli.simulate import run_simulate
 from ssh_abduction.data import Odometry
 from ssh_abduction.runtime.loggers import PROGRESS, begin_stage, log_progress, stages
 
@@ -296,6 +298,11 @@ def test_completion_scripts_have_every_verb_and_option(
     for verb in VERBS:
         assert verb in out
     assert "time-limit" in out
+
+
+def test_help_names_the_shipped_worlds() -> None:
+    worlds = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").glob("*.json"))
+    assert ", ".join(worlds) in run_simulate.rows["world"]
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash")

@@ -10,7 +10,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import simulator
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.shared import check_ending, write_trace
 from ssh_abduction.cli.text import counted
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
 
 # The formats of logs, by the ending of a file.
 FORMATS = {".log": "carmen", ".clf": "carmen", ".bag": "bag", ".mcap": "bag"}
-SHIPPED = sorted(path.stem for path in (Path(simulator.__path__[0]) / "worlds").glob("*.json"))
 
 
 @verb()
