@@ -361,8 +361,8 @@ def test_demo_maps_a_simulated_drive_and_opens_it(
 ) -> None:
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", opened.append)
-    monkeypatch.setattr("ssh_abduction.cli.demo.WORLD", "triangle")
-    monkeypatch.setattr("ssh_abduction.cli.demo.WORK", 1)
+    monkeypatch.setattr("ssh_abduction.cli.simulate.WORLD", "triangle")
+    monkeypatch.setattr("ssh_abduction.cli.simulate.WORK", 1)
     assert main(["demo", "-o", str(tmp_path)]) == 0
     page = tmp_path / "house" / "page.html"
     assert opened == [page.as_uri()]

@@ -29,7 +29,6 @@ from ssh_abduction.cli import (
     about,
     compare,
     correct,
-    demo,
     import_log,
     judge,
     learn,
@@ -90,7 +89,7 @@ VERBS: Mapping[str, tuple[Verb, ...]] = {
     "make: simulated robots and the paper's experiments": (
         simulate.run_simulate,
         simulate.run_examples,
-        demo.run_demo,
+        simulate.run_demo,
     ),
     "about: the axioms, their input, and your shell": (
         about.run_theory,

@@ -1,15 +1,17 @@
-"""ssh-abduction simulate and examples: simulated robots, and the examples of the package."""
+"""ssh-abduction simulate, examples and demo: simulated robots, and the package's examples."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
+import webbrowser
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ssh_abduction.cli.outcome import EXIT_UNPROVEN
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.shared import check_ending, write_trace
 from ssh_abduction.cli.text import counted
@@ -22,6 +24,10 @@ if TYPE_CHECKING:
 
 # The formats of logs, by the ending of a file.
 FORMATS = {".log": "carmen", ".clf": "carmen", ".bag": "bag", ".mcap": "bag"}
+# The world of the demo, a corridor with rooms, and units of work for the search. They suffice for a
+# good map, and a demo is short.
+WORLD = "doors"
+WORK = 5
 
 
 @verb()
@@ -150,4 +156,31 @@ def run_examples(options: argparse.Namespace) -> int:
         write_file(path, data)
     listed = ", ".join(path.name for path in examples)
     print(f"{counted(len(examples), 'examples')} in {named(folder)}: {listed}")
+    return 0
+
+
+@verb()
+def run_demo(options: argparse.Namespace) -> int:
+    """Simulate a drive, map it, and open the map.
+
+    A robot with a laser drives through a simulated building. Its log becomes a map, and the page of
+    the map opens in the browser. The commands are printed, to be tried with your own log.
+    """
+    from ssh_abduction.cli import parser
+
+    folder = Path(options.output)
+    log, house = folder / "drive.log", folder / "house"
+    folder.mkdir(parents=True, exist_ok=True)
+    for words in (
+        ["simulate", WORLD, "-o", str(log), "--set", "every=0.5"],
+        ["map", str(log), "-o", str(house), "--work-limit", str(WORK)],
+    ):
+        print(f"$ ssh-abduction {' '.join(words)}", flush=True)
+        chosen = parser().parse_args(words)
+        if (code := int(chosen.act(chosen))) not in (0, EXIT_UNPROVEN):
+            return code
+    page = (house / "page.html").absolute()
+    print(f"the map: {named(page)}\nnext, try: ssh-abduction show {named(house)} --paths")
+    if options.open:
+        webbrowser.open(page.as_uri())
     return 0
