@@ -68,7 +68,7 @@ SEVERAL = {
     "ssh_abduction/cli/judge.py": ("check", "explain"),
     "ssh_abduction/cli/learn.py": ("cluster", "train", "recognise"),
     "ssh_abduction/cli/use.py": ("localise", "route", "show", "export", "view"),
-    "ssh_abduction/cli/simulate.py": ("simulate", "examples"),
+    "ssh_abduction/cli/simulate.py": ("simulate", "examples", "show"),
 }
 OPTION = re.compile(r"(?:(?<![\w-])(\w[\w-]*) (?:with )?)?(?<![\w-])(--set [a-z_]+|--[a-z][a-z-]*)")
 FOREIGN = re.compile(
