@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, maps_path
+from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, maps_path, rows_of
 from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS, load_corrections
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
@@ -43,18 +43,9 @@ def theory_rows(default: str = "topological") -> Rows:
 
     `default` says in the help which theory is used if the user names none.
     """
-    rows: dict[str, str | tuple[str, Mapping[str, Any]]] = {
-        "# theory": (
-            "The axioms that maps must satisfy: a preset or a file, and changes to it. I and J are "
-            "numbers of steps, from 0; in a joint trace, also DRIVE:STEP, such as monday:12. Each "
-            "option but --theory may be given again."
-        ),
-        "--theory PRESET|FILE": (
-            f"a preset: {', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file "
-            f"of maps or a folder that the command 'map' wrote, to use the theory of its maps "
-            f"(default: {default})"
-        ),
-    }
+    rows: dict[str, str | tuple[str, Mapping[str, Any]]] = {**rows_of("THEORY")}
+    said = str(rows["--theory PRESET|FILE"])
+    rows["--theory PRESET|FILE"] = said.format(presets=", ".join(PRESETS), default=default)
     for name, text in ASSERTED.items():
         said = f"assume that steps I and J {text}"
         rows[f"--{name.replace('_', '-')} I,J"] = said, {"action": "append"}
