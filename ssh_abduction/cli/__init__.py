@@ -49,7 +49,7 @@ from ssh_abduction.cli.outcome import (
     unwritten,
     warn,
 )
-from ssh_abduction.cli.parsing import Parser, Verb
+from ssh_abduction.cli.parsing import Parser, Verb, rows_of
 from ssh_abduction.cli.shared import check_inputs_are_kept
 from ssh_abduction.data.errors import AbductionError, printable
 from ssh_abduction.data.files import json_line
@@ -97,15 +97,6 @@ VERBS: Mapping[str, tuple[Verb, ...]] = {
         about.run_completion,
     ),
 }
-WORDS = (
-    "A trace lists the steps of a drive. Each step has a view (the class of the image there), the "
-    "action that came next, and perhaps a star (the gateways seen around the robot) and a "
-    "displacement by odometry. A dstate (distinctive state) is a place and a heading. A map has "
-    "dstates, their places, the paths through the places, and links: actions that lead from one "
-    "dstate to another. A theory is the set of axioms that maps must satisfy. A map is minimal if "
-    "no other map of the trace has fewer dstates (or costs less). docs/reference/glossary.md "
-    "explains all words."
-)
 SEE_WORDS = "Words such as dstate are explained by: ssh-abduction --help"
 
 
@@ -115,11 +106,7 @@ def parser() -> Parser:
     top = Parser(
         prog="ssh-abduction",
         description="Find the topological maps that explain what a robot saw and did.",
-        epilog=(
-            f"Words: {WORDS}\n\nExit codes: 0 success; 1 error; 2 wrong usage; 10 with "
-            "--strict, a map or plan that is not proven best; 20 no map exists, or a map breaks "
-            "an axiom; 30 no map in time; 130 interrupted; 143 ended by SIGTERM."
-        ),
+        epilog="\n\n".join(f"{form[2:]}: {said}" for form, said in rows_of("program").items()),
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
     said = "one of the verbs below; ssh-abduction VERB --help describes it"
