@@ -371,6 +371,7 @@ def _units_of(log: RobotLog, tell: Teller) -> log_checks.Units:
     """Recognise the units of the odometry of the first scans of a drive. Raises LogError."""
     log_checks.refuse_lengths(log)
     log_checks.refuse_shuffled(log)
+    log_checks.refuse_mixed(log)
     if odometers.keep_one_source(log)[1]:
         raise LogError(
             f"{named(log.source)}: expected odometry of one source, got poses of several sources "
