@@ -45,11 +45,9 @@ from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.runtime.loggers import log_progress
 
-# Longer beams are not matched, in metres, since neighbouring beams are too far apart to show a
-# wall.
+# Longer beams are not matched, in metres: their neighbours are too far apart to show a wall.
 FARTHEST = 25.0
-# Standard deviation in metres of the distance from a point to its wall: noise of the laser and
-# unevenness of walls.
+# Standard deviation in metres of points from their wall: noise, and unevenness of the wall.
 ROUGHNESS = 0.05
 # Fewer points of a scan do not show whether the robot is where it seems to be.
 FEW_POINTS = 20
@@ -378,11 +376,8 @@ class ScanMotion:
                 if len(self.seen) >= FEW_POINTS:
                     tried = (guess + np.array([0, 0, turn]) for turn in turns if abs(turn) <= most)
                     turned = [fit.improved(start, weight) for start in tried]
-                    # Matches that ended beyond `most` have to stand without the odometry.
                     beyond = [abs(wrapped(pose[2] - guess[2])) > most for _, pose, _ in turned]
-                    turned = [
-                        m for m, far in zip(turned, beyond, strict=True) if m[0] >= WELL * far
-                    ]
+                    turned = [m for m, b in zip(turned, beyond, strict=True) if m[0] >= WELL * b]
 
                 def gain(match: tuple[float, Array, Array]) -> float:
                     loss = min(_square(match[1], guess, weight) / 2, MISSED)
