@@ -207,6 +207,16 @@ def test_folder_that_cannot_be_written_is_told_once(
     assert "cannot be written" in line
 
 
+def test_replay_keeps_the_folder_of_another_program(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "maps.json").write_text("{}")
+    call = ["live", "--replay", str(tmp_path / "a.log"), "--save", str(tmp_path)]
+    assert main(call) == 2
+    assert "got maps.json, which is not of map" in capsys.readouterr().err
+    assert (tmp_path / "maps.json").read_text() == "{}"
+
+
 @pytest.mark.slow
 def test_replayed_log_is_mapped_and_goes_on(
     scans: tuple[Scan, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]

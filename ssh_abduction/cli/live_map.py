@@ -54,7 +54,7 @@ def run_live(options: argparse.Namespace) -> int:
     where = options.save if options.save is not None else options.onto
     folder = None if where is None else Path(where)
     if folder is not None and options.replay is not None:
-        import_log.check_folder(folder)
+        import_log.check_run_folder(folder)
     tell = lambda note: warn([note])  # noqa: E731
     mapper = OnlineLogMapper(options.width or import_log.WIDTH, tell)
     if options.onto is not None:
