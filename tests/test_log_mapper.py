@@ -212,7 +212,7 @@ def test_replay_keeps_the_folder_of_another_program(
 ) -> None:
     (tmp_path / "maps.json").write_text("{}")
     call = ["live", "--replay", str(tmp_path / "a.log"), "--save", str(tmp_path)]
-    assert main(call) == 2
+    assert main(call) == 1
     assert "got maps.json, which is not of map" in capsys.readouterr().err
     assert (tmp_path / "maps.json").read_text() == "{}"
 
