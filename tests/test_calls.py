@@ -163,7 +163,7 @@ RIGHT: dict[str, set[str]] = {
     **{f"Theory.{price}": {"3.5"} for price in ("misread", "slipped", "jumped", "changed")},
     **{f"{written}.save.path": {"nonsense"} for written in ("Page", "Solution", "SSHMap", "Trace")},
     "Trace.at.step": {"huge"},
-    "Trace.closures": {"list"},
+    "Trace.closures": EMPTY,
     "Trace.from_steps.views": {"[1, 2]"},
     "Trace.prefix.steps": {"huge"},
     "Trace.without_displacements_at.steps": {"array", "[1, 2]", *EMPTY},
