@@ -31,6 +31,7 @@ from table import OURS, WITHOUT
 
 from ssh_abduction import Solution, Theory, Trace
 from ssh_abduction.checker.checker import check
+from ssh_abduction.runtime import clock
 from ssh_abduction.solution import Status
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.asp import limits
@@ -56,9 +57,8 @@ def main() -> None:
     if options.clock == "cpu":
         now, timer = cpu_seconds, signal.ITIMER_PROF
         # A search reads these clocks.
-        vars(limits)["time"] = SimpleNamespace(
-            perf_counter=cpu_seconds, thread_time=time.thread_time
-        )
+        read = SimpleNamespace(perf_counter=cpu_seconds, thread_time=time.thread_time)
+        vars(clock)["time"] = vars(limits)["time"] = read
     instance = INSTANCES[options.instance]
     end_after(AROUND)
     for module in PEERS[tool].modules if tool in PEERS else ():

@@ -42,6 +42,7 @@ from fault_peers import PEERS
 from scipy.optimize import linear_sum_assignment
 
 from ssh_abduction import SSHMap, Theory
+from ssh_abduction.runtime import clock
 from ssh_abduction.solution import Progress, Status
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.asp import limits
@@ -169,9 +170,8 @@ def work(sender: Connection, name: str, solver: str, seed: int, limit: float, me
             )
         else:
             # A search reads these clocks.
-            vars(limits)["time"] = SimpleNamespace(
-                perf_counter=cpu_seconds, thread_time=time.thread_time
-            )
+            read = SimpleNamespace(perf_counter=cpu_seconds, thread_time=time.thread_time)
+            vars(clock)["time"] = vars(limits)["time"] = read
             end_after(limit + MARGIN, signal.ITIMER_PROF)
             search(
                 sender, case, theory_for(case, FAMILIES[name].theory, told=solver == TOLD), limit

@@ -217,13 +217,12 @@ def test_stored_run_has_all_fields_and_no_contradiction(path: Path) -> None:
 def stored(page: str, name: str) -> Path:
     """The stored run that a table of a page names as its source."""
     found = re.search(
-        rf"<!-- bench:begin {name} -->.*(benchmarks/results/[\w.-]+\.json)\).*<!-- bench:end "
-        rf"{name} -->",
+        rf"<!-- bench:begin {name} -->.*\((results/[\w.-]+\.json)\).*<!-- bench:end {name} -->",
         page,
         re.DOTALL,
     )
     assert found
-    return ROOT / found[1]
+    return ROOT / "benchmarks" / found[1]
 
 
 @pytest.mark.parametrize("name", readme.PAGES)
