@@ -132,7 +132,7 @@ def test_slopes_of_the_spreads_are_those_by_differences(off: float) -> None:
     problem = settle(truth.random_walk(3, 8, 5, noise).trace)
     misfit = Misfit(problem)
     steps, entries = range(len(problem.trace)), [2, 3, 4, 5, 2 * len({*misfit.visit}) + 3]
-    ((poses, _),) = misfit.explanations(steps, misfit.visit)
+    ((poses, _),) = misfit.bounding(steps, misfit.visit)
     best = poses.best[0]
     products = conditional(poses, entries)[1]
 
@@ -156,7 +156,7 @@ def test_without_a_displacement_the_bound_knows_no_covariance() -> None:
     last = [step for step in range(len(trace)) if trace.steps[step].displacement][-1]
     for one, holds in ((trace, True), (trace.without_displacements_at([last]), False)):
         misfit = Misfit(settle(one))
-        ((poses, _),) = misfit.explanations(range(len(one)), misfit.visit)
+        ((poses, _),) = misfit.bounding(range(len(one)), misfit.visit)
         assert may_be_joined(poses) is holds
 
 

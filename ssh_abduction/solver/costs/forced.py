@@ -7,7 +7,7 @@ without it costs T or more, then every map of a cost below T has the join, and F
 costs more, and fewer joins may follow. If the bound is T or more, then no map costs less than T.
 Only joins of the best known map are tried. If F gets no further join, assume that a map lacks a
 certain join, and find what all cheap maps without this join have. If no map without it costs less
-than T, F gets it.
+than T, F gets it. If this fails for single joins, assume that a map lacks two.
 
 *What a join may gain.* There are two bounds, and the greater one counts. For the first one, a join
 gains at most what a new place, or a new dstate, costs at its first step (`theory/prior.py`). The
@@ -69,7 +69,7 @@ NEAR = 0.9
 LISTED = 100
 # Keep the poses of the last KEPT sets of classes.
 KEPT = 8
-# After the lack of BRANCHES joins, one after the other, gave F none of them, assume no more lacks.
+# Give up if assuming the lack of a join added nothing to F, BRANCHES times in a row.
 BRANCHES = 3
 
 
@@ -98,7 +98,7 @@ class Forcing:
         self.joins = self.visits.joined(np.arange(len(self.visits.place)), [])
         self.low = 0.0
         # A map is bounded again if two of its classes are apart, or by its poses.
-        self._explanations = lru_cache(maxsize=KEPT)(lambda *of: tuple(misfit.explanations(*of)))
+        self._bounding = lru_cache(maxsize=KEPT)(misfit.bounding)
 
     @staticmethod
     def holds_for(problem: Problem) -> bool:
@@ -186,7 +186,7 @@ class Forcing:
             for of, some in enumerate(named)
         ]
         new = [prior.new[[steps[0] for steps in some], of] for of, some in enumerate(named)]
-        ways = self._explanations(tuple(classes.node.tolist()), tuple(classes.place.tolist()))
+        ways = self._bounding(tuple(classes.node.tolist()), tuple(classes.place.tolist()))
         for i, (poses, alias) in enumerate(ways):
             look_at_clock(LONG_TURN)
             seen = [some * (not i) for some in shown]

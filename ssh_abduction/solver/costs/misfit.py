@@ -79,19 +79,14 @@ class Misfit:
             self._known[groups] = self._explaining(groups).least()
         return self._known[groups]
 
-    def explanations(
+    def bounding(
         self, dstates: Sequence[int], places: Sequence[Hashable]
-    ) -> Iterator[tuple[Poses, float]]:
-        """Yield poses for lower bounds: all closures are true, or one at least is of an alias.
+    ) -> tuple[tuple[Poses, float], ...]:
+        """Return poses for lower bounds, as `Explaining.bounding`.
 
-        Also yield the nats that these closures cost at least. In the second case no closure is
-        used, and what dstates and places show may cost nothing.
+        If there may be an alias, what dstates and places show may cost nothing.
         """
-        explaining = self._explaining(_groups_of(dstates, places, ()))
-        n = len(self.trace.closures)
-        yield explaining.poses((0,) * n), 0.0
-        if n:
-            yield explaining.poses((0,) * n, ()), explaining.least_alias()
+        return self._explaining(_groups_of(dstates, places, ())).bounding()
 
     def of_closing(self, ssh_map: SSHMap) -> float:
         """Compute by how much the returns of a map of the whole trace raise its misfit."""

@@ -81,15 +81,18 @@ class Explaining:
 
     def least(self) -> float:
         """Return a lower bound on the chi-square and twice the cost of the aliases."""
-        n = self._closures
-        square = self.misfit((0,) * n)
-        if not n:
-            return square
-        return min(square, self.poses((0,) * n, ()).misfit() + 2 * self.least_alias())
+        return min(poses.misfit() + 2 * nats for poses, nats in self.bounding())
 
-    def least_alias(self) -> float:
-        """Return what an alias costs at least, in nats."""
-        return FAULT + float(self._free(self._closures).min())
+    def bounding(self) -> tuple[tuple[Poses, float], ...]:
+        """Return poses for lower bounds: all closures are true, or one at least is of an alias.
+
+        Also return the nats that the aliases cost at least. In the second case no closure is used.
+        """
+        n = self._closures
+        believed = self.poses((0,) * n), 0.0
+        if not n:
+            return (believed,)
+        return believed, (self.poses((0,) * n, ()), FAULT + float(self._free(n).min()))
 
     def misfit(self, aliases: Aliases) -> float:
         """Return the least chi-square with these aliases."""
