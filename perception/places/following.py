@@ -356,8 +356,8 @@ class ScanMotion:
         """Match a scan with the walls that previous scans saw.
 
         `onward` is the expected motion since the previous scan, `prior` its (3, 3) covariance. The
-        heading differs by at most about `most` radians. Returns the pose; the covariance of the
-        motion, in the frame of the robot at the previous scan; and the share of points on walls.
+        heading differs by at most `most` radians, unless the share WELL of the points is on walls.
+        Returns the pose, the covariance of the motion seen from the previous scan, and this share.
         """
         walls = Surfaces.joined(self.recent)
         guess: Array = np.array(moved(self.last, onward))
@@ -376,8 +376,8 @@ class ScanMotion:
                 if len(self.seen) >= FEW_POINTS:
                     tried = (guess + np.array([0, 0, turn]) for turn in turns if abs(turn) <= most)
                     turned = [fit.improved(start, weight) for start in tried]
-                    beyond = [abs(wrapped(pose[2] - guess[2])) > most for _, pose, _ in turned]
-                    turned = [m for m, b in zip(turned, beyond, strict=True) if m[0] >= WELL * b]
+                    ok = [m[0] >= WELL or abs(wrapped(m[1][2] - guess[2])) <= most for m in turned]
+                    turned = [m for m, good in zip(turned, ok, strict=True) if good]
 
                 def gain(match: tuple[float, Array, Array]) -> float:
                     loss = min(_square(match[1], guess, weight) / 2, MISSED)

@@ -16,7 +16,6 @@ import numpy as np
 from perception.errors import LogError
 from perception.places import odometers
 from perception.places.following import FAILING, contradicting_scans, follow, share_failing
-from perception.places.odometers import change_between
 from perception.places.track import Track, odometer_covariance, wrapped
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.errors import named
@@ -114,7 +113,7 @@ def refuse_mixed(log: RobotLog) -> None:
     some = np.unique(np.linspace(max(IN_TURN), len(log) - 1, MIXED_TRIED).astype(int)).tolist()
     mixed = 0
     for k in some:
-        last, *earlier = (change_between(log.scans[k - n], log.scans[k]) for n in IN_TURN)
+        last, *earlier = (odometers.change_between(log.scans[k - n], log.scans[k]) for n in IN_TURN)
         mixed += last > odometers.MOVED and min(earlier) < last / 2
     if mixed > MIXED * len(some):
         raise LogError(
