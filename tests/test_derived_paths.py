@@ -509,6 +509,11 @@ def test_routes_are_told_in_words() -> None:
         "turn right",
         "go 3 m on, through the door, 3 m on, to place 5 (kitchen)",
     )
+    at_corner = replace(found, names=(Name("place", 2, "fountain"), Name("place", 1, "desk")))
+    assert directions_to(at_corner, trace, [0], [5])[0] == (
+        "go 10 m along corridor 0, past a door on your left, past desk, "
+        "to the first opening on the right, at fountain"
+    )
     assert directions_to(named, trace, [0], [0, 3]) == (
         "there is nothing to do: the start is at the goal",
     )

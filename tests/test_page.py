@@ -669,7 +669,10 @@ def test_page_of_a_joint_map_shows_its_drives(browser: Any, tmp_path: Path) -> N
     browser.execute_script(write, "<b>tuesday</b>:1")
     assert page["verdict"].text.startswith("Steps monday:2 and <b>tuesday</b>:1: different")
     browser.execute_script(write, "<b>tuesday</b>:2")
-    assert page["verdict"].text == "There is no step <b>tuesday</b>:2: steps are 0 to 4."
+    said = "There is no step or place <b>tuesday</b>:2: steps are 0 to 4, a place is written as p4."
+    assert page["verdict"].text == said
+    browser.execute_script(write, "d1")
+    assert browser.execute_script("return [...state.picked]") == [1, 2]
     told = browser.execute_script("return stretches([1, 2, 3, 4])")
     assert told == "steps monday:1–2, <b>tuesday</b>:0–1"
     assert page.complaints == []

@@ -171,14 +171,20 @@ class Guide:
             anchor, count = (anchor if at is None else at), count + (at is not None)
         side = turn.split()[-1] if turn else None
         passed = [b for b in beside if first + ONE < b.metres < last - ONE]
+        seen = list[tuple[float, str]]()  # what the person passes, with its metres
         for one in ("left", "right"):
             doors = [b for b in passed if b.side == one and b.is_door]
             if doors and one != side:
                 word = COUNT[len(doors)] if len(doors) < len(COUNT) else str(len(doors))
-                said.append(f"past {word} door{'s' * (len(doors) > 1)} on your {one}")
-        inside = [p for p, at in route.places if begin < at < end]
-        names = [self._map.name_of("place", p) for p in inside if p >= 0]
-        said += [f"past {name}" for name in names if name]
+                text = f"past {word} door{'s' * (len(doors) > 1)} on your {one}"
+                seen.append((doors[0].metres, text))
+        # A place at a corner belongs to the leg that ends there.
+        after, corner = first + CLOSE * (begin > 0), last - CLOSE * bool(turn)
+        inside = [(float(route.metres[at]), p) for p, at in route.places[:-1] if p >= 0]
+        named = [(at, name) for at, p in inside if (name := self._map.name_of("place", p))]
+        seen += [(at, f"past {name}") for at, name in named if after < at < corner]
+        turning = [name for at, name in named if turn and abs(at - last) <= CLOSE and at > after]
+        said += [text for _, text in sorted(seen)]
         if turn is None:
             goal = route.places[-1][0]
             room = self._map.building.room_of(goal) if self._map.building else None
@@ -190,6 +196,7 @@ class Guide:
             count = sum(b.side == side and b.metres > anchor + ONE for b in passed)
             nth = NTH[count] if count < len(NTH) else f"{count + 1}th"
             said.append(f"to the {nth} opening on the {side}")
+        said += [f"at {name}" for name in turning[:1]]
         return ", ".join(said)
 
     def _named(self, corridor: Corridor) -> str:

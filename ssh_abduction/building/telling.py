@@ -40,7 +40,7 @@ def corridor_in_words(ssh_map: SSHMap, corridor: Corridor) -> str:
         f"{corridor.length:.0f} m, {corridor.width:.1f} m wide, places {order}",
     ]
     for side in ("left", "right"):
-        ways = [_way(ssh_map, o) for o in corridor.openings if o.side == side]
+        ways = dict.fromkeys(_way(ssh_map, o) for o in corridor.openings if o.side == side)
         parts.append(f"{side}: {', '.join(ways) or 'nothing known'}")
     if corridor.doors:
         parts.append(f"{noun_of('door', corridor.doors)} {list_in_words(corridor.doors)} across it")

@@ -103,7 +103,19 @@ class KnownMap:
         text = text.strip()
         if (step := re.fullmatch(r"(?:step|visit) ?(\d+)", text)) and not self.map.starts:
             text = f"{self.saved.drives[0].name}:{int(step[1])}"
-        return *self.saved.thing(text), self.saved.numbered_or_named(text) is None
+        names, bare = [name.text for name in self.map.names], text.casefold().removeprefix("the ")
+        text = next((name for name in names if name.casefold() == bare), text)
+        try:
+            return *self.saved.thing(text), self.saved.numbered_or_named(text) is None
+        except MapError as error:
+            if any(letter.isdigit() for letter in text):
+                raise
+            hint = str(error).rpartition("; did you mean ")
+            near = f"did you mean {hint[2]}" if hint[1] else "or a number, such as room4"
+            known = ", ".join(sorted(names)) or "it has none"
+            raise MapError(
+                f"{text}: expected a name of this map ({known}), got none of them; {near}"
+            ) from None
 
     def two_steps(self, one: str, other: str) -> tuple[int, int]:
         """Find a step at each of two things. Raises MapError if it is the same step."""

@@ -32,6 +32,7 @@ from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.loggers import begin_stage, stages
 from ssh_abduction.solution import Solution, Status, Stop, opening, written_map
 from ssh_abduction.solver import Search, Start, solve
+from ssh_abduction.solver.asp.own_rules import never_true
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
 # At most this many maps are kept in memory, to compare them on the terminal or to sort them for
@@ -100,6 +101,8 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
                 memory_limit=options.memory_limit,
                 speedups=Speedups.without(options.without_speedups),
             )
+            silent = [*never_true(search.parts.task.problem)]
+            outcome.warn(silent)  # at once, as rules make a search slow
             # Ctrl-C must not cut the output, as half of it would be useless.
             until_printed.enter_context(outcome.on_ctrl_c(search.interrupt))
             found = outcome.Warnings(search)
@@ -107,7 +110,7 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
 
             def last_words(why: Stop) -> tuple[str, int, Callable[[], None]]:
                 solution = obeying.with_names(search.snapshot(why))
-                outcome.warn(found.of(solution))
+                outcome.warn(w for w in found.of(solution) if w not in silent)
                 save = partial(outcome.save_solution, solution, options.output)
                 return printed.last_words(solution), outcome.exit_code(solution), save
 
@@ -127,7 +130,7 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
             options.json = False  # the JSON is complete: a later error must not follow it
             outcome.save_solution(solution, options.output)
             # Warn here, as the guard may end the process after finish().
-            outcome.warn(solution.warnings)
+            outcome.warn(w for w in solution.warnings if w not in silent)
 
         guard.finish(outcome.exit_code(solution), printed.end(solution, explanation), save)
         outcome.warn(found.second_opinion(solution))

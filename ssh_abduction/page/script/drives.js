@@ -15,11 +15,16 @@ function inShell(text) {
   return /^[\w:.,-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`;
 }
 
-// The number of a step from its number, or from its name as called() writes it; NaN for none.
+// The number of a step from its number or name (step 4, monday:4), or the first step of a dstate (d4)
+// or of a thing (p4, kitchen); NaN for none.
 function numberOf(text) {
-  const [, name, number] = /^(?:(.*):)?(\d+)$/.exec(text.trim()) ?? [],
+  const said = text.trim(),
+    dstate = /^d(\d+)$/.exec(said),
+    [, name, number] = /^(?:(.*):|step ?)?(\d+)$/.exec(said) ?? [],
     drive = data.drives.find((drive) => drive.name === name);
-  if (name === undefined) return number === undefined ? NaN : Number(number);
+  if (dstate) return [...labelsOf(0)].findIndex((label) => label === Number(dstate[1]));
+  if (number === undefined) return thingCalled(said)?.steps?.[0] ?? NaN;
+  if (name === undefined) return Number(number);
   return drive && Number(number) < drive.stop - drive.first ? drive.first + Number(number) : NaN;
 }
 

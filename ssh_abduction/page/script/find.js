@@ -44,17 +44,24 @@ function listThings() {
   for (const { text } of things()) element("option", { value: text }, null, $("things"));
 }
 
-// Show the thing that is called so: its name, its number, or the first one that begins so or has it.
-function find(text) {
-  const wanted = text.trim().toLowerCase(),
+// The thing that is called so: its name, its number as in the shell (p4, room 4), or the first one
+// that begins so or has it.
+function thingCalled(text) {
+  const wanted = text.trim().toLowerCase().replace(/^p(?=\d+$)/, "place ").replace(/^([a-z]+)(?=\d+$)/, "$1 "),
     all = things(),
-    said = (one) => one.text.toLowerCase(),
-    one =
-      all.find((one) => said(one) === wanted) ??
-      all.find((one) => said(one) === `place ${wanted}` || said(one).startsWith(`place ${wanted} `)) ??
-      all.find((one) => said(one).includes(`(${wanted})`)) ??
-      all.find((one) => wanted && said(one).includes(wanted));
-  $("found").textContent = !wanted ? "" : one ? one.text : `nothing is called ${text.trim()}`;
+    said = (one) => one.text.toLowerCase();
+  return (
+    all.find((one) => said(one) === wanted) ??
+    all.find((one) => [`place ${wanted}`, wanted].some((start) => said(one).startsWith(`${start} `))) ??
+    all.find((one) => said(one).includes(`(${wanted})`)) ??
+    all.find((one) => wanted && said(one).includes(wanted))
+  );
+}
+
+function find(text) {
+  const wanted = text.trim(),
+    one = thingCalled(text);
+  $("found").textContent = !wanted ? "" : one ? one.text : `nothing is called ${wanted}`;
   state.found = wanted && one ? one.at : null;
   if (state.found) {
     if (one.steps && !replay().other) setStep(one.steps[0]);

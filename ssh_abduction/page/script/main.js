@@ -113,12 +113,12 @@ for (const name of ["first", "later"])
   $(name).addEventListener("change", () => {
     const texts = ["first", "later"].map((id) => $(id).value).filter((text) => text !== ""),
       last = labelsOf(0).length - 1,
-      isStep = (text) => numberOf(text) <= last;
+      isStep = (text) => numberOf(text) >= 0 && numberOf(text) <= last;
     const wrong = texts.find((text) => !isStep(text));
     state.picked = [...new Set(texts.filter(isStep).map(numberOf))].sort((a, b) => a - b);
     judge();
     if (wrong !== undefined)
-      $("verdict").textContent = `There is no step ${wrong}: steps are 0 to ${last}.`;
+      $("verdict").textContent = `There is no step or place ${wrong}: steps are 0 to ${last}, a place is written as p4.`;
   });
 $("why").addEventListener("click", why);
 $("same").addEventListener("click", () => assume("same"));
