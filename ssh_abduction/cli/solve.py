@@ -31,8 +31,7 @@ from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.loggers import begin_stage, stages
 from ssh_abduction.solution import Solution, Status, Stop, opening, written_map
-from ssh_abduction.solver import Search, Start, solve
-from ssh_abduction.solver.asp.own_rules import never_true
+from ssh_abduction.solver import Search, Start, never_true, solve
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
 # At most this many maps are kept in memory, to compare them on the terminal or to sort them for
