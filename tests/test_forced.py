@@ -178,9 +178,7 @@ def test_forcing_tries_single_missing_joins_to_raise_the_bound() -> None:
     ssh_map, problem = true_map(known), settle(known.trace)
     cost = Misfit(problem).nats_of(ssh_map)
     forcing = forcing_of(known.trace, Theory.topological(), ssh_map)
-    with patch.object(forced, "BRANCHES", 0):
-        without = max(forcing.bounds(cost))
-    assert without <= max(forcing.bounds(cost)) <= cost
+    assert max(forcing.bounds(cost)) < max(forcing.bounds(cost, depth=1)) <= cost
 
 
 def test_forced_bound_is_off_if_faults_other_than_views_are_allowed() -> None:

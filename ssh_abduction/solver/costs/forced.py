@@ -40,6 +40,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from itertools import chain, combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,7 +58,7 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 
 # Search for a higher bound until it is known to this share.
-NEARLY = 0.004
+NEARLY = 0.01
 # The bound compares all pairs of visits, so it is only for traces of at most LONGEST steps.
 LONGEST = 2500
 # Consider joins of each visit with the last visits to its place, with at least one. Of all visits
@@ -71,6 +72,23 @@ LISTED = 100
 KEPT = 8
 # Give up if assuming the lack of a join added nothing to F, BRANCHES times in a row.
 BRANCHES = 3
+
+
+class _Proven(NamedTuple):
+    """Joins that every cheap map is proven to have.
+
+    Attributes:
+        visits: The visits, with what is known to be apart or to meet.
+        joins: The class of each visit.
+        low: A lower bound on the cost of maps with these joins.
+        lacking: Pairs of visits that are joined in the best map, but perhaps not in all cheap maps.
+            Maps that do not join the first pair cost most.
+    """
+
+    visits: Visits
+    joins: Ints
+    low: float = -math.inf
+    lacking: Sequence[tuple[int, int]] = ()
 
 
 class Forcing:
@@ -115,25 +133,27 @@ class Forcing:
         return self.visits.returns(self.joins)
 
     def bounds(self, most: float, low: float = 0.0, depth: int = 0) -> Iterator[float]:
-        """Yield rising lower bounds, above `low` and at most `most`, on the cost of all maps.
+        """Yield lower bounds, above `low` and at most `most`, on the cost of all maps.
 
-        Up to `depth` joins at a time are assumed to be lacking. `joins` does not change.
+        Up to `depth` joins at a time are assumed to be lacking. `joins` does not change. All maps
+        of a cost below `most` have these joins, and more joins the less such a map may cost.
         """
-        high = 2 * most
-        while low < most and high - low > NEARLY * most:
-            middle = (low + high) / 2
-            if self._forced(self.visits, self.joins, middle, depth):
+        state, nearly = _Proven(self.visits, self.joins), NEARLY * most
+        while most - low > nearly:
+            middle = (low + most) / 2
+            found = self._forced(state, middle, depth)
+            if found.low >= middle:
                 low = middle
                 yield low
             else:
-                high = middle
+                state, most = found, middle
 
     def force(self, most: float, depth: int) -> None:
         """Find joins that every map of a cost below `most` has, until no more are found.
 
         Up to `depth` joins at a time are assumed to be lacking.
         """
-        self._forced(self.visits, self.joins, most, depth, keep=True)
+        self._forced(_Proven(self.visits, self.joins), most, depth, keep=True)
 
     def courses(self, most: float) -> list[Course] | None:
         """List the dstates and places of all maps of a cost below `most`, and perhaps some more.
@@ -141,13 +161,13 @@ class Forcing:
         Returns None if they are too many. Each pair of classes that may be joined is taken to be
         joined, and then not to be joined.
         """
-        found, waiting = list[Course](), [(self.visits, self.joins)]
+        found, waiting = list[Course](), [_Proven(self.visits, self.joins)]
         if self.low < NEAR * most:
             return None
         for _ in range(LISTED):
             if not waiting:
                 return found
-            visits, joins, low, _ = self._grown(*waiting.pop(), most, True)
+            visits, joins, low, _ = self._grown(waiting.pop(), most, True)
             if low >= most:
                 continue
             classes = self._classes(visits, joins)
@@ -159,12 +179,12 @@ class Forcing:
                 continue
             kind, i, j = pair
             if kind == "place":
-                waiting.append((visits.parted([(i, j)]), joins))
-                waiting.append((replace(visits, met=(*visits.met, (i, j))), joins))
+                waiting.append(_Proven(visits.parted([(i, j)]), joins))
+                waiting.append(_Proven(replace(visits, met=(*visits.met, (i, j))), joins))
             else:
                 v, w = int(visits.visit[i]), int(visits.visit[j])
-                waiting.append((visits.lacking(v, w), joins))
-                waiting.append((visits, visits.joined(joins, [(v, w)])))
+                waiting.append(_Proven(visits.lacking(v, w), joins))
+                waiting.append(_Proven(visits, visits.joined(joins, [(v, w)])))
         return None
 
     def _classes(self, visits: Visits, joins: Ints) -> Joined:
@@ -188,7 +208,7 @@ class Forcing:
         new = [prior.new[[steps[0] for steps in some], of] for of, some in enumerate(named)]
         ways = self._bounding(tuple(classes.node.tolist()), tuple(classes.place.tolist()))
         for i, (poses, alias) in enumerate(ways):
-            look_at_clock(LONG_TURN)
+            look_at_clock(LONG_TURN // 2)
             seen = [some * (not i) for some in shown]
             prices = [some + more for some, more in zip(seen, new, strict=True)]
             least = poses.misfit() / 2 + sum(float(some[1:].sum()) for some in prices)
@@ -234,55 +254,48 @@ class Forcing:
             gains[-of][k] = max(free[-of] + seen[-of][k] + nats_of, 0.0)
         return Gains(nats - float(products[0, 0]), *gains)
 
-    def _forced(
-        self, visits: Visits, joins: Ints, most: float, depth: int, *, keep: bool = False
-    ) -> bool:
-        """Add joins that every map of a cost below `most` has. Return whether there is no such map.
+    def _forced(self, state: _Proven, most: float, depth: int, *, keep: bool = False) -> _Proven:
+        """Add joins that every map of a cost below `most` has.
 
-        `joins` has the joins found so far. Up to `depth` joins at a time are assumed to be lacking.
-        If `keep`, keep what is found.
+        Up to `depth` joins at a time are assumed to be lacking. If `keep`, keep what is found.
         """
         wanted = 1  # look for twice as many joins each time before what they imply
         while True:
-            visits, joins, low, worth = self._grown(visits, joins, most, False)
+            state = self._grown(state, most, False)
             if keep:
-                self.visits, self.joins, self.low = visits, joins, low
-            if low >= most:
-                return True
+                self.visits, self.joins, self.low = state.visits, state.joins, state.low
+            if state.low >= most:
+                return state
+            visits, joins, _, lacking = state
             for less in range(depth):
                 found, failed = 0, 0
-                for i, j in worth:
+                for i, j in lacking:
                     if found == wanted or failed == BRANCHES:
                         break
                     if joins[i] != joins[j]:
-                        if self._forced(visits.lacking(i, j), joins, most, less):
+                        branch = _Proven(visits.lacking(i, j), joins)
+                        if self._forced(branch, most, less).low >= most:
                             joins, found, failed = visits.joined(joins, [(i, j)]), found + 1, 0
                         else:
                             failed += 1
+                state = _Proven(visits, joins, state.low, lacking)
                 if found:
                     break
             else:
-                return False
+                return state
             wanted *= 2
 
-    def _grown(
-        self, visits: Visits, joins: Ints, most: float, is_last: bool
-    ) -> tuple[Visits, Ints, float, list[tuple[int, int]]]:
+    def _grown(self, state: _Proven, most: float, is_last: bool) -> _Proven:
         """Add joins that every map of a cost below `most` has, as far as bounds alone show them.
 
-        Returns the visits, the class of each, a lower bound on the cost of maps with these joins,
-        and the other joins of the best map, the one first without which maps cost most.
+        If `is_last`, also find places that are not one in these maps.
         """
-        by_poses = False  # first, force what the faster bound forces
+        visits, joins = state.visits, state.joins
         while True:
-            look_at_clock(LONG_TURN)
+            look_at_clock(LONG_TURN // 2)
             classes = self._classes(visits, joins)
             if classes.fails:
-                return visits, joins, math.inf, []
-            ways = self._ways(classes, by_poses)
-            low = classes.low(ways)
-            if low >= most:
-                return visits, joins, low, []
+                return _Proven(visits, joins, math.inf)
             # Of each two classes that may join, try one pair of visits.
             left = firsts(
                 ((min(a, b), max(a, b)), pair)
@@ -290,20 +303,22 @@ class Forcing:
                 for a, b in [joins[[*pair]].tolist()]
                 if a != b and not classes.apart[0, a, b]
             )
-            worth = dict[tuple[int, int], float]()
-            for (a, b), pair in left.items():
-                look_at_clock(2 * SHORT_TURN)
-                worth[pair] = classes.low_lacking(ways, a, b)
-            forced = [pair for pair, nats in worth.items() if nats >= most]
-            joins = visits.joined(joins, forced)
-            if not forced and not by_poses:
-                by_poses = True
-                continue
+            for by_poses in (False, True):  # first, force what the faster bound forces
+                ways = self._ways(classes, by_poses)
+                if (low := classes.low(ways)) >= most:
+                    return _Proven(visits, joins, low)
+                lacking = list[tuple[float, tuple[int, int]]]()
+                for (a, b), pair in left.items():
+                    look_at_clock(SHORT_TURN // 2)
+                    lacking.append((classes.low_lacking(ways, a, b), pair))
+                if forced := [pair for nats, pair in lacking if nats >= most]:
+                    break
             met = [] if forced else self._met(classes, ways, most)
             far = [] if forced or met or not is_last else self._far(visits, joins, classes, most)
-            by_poses = False
             if not forced and not met and not far:
-                return visits, joins, low, sorted(worth, key=lambda pair: -worth[pair])
+                lacking.sort(reverse=True)
+                return _Proven(visits, joins, low, [pair for _, pair in lacking])
+            joins = visits.joined(joins, forced)
             visits = replace(visits.parted(far), met=(*visits.met, *met))
 
     def _met(
@@ -318,7 +333,7 @@ class Forcing:
                 continue
             for other, i in first.items():
                 if i < t and at[i] == at[t] and classes.may_meet(other, p):
-                    look_at_clock(4 * SHORT_TURN)
+                    look_at_clock(SHORT_TURN)
                     if classes.low_apart(ways, other, p) >= most:
                         found.append((i, t))
                         break
@@ -336,7 +351,7 @@ class Forcing:
         found = []
         for (p, i), (q, j) in combinations(first, 2):
             if at[i] != at[j] and classes.may_meet(p, q):
-                look_at_clock(LONG_TURN)
+                look_at_clock(LONG_TURN // 2)
                 meeting = self._classes(replace(visits, met=(*visits.met, (i, j))), joins)
                 if any(meeting.low(self._ways(meeting, poses)) >= most for poses in (False, True)):
                     found.append((i, j))

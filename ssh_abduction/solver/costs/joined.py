@@ -17,7 +17,8 @@ costs several views then. The bound is the least over the number of dstates.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -29,7 +30,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ssh_abduction.data.groups import NodeClasses, firsts, gathered, numbered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.steps.apart import apart_classes, apart_matrix, clique, grown_clique
+from ssh_abduction.solver.steps.apart import apart_classes, apart_matrix, clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
@@ -176,24 +177,41 @@ class Visits:
         return found
 
 
+class _MoreApart(NamedTuple):
+    """What changes if some more pairs of nodes are apart.
+
+    Attributes:
+        sizes: The sizes of the cliques of the parts that have these pairs.
+        fixed: The nodes that cannot be joined with earlier ones any more.
+    """
+
+    sizes: dict[int, int]
+    fixed: set[int]
+
+
 class _Cliques:
     """A clique in each part of the nodes. Nodes of different parts are always apart.
 
-    So the union of the cliques is a clique, too. Nodes are in the order of their first steps.
+    So the union of the cliques is a clique, too. Nodes are in the order of their first steps. A set
+    of nodes is a number with a bit for each node, as such sets are small and intersected often.
     """
 
     def __init__(self, apart: Flags) -> None:
         """Find the cliques."""
-        self.apart, self._random = apart, np.random.default_rng(0)
+        self.apart = apart
         part = connected_components(csr_array(~apart), directed=False)[1]
-        self._part: Ints = part
-        self._members = [np.flatnonzero(part == p) for p in range(part.max() + 1)]
-        self._cliques = [
+        members = [np.flatnonzero(part == p) for p in range(part.max() + 1)]
+        cliques = [
             some[clique(apart[np.ix_(some, some)], [0] * len(some))] if len(some) > 1 else some
-            for some in self._members
+            for some in members
         ]
-        self._may_join = np.tril(~apart, -1).sum(axis=1)
-        self._lost: dict[int, tuple[Array, dict[int, float]]] = {}
+        self._part: list[int] = part.tolist()
+        self._members, self._cliques = [*map(_bits, members)], [*map(_bits, cliques)]
+        flags = np.packbits(apart, axis=1, bitorder="little")
+        self._rows = [int.from_bytes(row.tobytes(), "little") for row in flags]
+        self._may_join: list[int] = np.tril(~apart, -1).sum(axis=1).tolist()
+        self._size = sum(map(int.bit_count, self._cliques))
+        self._lost: dict[int, tuple[Array, list[list[tuple[float, int]]], list[float]]] = {}
 
     @property
     def open(self) -> Flags:
@@ -203,53 +221,81 @@ class _Cliques:
         found: Flags = np.asarray(free.any(axis=1))
         return found
 
-    def size(self, pairs: Sequence[tuple[int, int]] = ()) -> int:
-        """Return the size of a clique of the whole graph if some more pairs are apart, too."""
-        return sum(map(len, self._larger(pairs)))
+    def size(self, change: _MoreApart) -> int:
+        """Return the size of a clique of the whole graph after a change."""
+        return self._size + sum(
+            size - self._cliques[part].bit_count() for part, size in change.sizes.items()
+        )
 
-    def lost(self, gains: Array, pairs: Sequence[tuple[int, int]] = ()) -> float:
-        """Return the most that joins of nodes may gain if some more pairs are apart, too.
+    def lost(self, gains: Array, change: _MoreApart) -> float:
+        """Return the most that joins of nodes may gain after a change.
 
         `gains` has what each node gains at most if it is joined with earlier ones. Nodes of a
         clique are not joined, so the nodes that gain least are taken to be these.
         """
         # The gains are kept, so no other gains get their id.
-        _, whole = self._lost.setdefault(id(gains), (gains, {}))
-        may_join = self._may_join.copy()
-        for u, v in {(min(pair), max(pair)) for pair in pairs}:
-            if not self.apart[u, v]:
-                may_join[v] -= 1
-        cliques, changed = self._larger(pairs), {int(self._part[v]) for _, v in pairs}
-        lost = 0.0
-        for part, (some, kept) in enumerate(zip(self._members, cliques, strict=True)):
-            if part in whole and part not in changed:
-                lost += whole[part]
-                continue
-            left = np.sort(np.where(may_join[some] > 0, gains[some], 0.0))[len(kept) :]
-            lost += (of_part := float(left.sum()))
-            if part not in changed:
-                whole[part] = of_part
-        return lost
+        if id(gains) not in self._lost:
+            ranked: list[list[tuple[float, int]]] = [[] for _ in self._members]
+            for gain, node in sorted(zip(gains.tolist(), range(len(gains)), strict=True)):
+                if self._may_join[node] and gain > 0:
+                    ranked[self._part[node]].append((gain, node))
+            nothing = [
+                self._lost_in(p, some, _MoreApart({}, set())) for p, some in enumerate(ranked)
+            ]
+            self._lost[id(gains)] = gains, ranked, nothing
+        _, ranked, before = self._lost[id(gains)]
+        return math.fsum(before) + math.fsum(
+            self._lost_in(part, ranked[part], change) - before[part] for part in change.sizes
+        )
 
-    def _larger(self, pairs: Sequence[tuple[int, int]]) -> list[Ints]:
-        """Return a clique of each part if some more pairs are apart, too."""
-        apart, cliques = self.apart, list(self._cliques)
-        if not pairs:
-            return cliques
-        first, second = np.array(pairs).T
-        before = apart[first, second]
-        apart[first, second] = apart[second, first] = True
+    def _lost_in(self, part: int, ranked: list[tuple[float, int]], change: _MoreApart) -> float:
+        """Return the most that joins may gain in one part. `ranked` has gains and their nodes."""
+        left = [gain for gain, node in ranked if node not in change.fixed]
+        size = change.sizes.get(part, self._cliques[part].bit_count())
+        return math.fsum(left[max(size - self._members[part].bit_count() + len(left), 0) :])
+
+    def changed(self, pairs: Sequence[tuple[int, int]]) -> _MoreApart:
+        """Find what changes if some more pairs are apart."""
+        new = {(min(u, v), max(u, v)) for u, v in pairs if not self.apart[u, v]}
+        if not new:
+            return _MoreApart({}, set())
+        rows, before = self._rows, {v: self._rows[v] for pair in new for v in pair}
+        fewer = Counter(v for _, v in new)
+        for u, v in new:
+            rows[u] |= 1 << v
+            rows[v] |= 1 << u
+        best = {self._part[v]: self._cliques[self._part[v]] for _, v in new}
         for u, v in pairs[:TRIED]:
-            part = int(self._part[u])
-            best, some = cliques[part], self._members[part]
-            kept = [u, v, *best[apart[u, best] & apart[v, best]].tolist()]
-            left = some[apart[np.ix_(kept, some)].all(0)]
-            if len(kept) + len(left) > len(best):
-                more = grown_clique(apart[np.ix_(left, left)], [], self._random)
-                if len(kept) + len(more) > len(best):
-                    cliques[part] = np.array([*kept, *left[more]])
-        apart[first, second] = apart[second, first] = before
-        return cliques
+            if (part := self._part[u]) not in best:
+                continue
+            found = best[part] & rows[u] & rows[v] | 1 << u | 1 << v
+            left = self._members[part]
+            for node in _nodes(found):
+                left &= rows[node]
+            while found.bit_count() + left.bit_count() > best[part].bit_count():
+                if not left:
+                    best[part] = found
+                    break
+                node = max(_nodes(left), key=lambda node: (rows[node] & left).bit_count())
+                found |= 1 << node
+                left &= rows[node]
+        for v, others in before.items():
+            rows[v] = others
+        fixed = {v for v, number in fewer.items() if number == self._may_join[v]}
+        return _MoreApart({part: some.bit_count() for part, some in best.items()}, fixed)
+
+
+def _bits(nodes: Iterable[int]) -> int:
+    """Return a set of nodes as a number."""
+    return sum(1 << int(node) for node in nodes)
+
+
+def _nodes(bits: int) -> Iterator[int]:
+    """Yield the nodes of a set."""
+    while bits:
+        node = bits.bit_length() - 1
+        yield node
+        bits ^= 1 << node
 
 
 class Gains(NamedTuple):
@@ -425,23 +471,32 @@ class Joined:
         places: Sequence[tuple[int, int]],
     ) -> float:
         """Return a lower bound if some more dstates, and places, are apart."""
+        of_dstates, of_places = self._dstates.changed(nodes), self._places.changed(places)
+        hard, shown = self._dstates.size(of_dstates), 0
+        if len(self.excused) > 1:
+            shown = self._differ.size(self._differ.changed(nodes))
         return self.spoilt + min(
-            max(self._least(way, nodes, places) for way in bounds) for bounds in ways
+            max(
+                way.nats
+                - min(self._dstates.lost(way.dstates, of_dstates), self._misread(way, hard, shown))
+                - self._places.lost(way.places, of_places)
+                for way in bounds
+            )
+            for bounds in ways
         )
 
-    def _least(
-        self, way: Gains, nodes: Sequence[tuple[int, int]], places: Sequence[tuple[int, int]]
-    ) -> float:
-        lost = self._dstates.lost(way.dstates, nodes)
-        if len(self.excused) > 1:
-            hard, shown = self._dstates.size(nodes), self._differ.size(nodes)
-            left = [*np.sort(way.dstates)[::-1].cumsum()[::-1].tolist(), 0.0]
-            misread = max(
-                left[min(k, len(left) - 1)] - float(self.excused[max(shown - k, 0)])
-                for k in range(hard, max(shown, hard) + 1)
-            )
-            lost = min(lost, misread)
-        return way.nats - lost - self._places.lost(way.places, places)
+    def _misread(self, way: Gains, hard: int, shown: int) -> float:
+        """Return the most that joins of dstates may gain, less what they misread at least.
+
+        There is a clique of `hard` dstates, and one of `shown` if no view is misread.
+        """
+        if len(self.excused) == 1:
+            return math.inf
+        left: list[float] = [*np.sort(way.dstates)[::-1].cumsum()[::-1].tolist(), 0.0]
+        return max(
+            left[min(k, len(left) - 1)] - float(self.excused[max(shown - k, 0)])
+            for k in range(hard, max(shown, hard) + 1)
+        )
 
     def _lack(self, waiting: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
         """Flag classes as apart, and all that are apart if they are. Return the new flags."""

@@ -214,7 +214,7 @@ class Weighing:
             if not self._lists_all(forcing):
                 self._raise_bound(forcing.low)
                 for depth in (0, 1):
-                    for bound in forcing.bounds(best.nats, self.bound, depth):
+                    for bound in forcing.bounds(self._most, self.bound, depth):
                         self._raise_bound(bound)
                 # This takes longer, but may be a proof.
                 forcing.force(self._most, 2)
