@@ -99,7 +99,11 @@ def test_search_gives_a_map_and_a_belief(scans: tuple[Scan, ...]) -> None:
     for scan in scans[:99]:
         assert not mapper.observe(scan).belief
     assert mapper.is_due
-    events = mapper.accept(solved(mapper.task(work=1.0)))
+    made = solved(mapper.task(work=1.0))
+    assert made is not None
+    lines = made.files["trace.jsonl"].decode().splitlines()
+    assert lines == [*mapper.finish("live").trace.to_lines()]  # with its widths and doors
+    events = mapper.accept(made)
     assert [event.kind for event in events] == ["new"] * len(events)
     assert {place["place"] for place in mapper.to_dict()["places"]} == set(range(len(events)))
     assert not mapper.is_due

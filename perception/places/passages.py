@@ -47,18 +47,24 @@ def resampled(way: Array, step: float) -> Array:
     return np.stack([np.interp(at, far[moving], way[moving, k]) for k in (0, 1)], axis=1)
 
 
+def spaced(track: Track, size: int) -> list[int]:
+    """Choose from the first `size` scans those at which the robot drove on, or turned."""
+    chosen = [0]
+    for i in range(1, size):
+        far = track.way[i] - track.way[chosen[-1]]
+        turned = radians_between(track.poses[chosen[-1], 2], track.poses[i, 2])
+        if i in track.breaks or far >= EVERY or turned > _TURN:
+            chosen.append(i)
+    return chosen
+
+
 class Passages:
     """Measures the ways of a robot between places in local maps of its log."""
 
     def __init__(self, log: RobotLog, track: Track) -> None:
         self._track, self._recent = track, Recent()
         self._maps = LocalMaps(self._recent, REACH)
-        chosen = [0]
-        for i in range(1, len(log)):
-            far = track.way[i] - track.way[chosen[-1]]
-            turned = radians_between(track.poses[chosen[-1], 2], track.poses[i, 2])
-            if i in track.breaks or far >= EVERY or turned > _TURN:
-                chosen.append(i)
+        chosen = spaced(track, len(log))
         for i in chosen:
             self._recent.append(log.scans[i], track.pose(i))
         self._chosen = np.array(chosen)

@@ -103,7 +103,7 @@ class KnownMap:
         text = text.strip()
         if (step := re.fullmatch(r"(?:step|visit) ?(\d+)", text)) and not self.map.starts:
             text = f"{self.saved.drives[0].name}:{int(step[1])}"
-        names, bare = [name.text for name in self.map.names], text.casefold().removeprefix("the ")
+        names, bare = sorted(self.saved.given), text.casefold().removeprefix("the ")
         text = next((name for name in names if name.casefold() == bare), text)
         try:
             return *self.saved.thing(text), self.saved.numbered_or_named(text) is None
@@ -112,7 +112,7 @@ class KnownMap:
                 raise
             hint = str(error).rpartition("; did you mean ")
             near = f"did you mean {hint[2]}" if hint[1] else "or a number, such as room4"
-            known = ", ".join(sorted(names)) or "it has none"
+            known = ", ".join(names) or "it has none"
             raise MapError(
                 f"{text}: expected a name of this map ({known}), got none of them; {near}"
             ) from None

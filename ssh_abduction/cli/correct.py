@@ -472,10 +472,14 @@ class SavedMap:
         try:
             return "place", self.step(text)
         except MapError as error:
-            names = {name.text for name in self.map.names} | {n.name for n in self._names}
-            names |= {f"{kind}{n}" for kind in NAMED for n in re.findall(r"\d+$", text)}
+            names = self.given | {f"{kind}{n}" for kind in NAMED for n in re.findall(r"\d+$", text)}
             hint = meant(text, names, 3) or "; or a place such as p4"
             raise MapError(f"{error}{hint}") from None
+
+    @property
+    def given(self) -> set[str]:
+        """All names that a person gave."""
+        return {name.text for name in self.map.names} | {naming.name for naming in self._names}
 
     @property
     def _names(self) -> tuple[Naming, ...]:

@@ -30,6 +30,7 @@ NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
 OPTIONS = Path(__file__).with_name("options.txt")
 # The names of the files in a folder that map wrote.
 MAPS, TRACE, RUN = "maps.json", "trace.jsonl", "run.json"
+LIVE = "drive.names"  # what a folder of live has instead of RUN
 
 
 def true_or_false(text: str) -> bool:

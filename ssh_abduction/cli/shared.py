@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, Rows, maps_path, rows_of
+from ssh_abduction.cli.parsing import LIVE, MAPS, RUN, TRACE, Rows, maps_path, rows_of
 from ssh_abduction.data.corrections import ASSERTED, ASSERTIONS, load_corrections
 from ssh_abduction.data.drives import step_named
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
@@ -181,10 +181,10 @@ def trace_of_maps(file: str) -> Trace | None:
 
 
 def trace_beside(maps: str) -> str | None:
-    """Return the trace file beside a file of maps that the verb map wrote; else None."""
+    """Return the trace file beside a file of maps that the verb map or live wrote; else None."""
     folder = Path(maps).parent
-    is_written = Path(maps).name == MAPS and (folder / RUN).is_file() and (folder / TRACE).is_file()
-    return str(folder / TRACE) if is_written else None
+    is_written = Path(maps).name == MAPS and any((folder / f).is_file() for f in (RUN, LIVE))
+    return str(folder / TRACE) if is_written and (folder / TRACE).is_file() else None
 
 
 def check_picture(file: str | None) -> None:

@@ -29,6 +29,7 @@ from perception.errors import LogError
 from perception.places.distinctive import WIDTH, Visit
 from perception.places.importing import Grown, Imported, Tell, assembled, tell_nobody
 from perception.places.live import LiveLog, LivePlace
+from perception.places.passages import spaced
 from perception.places.relations import Relocation
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.checks import an_instance, one_of
@@ -110,7 +111,7 @@ class Event:
 class MapTask:
     """All that the search for a map needs."""
 
-    log: RobotLog  # without ranges
+    log: RobotLog  # with the ranges of a scan every 0.3 m, for corridors and doors
     grown: Grown
     width: float
     work: float
@@ -391,10 +392,14 @@ class OnlineLogMapper:
         New visits are matched with earlier ones first.
         """
         self._asked = len(self.live.visits)
-        nothing = np.zeros(0)
-        scans = tuple(replace(scan, ranges=nothing) for scan in self.live.log.scans)
+        grown, nothing = self.live.grown(), np.zeros(0)
+        kept = {*spaced(grown.track, len(self.live))}
+        scans = tuple(
+            scan if k in kept else replace(scan, ranges=nothing)
+            for k, scan in enumerate(self.live.log.scans)
+        )
         said = tuple((kind, first, second) for kind, first, second in self._names.said)
-        return MapTask(RobotLog(scans), self.live.grown(), self.live.width, work, said)
+        return MapTask(RobotLog(scans), grown, self.live.width, work, said)
 
     def accept(self, found: FoundMap | None) -> list[Event]:
         """Take the result of `solved`, and return what changed."""
