@@ -409,7 +409,7 @@ class ErrorFilter:
         return covariance
 
     def new_until(self, end: int) -> Array:
-        """Return the covariance at `end` from the noise up to each step, of shape (end + 1, 9)."""
+        """Split the covariance at `end` by the step that each noise comes from: (end + 1, 9)."""
         onward = self.onward(np.arange(end + 1), np.full(end + 1, end))
         covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(
             -1, 9

@@ -500,9 +500,10 @@ def smoothed_map(
 
 
 class KeptApart:
-    """The dstates (or the places) of a map that are two, because two of their steps are apart.
+    """Says which dstates (or places) of a map must not be merged.
 
-    Those of one piece of a map that must be kept are two, as well.
+    Two must not if a step of one is apart from a step of the other, or if a map that is kept has
+    both of them in one piece.
     """
 
     def __init__(

@@ -207,7 +207,7 @@ def _fewest_closed(first: Star, second: Star) -> float:
 
 @lru_cache(maxsize=2**14)
 def _smaller(star: Star, less: int) -> tuple[Frame, ...]:
-    """Return the frames of a star, in all ways to leave out `less` of their gateways."""
+    """List the frames of a star without `less` gateways: one frame for each choice of these."""
     return tuple(
         Frame(
             tuple(frame.bearings[k] for k in kept),

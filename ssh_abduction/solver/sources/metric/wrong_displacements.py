@@ -52,8 +52,8 @@ def wrong_displacements(
 ) -> tuple[int, ...]:
     """Find the displacements that are outliers.
 
-    `labels` has the dstate of each step, nearly right, and `places` its place, or None. Returns the
-    steps that wrong displacements lead to, those with the most votes first.
+    `labels` and `places` are those of the steps in a map that is nearly right; a place may be
+    None. Returns the steps that wrong displacements lead to, those with the most votes first.
     """
     loops = Reckoning(trace).loops_of_unknown_drift()
     voters: list[tuple[int, int, float]] = []
