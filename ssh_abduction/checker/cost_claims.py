@@ -66,8 +66,8 @@ WORK = 5 * LONGEST**3
 MARGIN = 3.0
 # The nats of a fault that costs as much as a dstate, and of an alias of false closures.
 FAULT = 5.0
-# The nats of a misread view that only a rival has, as the theory forbids it. Parts of a building
-# that repeat others differ from them as often.
+# The nats of a misread view that only a rival has, as the theory forbids it, besides those of what
+# it shows. Parts of a building that repeat others differ from them as often.
 SUSPECTED = 3.5
 # Where an alias lays a part on another one, dstates that face one way differ by less radians.
 TWIST = 0.4
@@ -183,7 +183,8 @@ def cost_of(
         nats -= sum(model.repeated(of, steps[a], steps[b]) for a, b in pairs[of].items())
     for kind, step in faults:
         tenths = theory.fault_tenths(kind, trace.steps[step])
-        nats += FAULT * tenths / 10 if tenths or kind != "misread" else SUSPECTED
+        is_suspected = kind == "misread" and not tenths
+        nats += SUSPECTED + model.shown(0, [step]) if is_suspected else FAULT * tenths / 10
     return nats, square
 
 

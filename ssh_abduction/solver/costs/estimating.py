@@ -86,7 +86,7 @@ def rivals_with_misread_views(
 
     Two dstates of one place that face one way are a sign of a misread view: in a rival, they are
     one. One rival joins all such dstates, and one for each pair joins only this pair. A misread
-    view costs MISREAD nats. `seconds` is the time that this may take.
+    view costs MISREAD nats, and those of what it shows. `seconds` is the time that this may take.
     """
     found: list[Rival] = []
     if problem.theory.misread or not best.places:
@@ -113,7 +113,9 @@ def rivals_with_misread_views(
             right = {s: Counter(seen).most_common(1)[0][0] for s, seen in views.items()}
             misread = [t for t, (s, view) in enumerate(shown) if view not in (None, right.get(s))]
             nats = misfit.nats_of_course(dstates, known.places, wrong)
-            nats += FAULT * Cost.of(best).faults + MISREAD * len(misread)
+            # A misread view may be any view, as probable as at a new dstate.
+            nats += MISREAD * len(misread) + float(problem.prior.seen[misread, 0].sum())
+            nats += FAULT * Cost.of(best).faults
             faults = (*known.faults, *(("misread", t) for t in misread))
             found.append(Rival(nats, dstates, known.places, True, faults))
     return found
