@@ -57,8 +57,8 @@ from ssh_abduction.theory.prior import Array
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 
-# Search for a higher bound until it is known to this share.
-NEARLY = 0.01
+# Search for a higher bound until it is known to these shares: before a proof, and after it failed.
+ROUGHLY, NEARLY = 0.05, 0.01
 # The bound compares all pairs of visits, so it is only for traces of at most LONGEST steps.
 LONGEST = 2500
 # Consider joins of each visit with the last visits to its place, with at least one. Of all visits
@@ -132,14 +132,17 @@ class Forcing:
         """The returns that every cheap map is proven to have."""
         return self.visits.returns(self.joins)
 
-    def bounds(self, most: float, low: float = 0.0, depth: int = 0) -> Iterator[float]:
+    def bounds(
+        self, most: float, low: float = 0.0, depth: int = 0, nearly: float = NEARLY
+    ) -> Iterator[float]:
         """Yield lower bounds, above `low` and at most `most`, on the cost of all maps.
 
         Up to `depth` joins at a time are assumed to be lacking. `joins` does not change. All maps
-        of a cost below `most` have these joins, and more joins the less such a map may cost.
+        of a cost below `most` have these joins, and more joins the less such a map may cost. End
+        if the highest such bound is known to the share `nearly`.
         """
-        state, nearly = _Proven(self.visits, self.joins), NEARLY * most
-        while most - low > nearly:
+        state, gap = _Proven(self.visits, self.joins), nearly * most
+        while most - low > gap:
             middle = (low + most) / 2
             found = self._forced(state, middle, depth)
             if found.low >= middle:

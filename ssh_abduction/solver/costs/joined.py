@@ -30,7 +30,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ssh_abduction.data.groups import NodeClasses, firsts, gathered, numbered
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.steps.apart import apart_classes, apart_matrix, clique
+from ssh_abduction.solver.steps.apart import apart_classes, apart_matrix, grown_clique
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
@@ -200,9 +200,10 @@ class _Cliques:
         """Find the cliques."""
         self.apart = apart
         part = connected_components(csr_array(~apart), directed=False)[1]
+        random = np.random.default_rng(0)
         members = [np.flatnonzero(part == p) for p in range(part.max() + 1)]
         cliques = [
-            some[clique(apart[np.ix_(some, some)], [0] * len(some))] if len(some) > 1 else some
+            some[grown_clique(apart[np.ix_(some, some)], [], random)] if len(some) > 1 else some
             for some in members
         ]
         self._part: list[int] = part.tolist()

@@ -55,7 +55,7 @@ from ssh_abduction.solver.costs.estimating import (
     rivals_of,
     rivals_with_misread_views,
 )
-from ssh_abduction.solver.costs.forced import Forcing
+from ssh_abduction.solver.costs.forced import NEARLY, ROUGHLY, Forcing
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.parts import Parts, Priced
 from ssh_abduction.solver.schedule import Source, turn
@@ -211,14 +211,17 @@ class Weighing:
         forcing = Forcing(task.problem, task.log, self._misfit, best.map)
         try:
             forcing.force(self._most, 1)
-            if not self._lists_all(forcing):
+            if self._lists_all(forcing):
+                return
+            for nearly in (ROUGHLY, NEARLY):
                 self._raise_bound(forcing.low)
                 for depth in (0, 1):
-                    for bound in forcing.bounds(self._most, self.bound, depth):
+                    for bound in forcing.bounds(self._most, self.bound, depth, nearly):
                         self._raise_bound(bound)
-                # This takes longer, but may be a proof.
-                forcing.force(self._most, 2)
-                self._lists_all(forcing)
+                if nearly == ROUGHLY:
+                    forcing.force(self._most, 2)  # this takes longer, but may be a proof
+                    if self._lists_all(forcing):
+                        return
         finally:
             self._raise_bound(forcing.low)
             returns = forcing.returns
