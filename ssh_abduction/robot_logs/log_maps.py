@@ -26,7 +26,6 @@ from perception.places.distinctive import WIDTH
 from perception.places.importing import Imported, import_log, join_logs
 from perception.readers.scans import RobotLog
 from perception.recognition import recogniser as new_recogniser
-from perception.store import written
 from ssh_abduction.building.derive import with_building
 from ssh_abduction.data.checks import all_instances
 from ssh_abduction.data.corrections import Corrections
@@ -191,6 +190,8 @@ class LogMap:
         found["page.html"] = page.html
         files = {name: text.encode() for name, text in found.items()}
         if solution.maps:
+            from perception.store import written  # loads skops, which live does without
+
             files["recogniser.skops"] = written(recogniser_of(trace, solution.maps[0]))
         run = f"{json.dumps(self.to_dict(), indent=2, ensure_ascii=False)}\n"
         return {**files, "run.json": run.encode()}

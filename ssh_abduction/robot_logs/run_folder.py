@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from perception.store import written
 from ssh_abduction.data.corrections import beside, load_corrections
 from ssh_abduction.data.drives import fingerprints_of
 from ssh_abduction.data.files import write_file
@@ -53,6 +52,8 @@ def bring_up_to_date(maps: Path, change: Literal["names", "corrections", "maps"]
             kept = [section for section in ground.sections if section.title == OF_LOG]
             ground = replace(ground, sections=(Section("Summary", (SOLVED,)), *kept))
         if all(step.image is not None for step in trace.steps):
+            from perception.store import written  # loads skops, which live does without
+
             recogniser = written(recogniser_of(trace, solution.maps[0]))
             write_file(folder / "recogniser.skops", recogniser)
         else:
