@@ -15,12 +15,14 @@ import pytest
 from perception.places.passages import STEP, doors_in, openings_in, resampled
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.building.derive import buildings_of, with_building
-from ssh_abduction.building.directions import directions_to
+from ssh_abduction.building.directions import RouteCourse, directions_to
+from ssh_abduction.building.edges import PlanEdge
 from ssh_abduction.building.straight_paths import PRICE, best_pairings, chains_of, sides_of
 from ssh_abduction.building.telling import told
 from ssh_abduction.checker.buildings import faults_of_corridors, faults_of_paths
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
+from ssh_abduction.data.building import Corridor
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import DState, Fit, MapPath, Name, Pose, Region
 from ssh_abduction.data.parts_of_dstates import number_at
@@ -543,6 +545,14 @@ def test_a_turn_into_a_door_is_told_before_the_door() -> None:
         "turn left",
         "go 1 m on, through the door, to place 2",
     )
+
+
+def test_a_leg_across_a_corridor_is_as_long_as_it_is() -> None:
+    """Both ends are places of a corridor that is 6 m wide and 24 m long."""
+    course = np.linspace((1.0, -3.0), (1.5, 3.0), 31)
+    edge = PlanEdge((0, 1), course, (0,), np.full((31, 2), 1.0))
+    hall = Corridor(0, 0, (0, 1), ((0.0, 0.0), (24.0, 0.0)), 24.0, 6.0)
+    assert RouteCourse.of([edge], [hall]).metres[-1] == pytest.approx(6.02, abs=0.1)
 
 
 def test_an_opening_that_was_never_driven_through_is_counted() -> None:

@@ -296,11 +296,17 @@ class RouteCourse:
         return max(float(self.metres[end]), self.beside(end, self.course[door]))
 
     def corridor_of(self, begin: int, end: int) -> Corridor | None:
-        """Find the corridor that has both ends of an edge with its middle in a leg, if any."""
+        """Find the corridor that a leg leads along and not across, if any.
+
+        It has both ends of an edge with its middle in the leg.
+        """
+        leg = self.course[end] - self.course[begin]
         for corridor in self.corridors:
             for (p, one), (q, other) in pairwise(self.places):
                 if begin < (one + other) / 2 < end and {p, q} <= {*corridor.order}:
-                    return corridor
+                    ahead = self._ahead(corridor, begin, end)
+                    if abs(leg @ ahead) >= abs(ahead[0] * leg[1] - ahead[1] * leg[0]):
+                        return corridor
         return None
 
     def _straight(self, begin: int, end: int) -> Array:
@@ -309,11 +315,16 @@ class RouteCourse:
         corridor = self.corridor_of(begin, end)
         if corridor is None:
             return leg
+        ahead = self._ahead(corridor, begin, end)
+        return np.asarray(ahead * (leg @ ahead) / (ahead @ ahead))
+
+    def _ahead(self, corridor: Corridor, begin: int, end: int) -> Array:
+        """The direction of a corridor beside a leg, (2,) metres of any length."""
         line = resampled(np.array(corridor.line), STEP)
         some = sorted(int(np.hypot(*(line - p).T).argmin()) for p in self.course[[begin, end]])
         more = round(LONG / 2 / STEP)
-        ahead = line[min(some[1] + more, len(line) - 1)] - line[max(some[0] - more, 0)]
-        return np.asarray(ahead * (leg @ ahead) / (ahead @ ahead))
+        ahead: Array = line[min(some[1] + more, len(line) - 1)] - line[max(some[0] - more, 0)]
+        return ahead
 
     def opens(self, begin: int, end: int, side: int) -> bool:
         """Whether there is an opening on a side where a leg ends, and not one wide hall."""
