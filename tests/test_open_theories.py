@@ -608,3 +608,19 @@ def test_rule_that_can_never_fire_is_warned_of() -> None:
         '"v0" in quotes',
         "own.lp:4: act((t-1),stay) holds at no step of this trace, so its rule has no effect",
     )
+
+
+def test_rules_that_exclude_no_minimal_map_keep_the_answer_of_a_long_trace() -> None:
+    trace = Trace.from_steps("abcdefgh" * 8, [*["travel", "right"] * 31, "travel"])
+    harmless = Rules("own.lp", "#program step(t). :- same(I,t), t-I > 64.")
+    free = solve(trace, Theory.topological(), work_limit=1)
+    bound = solve(trace, Theory.topological().replace(rules=[harmless]), work_limit=1)
+    assert bound.status is free.status is Status.OPTIMAL
+    assert bound.complete
+    assert set(bound.maps) == set(free.maps)
+    # If no minimal map obeys, there is still some map, and the bound holds.
+    theory = Theory.topological().replace(rules=[FORGETFUL])
+    found = solve(trace, theory, work_limit=1)
+    assert found.bound.dstates is not None
+    assert found.bound.dstates >= len(free.maps[0].dstates)
+    assert len(found.maps[0].dstates) > len(free.maps[0].dstates)

@@ -10,6 +10,7 @@ import math
 from collections.abc import Generator, Iterator
 
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.clock import each_looking
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solution.values import Found, Status
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 
 _log = log_of(__name__)
 
+# Without own rules, list at most this many minimal maps if all are wanted.
+RELAXED = 1000
+
 
 class Counting:
     """Finds the minimal counts of maps in one search, and lists the maps that have them."""
@@ -42,7 +46,7 @@ class Counting:
         If `goes_on`, the search goes on from an earlier search for the first steps.
         """
         self._parts, self._solve_mended, self._goes_on = parts, solve_mended, goes_on
-        # The minimal maps that mending the trace found, and whether they are all.
+        # The minimal maps of a mended trace or of fewer rules, and whether they are all.
         self._mended: tuple[tuple[SSHMap, ...], bool] | None = None
 
     def sources(self) -> Iterator[Source]:
@@ -63,13 +67,21 @@ class Counting:
         finds = task.theory.has_faults and task.theory.level == "topological"
         if (mends or finds) and steps > READABLE:
             raise LimitError("no proof")
-        # 2. An earlier search may have proved a map minimal.
+        # 2. Rules of the user only exclude maps, but no fast method knows them.
+        if task.theory.rules and parts.judging.can_accept and not self._goes_on:
+            # Without rules, maps show no paths if no axiom is about them.
+            shows_all = task.theory.has_paths == task.theory.replace(rules=()).has_paths
+            may_relax = shows_all and not (task.theory.has_faults or parts.limits.within)
+            yield Source(turn("maps without own rules"), lambda: may_relax, self._relax)
+            if self._mended:
+                return
+        # 3. An earlier search may have proved a map minimal.
         if parts.known.status is Status.OPTIMAL:
             if not engine.size:
                 lists = task.theory.level == "topological" and not isinstance(engine, StepEngine)
                 engine.grow(steps if lists else min(steps, prefixes.FIRST_PREFIX))
             return
-        # 3. Go on by prefixes for a short time, then with the dstates of some map.
+        # 4. Go on by prefixes for a short time, then with the dstates of some map.
         may_change = isinstance(engine, StepEngine) and not self._goes_on and takes_all(task)
         may_frame = may_change and task.speedups.framing
         may_settle = may_change and task.speedups.ways and parts.speedups.names
@@ -80,7 +92,7 @@ class Counting:
                 parts.candidates.frame(parts.speedups)
             if self._is_open() and may_settle:
                 self._settle_dstates_first()
-        # 4. The proof.
+        # 5. The proof.
         yield Source(turn("exact search"), self._is_open, self._find)
 
     def maps(self) -> Generator[Priced, None, None]:
@@ -126,10 +138,31 @@ class Counting:
         finally:
             known.raise_bound(mending.bound)
         if self._mended:
-            first = self._mended[0][0]
-            known.status = Status.OPTIMAL
-            known.keep(Found.of(first, parts.task.theory), first.dstate_at)
+            self._keep_mended(self._mended)
             parts.rivals.reasons = False  # engines do not know mended traces
+
+    def _keep_mended(self, found: tuple[tuple[SSHMap, ...], bool]) -> None:
+        """Keep minimal maps that were proven minimal for another trace or theory."""
+        self._mended, known, first = found, self._parts.known, found[0][0]
+        known.status = Status.OPTIMAL
+        known.keep(Found.of(first, self._parts.task.theory), first.dstate_at)
+
+    def _relax(self) -> None:
+        """Solve the trace without the rules of the user. Minimal maps that obey them stay minimal.
+
+        If no minimal map obeys the rules, the least count is still a lower bound.
+        """
+        parts, known, task = self._parts, self._parts.known, self._parts.task
+        most, theory = parts.limits.most or RELAXED, task.theory.replace(rules=())
+        maps, proven = self._solve_mended(task.trace, theory, most + 1, parts.watch.left())
+        obeying = [ssh_map for ssh_map in each_looking(maps) if parts.judging.accepts(ssh_map)]
+        for ssh_map in obeying[:1]:
+            parts.candidates.offer(ssh_map)
+        if proven and maps:
+            first = Found.of(maps[0], task.theory)
+            known.raise_bound(first.cost[0] if first.cost else None)
+            if obeying and len(maps) <= most:
+                self._keep_mended((tuple(obeying), True))
 
     def _settle_dstates_first(self) -> None:
         """If a map is known, continue from it with an engine that finds dstates first."""

@@ -62,6 +62,12 @@ COUNTED = (
         "It finds the fewest faults by solving traces without them.",
     ),
     SourceTurn(
+        "maps without own rules",
+        "theories with rules of the user, no faults",
+        "Such rules only exclude maps, and no fast method knows them.",
+        share=0.5,
+    ),
+    SourceTurn(
         "prefixes",
         "theories without frames, more than 24 steps",
         "A trace that is not solved by then is seldom solved step by step.",
