@@ -298,14 +298,15 @@ class RouteCourse:
     def corridor_of(self, begin: int, end: int) -> Corridor | None:
         """Find the corridor that a leg leads along and not across, if any.
 
-        It has both ends of an edge with its middle in the leg.
+        It has both ends of an edge with its middle in the leg. A leg leads across if it is less
+        than AHEAD degrees from straight across.
         """
         leg = self.course[end] - self.course[begin]
         for corridor in self.corridors:
             for (p, one), (q, other) in pairwise(self.places):
                 if begin < (one + other) / 2 < end and {p, q} <= {*corridor.order}:
-                    ahead = self._ahead(corridor, begin, end)
-                    if abs(leg @ ahead) >= abs(ahead[0] * leg[1] - ahead[1] * leg[0]):
+                    ahead, least = self._ahead(corridor, begin, end), math.sin(math.radians(AHEAD))
+                    if abs(leg @ ahead) >= least * np.hypot(*leg) * np.hypot(*ahead):
                         return corridor
         return None
 
