@@ -74,7 +74,7 @@ def send(number: int = signal.SIGTERM) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        "waits = iter([0, 100])  # the second call may follow a long search\n"
+        "waits = iter([0, 0, 100])  # the last call may follow a long search\n"
         "outcome.warn = lambda _: next(waits) and (print(file=sys.stderr) or time.sleep(100))",
         "outcome.save_solution = lambda *_: print(file=sys.stderr) or time.sleep(0.6)",
     ],
