@@ -31,7 +31,7 @@ from ssh_abduction.data.trace import Trace, with_images_named_from
 from ssh_abduction.explain.no_map import Explanation
 from ssh_abduction.runtime.loggers import begin_stage, stages
 from ssh_abduction.solution import Solution, Status, Stop, opening, written_map
-from ssh_abduction.solver import Search, Start, never_true, solve
+from ssh_abduction.solver import Search, Start, solve
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
 # At most this many maps are kept in memory, to compare them on the terminal or to sort them for
@@ -100,7 +100,7 @@ def _solve(options: argparse.Namespace, trace: Trace) -> int:
                 memory_limit=options.memory_limit,
                 speedups=Speedups.without(options.without_speedups),
             )
-            silent = [*never_true(search.parts.task.problem)]
+            silent = search.parts.silent
             outcome.warn(silent)  # at once, as rules make a search slow
             # Ctrl-C must not cut the output, as half of it would be useless.
             until_printed.enter_context(outcome.on_ctrl_c(search.interrupt))

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp.limits import processor_clock as processor_clock
     from ssh_abduction.solver.asp.limits import resident_memory as resident_memory
     from ssh_abduction.solver.asp.own_rules import check_rules as check_rules
-    from ssh_abduction.solver.asp.own_rules import never_true as never_true
     from ssh_abduction.solver.board import InternalError as InternalError
     from ssh_abduction.solver.board import Judging as Judging
     from ssh_abduction.solver.costs.estimating import maps_apart as maps_apart

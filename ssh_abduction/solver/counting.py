@@ -47,7 +47,7 @@ class Counting:
         """
         self._parts, self._solve_mended, self._goes_on = parts, solve_mended, goes_on
         # The minimal maps of a mended trace or of fewer rules, and whether they are all.
-        self._mended: tuple[tuple[SSHMap, ...], bool] | None = None
+        self._minimal: tuple[tuple[SSHMap, ...], bool] | None = None
 
     def sources(self) -> Iterator[Source]:
         """Yield the sources in the order of the schedule, until the minimal cost is known.
@@ -62,7 +62,7 @@ class Counting:
         mends = row("mending").holds_for(task.theory) and may_name(task)
         if mends:
             yield Source(turn("mending"), lambda: True, self._mend)
-            if self._mended:
+            if self._minimal:
                 return
         finds = task.theory.has_faults and task.theory.level == "topological"
         if (mends or finds) and steps > READABLE:
@@ -73,7 +73,7 @@ class Counting:
             shows_all = task.theory.has_paths == task.theory.replace(rules=()).has_paths
             may_relax = shows_all and not (task.theory.has_faults or parts.limits.within)
             yield Source(turn("maps without own rules"), lambda: may_relax, self._relax)
-            if self._mended:
+            if self._minimal:
                 return
         # 3. An earlier search may have proved a map minimal.
         if parts.known.status is Status.OPTIMAL:
@@ -98,7 +98,7 @@ class Counting:
     def maps(self) -> Generator[Priced, None, None]:
         """Yield the minimal maps with their counts, then those with up to `within` dstates more."""
         parts, known, limits = self._parts, self._parts.known, self._parts.limits
-        minimal, is_all = self._mended or (parts.prefixes.minimal_maps(), True)
+        minimal, is_all = self._minimal or (parts.prefixes.minimal_maps(), True)
         yield from ((ssh_map, known.cost) for ssh_map in minimal)
         if not is_all:
             raise StageTimeError
@@ -134,16 +134,16 @@ class Counting:
                 known.raise_bound(mending.bound)
                 parts.report()
             # Ask for one map more than wanted, to know whether the list is complete.
-            self._mended = mending.minimal_maps(most and most + 1)
+            self._minimal = mending.minimal_maps(most and most + 1)
         finally:
             known.raise_bound(mending.bound)
-        if self._mended:
-            self._keep_mended(self._mended)
+        if self._minimal:
+            self._keep_minimal(self._minimal)
             parts.rivals.reasons = False  # engines do not know mended traces
 
-    def _keep_mended(self, found: tuple[tuple[SSHMap, ...], bool]) -> None:
+    def _keep_minimal(self, found: tuple[tuple[SSHMap, ...], bool]) -> None:
         """Keep minimal maps that were proven minimal for another trace or theory."""
-        self._mended, known, first = found, self._parts.known, found[0][0]
+        self._minimal, known, first = found, self._parts.known, found[0][0]
         known.status = Status.OPTIMAL
         known.keep(Found.of(first, self._parts.task.theory), first.dstate_at)
 
@@ -156,13 +156,13 @@ class Counting:
         most, theory = parts.limits.most or RELAXED, task.theory.replace(rules=())
         maps, proven = self._solve_mended(task.trace, theory, most + 1, parts.watch.left())
         obeying = [ssh_map for ssh_map in each_looking(maps) if parts.judging.accepts(ssh_map)]
-        for ssh_map in obeying[:1]:
-            parts.candidates.offer(ssh_map)
         if proven and maps:
             first = Found.of(maps[0], task.theory)
             known.raise_bound(first.cost[0] if first.cost else None)
-            if obeying and len(maps) <= most:
-                self._keep_mended((tuple(obeying), True))
+        if proven and obeying and len(maps) <= most:
+            self._keep_minimal((tuple(obeying), True))
+        elif obeying:
+            parts.candidates.offer(obeying[0])
 
     def _settle_dstates_first(self) -> None:
         """If a map is known, continue from it with an engine that finds dstates first."""

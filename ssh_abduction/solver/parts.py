@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeAlias
 
 from ssh_abduction.data.checks import a_count_of_maps, a_flag
@@ -175,6 +176,11 @@ class Parts:
             self._take_over(start.after, start)
         self.watch.stop()
 
+    @cached_property
+    def silent(self) -> tuple[str, ...]:
+        """Warnings of rules of the user that have no effect."""
+        return tuple(never_true(self.task.problem))
+
     def _engine_after(self, after: Parts) -> Engine:
         """Return the engine of an earlier search if it can take more steps, else a new engine."""
         before = after.prefixes.engine
@@ -316,8 +322,7 @@ class Answer:
         warning = None
         if self._first and self._first.fit:
             warning = units_warning(trace) or noise_warning(self._first, trace)
-        silent = never_true(parts.task.problem)
-        return Support(self._basis or self._basis_of(size)).warning_of(warning, *silent)
+        return Support(self._basis or self._basis_of(size)).warning_of(warning, *parts.silent)
 
     def in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:
         """Sort the maps of each level into an order that is the same in each run.
