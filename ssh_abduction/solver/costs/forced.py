@@ -281,7 +281,7 @@ class Forcing:
                             joins, found, failed = visits.joined(joins, [(i, j)]), found + 1, 0
                         else:
                             failed += 1
-                state = _Proven(visits, joins, state.low, lacking)
+                state = state._replace(joins=joins)
                 if found:
                     break
             else:

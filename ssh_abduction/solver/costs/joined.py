@@ -473,8 +473,9 @@ class Joined:
     ) -> float:
         """Return a lower bound if some more dstates, and places, are apart."""
         of_dstates, of_places = self._dstates.changed(nodes), self._places.changed(places)
-        hard, shown = self._dstates.size(of_dstates), 0
+        hard = shown = 0
         if len(self.excused) > 1:
+            hard = self._dstates.size(of_dstates)
             shown = self._differ.size(self._differ.changed(nodes))
         return self.spoilt + min(
             max(
@@ -489,9 +490,10 @@ class Joined:
     def _misread(self, way: Gains, hard: int, shown: int) -> float:
         """Return the most that joins of dstates may gain, less what they misread at least.
 
-        There is a clique of `hard` dstates, and one of `shown` if no view is misread.
+        There is a clique of `hard` dstates, and one of `shown` if no view is misread. If `shown` is
+        0, no view may be misread.
         """
-        if len(self.excused) == 1:
+        if not shown:
             return math.inf
         left: list[float] = [*np.sort(way.dstates)[::-1].cumsum()[::-1].tolist(), 0.0]
         return max(

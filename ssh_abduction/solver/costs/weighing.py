@@ -213,20 +213,22 @@ class Weighing:
             forcing.force(self._most, 1)
             if self._lists_all(forcing):
                 return
-            for nearly in (ROUGHLY, NEARLY):
-                self._raise_bound(forcing.low)
-                for depth in (0, 1):
-                    for bound in forcing.bounds(self._most, self.bound, depth, nearly):
-                        self._raise_bound(bound)
-                if nearly == ROUGHLY:
-                    forcing.force(self._most, 2)  # this takes longer, but may be a proof
-                    if self._lists_all(forcing):
-                        return
+            self._bound(forcing, ROUGHLY)
+            forcing.force(self._most, 2)  # this takes longer, but may be a proof
+            if not self._lists_all(forcing):
+                self._bound(forcing, NEARLY)
         finally:
             self._raise_bound(forcing.low)
             returns = forcing.returns
             self._forced = [(one.first, one.second) for one in returns if one.of == "dstate"]
             self._base = max(self._base, self._misfit.of_returns(returns) / 2)
+
+    def _bound(self, forcing: Forcing, nearly: float) -> None:
+        """Raise the bound until the highest one by forced joins is known to the share `nearly`."""
+        self._raise_bound(forcing.low)
+        for depth in (0, 1):
+            for bound in forcing.bounds(self._most, self.bound, depth, nearly):
+                self._raise_bound(bound)
 
     def _lists_all(self, forcing: Forcing) -> bool:
         """Add all maps that are worth finding. Return whether this is a proof."""
