@@ -190,9 +190,7 @@ class LogMap:
         found["page.html"] = page.html
         files = {name: text.encode() for name, text in found.items()}
         if solution.maps:
-            from perception.store import written  # loads skops, which live does without
-
-            files["recogniser.skops"] = written(recogniser_of(trace, solution.maps[0]))
+            files["recogniser.skops"] = recogniser_file(trace, solution.maps[0])
         run = f"{json.dumps(self.to_dict(), indent=2, ensure_ascii=False)}\n"
         return {**files, "run.json": run.encode()}
 
@@ -212,6 +210,13 @@ def recogniser_of(trace: Trace, ssh_map: SSHMap) -> Any:
     image.
     """
     return new_recogniser(FLOOR).fit(images_of(trace), ssh_map.dstate_at)
+
+
+def recogniser_file(trace: Trace, ssh_map: SSHMap) -> bytes:
+    """Make the content of a file of `recogniser_of`, which `perception.store` reads."""
+    from perception.store import written  # loads skops, which live does without
+
+    return written(recogniser_of(trace, ssh_map))
 
 
 def seconds_driven(log: RobotLog) -> float | None:

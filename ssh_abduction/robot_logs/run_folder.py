@@ -15,7 +15,7 @@ from ssh_abduction.data.files import write_file
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page.content import Section
 from ssh_abduction.page.html import ground_in, view_page
-from ssh_abduction.robot_logs.log_maps import recogniser_of
+from ssh_abduction.robot_logs.log_maps import recogniser_file
 from ssh_abduction.robot_logs.log_report import OF_LOG
 from ssh_abduction.solution import Solution, with_names
 
@@ -52,9 +52,7 @@ def bring_up_to_date(maps: Path, change: Literal["names", "corrections", "maps"]
             kept = [section for section in ground.sections if section.title == OF_LOG]
             ground = replace(ground, sections=(Section("Summary", (SOLVED,)), *kept))
         if all(step.image is not None for step in trace.steps):
-            from perception.store import written  # loads skops, which live does without
-
-            recogniser = written(recogniser_of(trace, solution.maps[0]))
+            recogniser = recogniser_file(trace, solution.maps[0])
             write_file(folder / "recogniser.skops", recogniser)
         else:
             (folder / "recogniser.skops").unlink(missing_ok=True)
