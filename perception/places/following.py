@@ -375,9 +375,9 @@ class ScanMotion:
                 turned: list[tuple[float, Array, Array]] = []
                 if len(self.seen) >= FEW_POINTS:
                     tried = (guess + np.array([0, 0, turn]) for turn in turns if abs(turn) <= most)
-                    turned = [fit.improved(start, weight) for start in tried]
-                    ok = [m[0] >= WELL or abs(wrapped(m[1][2] - guess[2])) <= most for m in turned]
-                    turned = [m for m, good in zip(turned, ok, strict=True) if good]
+                    fits = (fit.improved(start, weight) for start in tried)
+                    at = guess[2]
+                    turned = [m for m in fits if m[0] >= WELL or abs(wrapped(m[1][2] - at)) <= most]
 
                 def gain(match: tuple[float, Array, Array]) -> float:
                     loss = min(_square(match[1], guess, weight) / 2, MISSED)

@@ -301,13 +301,15 @@ class RouteCourse:
         It has both ends of an edge with its middle in the leg. A leg leads across if it is less
         than AHEAD degrees from straight across.
         """
-        leg = self.course[end] - self.course[begin]
+        leg, least = self.course[end] - self.course[begin], math.sin(math.radians(AHEAD))
         for corridor in self.corridors:
-            for (p, one), (q, other) in pairwise(self.places):
-                if begin < (one + other) / 2 < end and {p, q} <= {*corridor.order}:
-                    ahead, least = self._ahead(corridor, begin, end), math.sin(math.radians(AHEAD))
-                    if abs(leg @ ahead) >= least * np.hypot(*leg) * np.hypot(*ahead):
-                        return corridor
+            if any(
+                begin < (one + other) / 2 < end and {p, q} <= {*corridor.order}
+                for (p, one), (q, other) in pairwise(self.places)
+            ):
+                ahead = self._ahead(corridor, begin, end)
+                if abs(leg @ ahead) >= least * np.hypot(*leg) * np.hypot(*ahead):
+                    return corridor
         return None
 
     def _straight(self, begin: int, end: int) -> Array:

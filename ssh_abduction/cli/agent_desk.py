@@ -107,11 +107,10 @@ class KnownMap:
         text = next((name for name in names if name.casefold() == bare), text)
         try:
             return *self.saved.thing(text), self.saved.numbered_or_named(text) is None
-        except MapError as error:
+        except MapError:
             if any(letter.isdigit() for letter in text):
                 raise
-            hint = str(error).rpartition("; did you mean ")
-            near = f"did you mean {hint[2]}" if hint[1] else "or a number, such as room4"
+            near = meant(text, names, 3).removeprefix("; ") or "or a number, such as room4"
             known = ", ".join(names) or "it has none"
             raise MapError(
                 f"{text}: expected a name of this map ({known}), got none of them; {near}"
