@@ -56,9 +56,7 @@ def main() -> None:
     now, timer = time.perf_counter, signal.ITIMER_REAL
     if options.clock == "cpu":
         now, timer = cpu_seconds, signal.ITIMER_PROF
-        # A search reads these clocks.
-        read = SimpleNamespace(perf_counter=cpu_seconds, thread_time=time.thread_time)
-        vars(clock)["time"] = vars(limits)["time"] = read
+        count_processor_time()
     instance = INSTANCES[options.instance]
     end_after(AROUND)
     for module in PEERS[tool].modules if tool in PEERS else ():
@@ -153,6 +151,12 @@ def cpu_seconds() -> float:
         used.ru_utime + used.ru_stime
         for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     )
+
+
+def count_processor_time() -> None:
+    """Let the searches of this process read processor time instead of wall-clock time."""
+    read = SimpleNamespace(perf_counter=cpu_seconds, thread_time=time.thread_time)
+    vars(clock)["time"] = vars(limits)["time"] = read
 
 
 def end_after(seconds: float, timer: int = signal.ITIMER_REAL) -> None:

@@ -26,26 +26,22 @@ import resource
 import signal
 import statistics
 import sys
-import time
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from arguments import add_number, add_pattern
-from cell import cpu_seconds, end_after
+from cell import count_processor_time, cpu_seconds, end_after
 from fault_cases import FAMILIES, PRICE, Case, Explanation
 from fault_peers import PEERS
 from scipy.optimize import linear_sum_assignment
 
 from ssh_abduction import SSHMap, Theory
-from ssh_abduction.runtime import clock
 from ssh_abduction.solution import Progress, Status
 from ssh_abduction.solver import Search
-from ssh_abduction.solver.asp import limits
 
 OURS, TOLD = "ssh-abduction", "ssh-abduction, told the kind"
 SOLVERS = (OURS, TOLD, *PEERS)
@@ -169,9 +165,7 @@ def work(sender: Connection, name: str, solver: str, seed: int, limit: float, me
                 {"status": "ok", "cpu": spent, **judged(case, [explanation], PEERS[solver].proves)}
             )
         else:
-            # A search reads these clocks.
-            read = SimpleNamespace(perf_counter=cpu_seconds, thread_time=time.thread_time)
-            vars(clock)["time"] = vars(limits)["time"] = read
+            count_processor_time()
             end_after(limit + MARGIN, signal.ITIMER_PROF)
             search(
                 sender, case, theory_for(case, FAMILIES[name].theory, told=solver == TOLD), limit
