@@ -27,7 +27,6 @@ from itertools import accumulate, chain
 
 import numpy as np
 
-from perception.appearance import ReciprocalTransformer
 from perception.errors import ImageWarning, LogError
 from perception.places import closures, following, log_checks, odometers, relations
 from perception.places.distinctive import WIDTH, WINDOW, Visit, find_visits
@@ -35,7 +34,6 @@ from perception.places.partings import with_partings
 from perception.places.tracing import closure_of, starts_of_drives, to_trace
 from perception.places.track import Array, Track, points_turned
 from perception.readers.scans import RobotLog
-from perception.views import ViewClusterer
 from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import named
@@ -260,6 +258,10 @@ def with_views(trace: Trace) -> Trace:
     There are few views, so that a place keeps its view even if objects move (Kuipers & Beeson 2002,
     section 3).
     """
+    # They load scikit-learn, and a robot that starts again should not wait for that.
+    from perception.appearance import ReciprocalTransformer
+    from perception.views import ViewClusterer
+
     images = ReciprocalTransformer(floor=0.3).fit_transform(
         np.array([step.image for step in trace.steps])
     )

@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
-import networkx as nx
 import numpy as np
 
 from perception.errors import LogError
@@ -237,6 +236,8 @@ class LiveLog:
 
         These are the largest part of the map that closures connect: only they have one frame.
         """
+        import networkx as nx
+
         grown = self.grown()
         track, visits, closings, poses = with_poses(grown.track, grown.visits, grown.closings)
         linked = nx.Graph()

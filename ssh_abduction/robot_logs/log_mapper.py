@@ -39,12 +39,8 @@ from ssh_abduction.data.groups import first_index_of, indices_of
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
-from ssh_abduction.page.content import Ground
-from ssh_abduction.page.html import view_page
-from ssh_abduction.robot_logs.log_ground import ground_of
-from ssh_abduction.robot_logs.log_maps import BARE
 from ssh_abduction.solution import Solution
-from ssh_abduction.solver import LimitError, Watch, in_process, solve
+from ssh_abduction.solver import LimitError, Watch, in_process
 
 NAMES = "drive.names"
 FORMAT, VERSION, MOST = "ssh-live-names", 2, 2**26
@@ -152,6 +148,13 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
     The watch is that of `in_process`, which stops the process of the search. Raises LogError if
     the search finds no map, and AbductionError if corrections contradict each other.
     """
+    # The process of the search needs them. A robot that starts again should not wait for them.
+    from ssh_abduction.page.content import Ground
+    from ssh_abduction.page.html import view_page
+    from ssh_abduction.robot_logs.log_ground import ground_of
+    from ssh_abduction.robot_logs.log_maps import BARE
+    from ssh_abduction.solver import solve
+
     grown = task.grown
     try:
         done = assembled(
