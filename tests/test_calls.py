@@ -405,7 +405,7 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "Speedups.without.names": "names",
         "Theory.from_dict.data": {},
         "Theory.from_toml.path": "theory.toml",
-        "Theory.require.step": replace(trace.steps[1], star=(1, 0, 1, 0)),
+        "Theory.lack_of.step": replace(trace.steps[1], star=(1, 0, 1, 0)),
         "Trace.from_steps.actions": ["travel"],
         "Trace.from_steps.views": ["a", "b"],
         "Trace.load.path": "trace.jsonl",

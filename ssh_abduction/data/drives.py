@@ -216,7 +216,7 @@ def joined_drives(drives: Sequence[Drive], ssh_map: SSHMap) -> tuple[tuple[str, 
     piece_of = ssh_map.piece_of
     classes = NodeClasses[tuple[str, int]]()
     for k, drive in enumerate(drives):
-        for label in ssh_map.dstate_at[drive.first : drive.stop]:
+        for label in {*ssh_map.dstate_at[drive.first : drive.stop]}:
             classes.merge(("piece", piece_of[label]), ("drive", k))
     groups = gathered((classes.of(("drive", k)), drive.name) for k, drive in enumerate(drives))
     return tuple(map(tuple, groups.values()))

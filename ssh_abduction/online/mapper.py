@@ -239,8 +239,9 @@ class OnlineMapper:
                 "of a drive; a mapper takes one drive, so solve the traces of all drives together"
             )
         trace = Trace((*self.trace.steps[:-1], last, step), odometry=self._odometry)
-        self.theory.require(last, f"step {number - 1}")
-        self.theory.require(step, f"step {number}")
+        for t, checked in ((number - 1, last), (number, step)):
+            if lack := self.theory.lack_of(checked):
+                raise TraceError(f"step {t}: {lack}")
         self._settler.check_star(step, number)
         self.trace = trace
 

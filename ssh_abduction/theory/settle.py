@@ -107,7 +107,8 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
         lifts=any(action.changes_floor for action in trace.actions),
     )
     for i, step in enumerate(trace.steps):
-        settled.require(step, trace.at(i))
+        if lack := settled.lack_of(step):
+            raise TraceError(f"{trace.at(i)}: {lack}")
     problem = Problem(trace, settled, evidence_of(settled, known.evidence if known else ()))
     if displacement == "use" and not settled.returns:
         problem = problem.changed(theory=replace(settled, returns=count_returns(problem)))

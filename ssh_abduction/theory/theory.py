@@ -18,7 +18,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.data.checks import a_path, a_text, a_whole_number, an_instance, an_object, one_of
+from ssh_abduction.data.checks import a_path, a_whole_number, an_instance, an_object, one_of
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.errors import TheoryError, TraceError, brief, named, said_of
 from ssh_abduction.data.files import read_at_most
@@ -277,17 +277,11 @@ class Theory(Choices):
             star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest)
         )
 
-    def require(self, step: Step, where: str) -> None:
-        """Check that a step has what the axioms need. `star` must not be auto.
+    def lack_of(self, step: Step) -> str | None:
+        """Say what a step lacks that the axioms need, and how to mend it; None if nothing.
 
-        Args:
-            step: The step to check.
-            where: The name of the step in messages.
-
-        Raises:
-            TraceError: The step lacks a star, or the kind of its action.
+        `star` must not be auto. A step may lack a star, or the kind of its action.
         """
-        a_text("where", where, TraceError)
         _checked_step(step)
         if (
             self.level == "topological"
@@ -295,32 +289,31 @@ class Theory(Choices):
             and step.action.kind is None
             and not step.action.unlinked
         ):
-            raise TraceError(
-                f'{where}: action.kind: expected "travel" or "turn" in a topological theory, got '
+            return (
+                'action.kind: expected "travel" or "turn" in a topological theory, got '
                 f"none for {brief(step.action.name)}; "
                 f'write {{"name": …, "kind": "travel"}} or {{"name": …, "kind": "turn", "turn": '
                 f'"right"}}, or take {CAUSAL}'
             )
         if self.star == "none":
-            return
+            return None
         if step.star is None:
-            raise TraceError(
-                f"{where}: star: expected one, as other steps have stars; add it, or take "
+            return (
+                "star: expected one, as other steps have stars; add it, or take "
                 f"{choice('star', 'none')}"
             )
-        if self.star == "alike":
-            return
-        if self.star == "gateways":
-            if step.gateways and (near := step.gateways.too_near):
-                raise TraceError(
-                    f"{where}: star: expected gateways that their spreads tell apart, got "
-                    f"{near[0]:g} and {near[1]:g} degrees; give smaller spreads, or merge the two"
-                )
-            return
+        if self.star == "gateways" and step.gateways and (near := step.gateways.too_near):
+            return (
+                f"star: expected gateways that their spreads tell apart, got {near[0]:g} and "
+                f"{near[1]:g} degrees; give smaller spreads, or merge the two"
+            )
+        if self.star in ("alike", "gateways"):
+            return None
         try:
             _ = step.openings
         except TraceError as error:
-            raise TraceError(f"{where}: {error}, or take {choice('star', 'none')}") from None
+            return f"{error}, or take {choice('star', 'none')}"
+        return None
 
     def check_steps(self, trace: Trace) -> None:
         """Check that the trace has all steps of the user's assertions.
