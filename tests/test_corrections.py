@@ -25,7 +25,7 @@ from ssh_abduction.data import (
     save_corrections,
     together,
 )
-from ssh_abduction.data.corrections import from_yaml, to_yaml
+from ssh_abduction.data.corrections import Said, from_yaml, to_yaml
 from ssh_abduction.data.drives import fingerprints_of
 from ssh_abduction.data.map_parts import Name, Region
 from ssh_abduction.data.star import Gateway, with_gateway
@@ -374,7 +374,10 @@ def test_solve_reports_corrections_that_contradict_the_trace(
     assert main(["correct", building, "--different", "monday:1,tuesday:1"]) == 0
     assert main(["correct", building, "--same-place", "monday:1,monday:2"]) == 0
     assert main(["correct", building, "--elsewhere", "monday:2,tuesday:1"]) == 0
-    assert main(["correct", building, "--same-place", "monday:1,tuesday:1"]) == 0
+    file = folder / "building" / "corrections.yaml"
+    said_so_far = load_corrections(file)  # a person may write in it what `correct` refuses
+    more = Said("same_place", ("monday:1", "tuesday:1"))
+    save_corrections(replace(said_so_far, pairs=(*said_so_far.pairs, more)), file)
     assert main(solving(folder)) == 20
     said = "it contradicts the trace, or another correction that is named here"
     assert capsys.readouterr().out.count(said) == 2
@@ -949,3 +952,15 @@ def test_a_route_avoids_a_place_whose_name_has_a_comma(
     capsys.readouterr()
     assert main(["route", maps, "--from", "d0", "--to", "p1", "--avoid", "room 1, left"]) == 1
     assert "avoid: expected a dstate of 'to' that is not avoided" in capsys.readouterr().err
+
+
+def test_joins_of_other_steps_may_not_contradict_a_sentence() -> None:
+    said = Corrections().with_pair("same_place", "a:1", "a:2").with_pair("same", "a:2", "a:3")
+    chain = "got a contradiction of same_place: a:1, a:2 and same: a:2, a:3; say the opposite"
+    with pytest.raises(MapError, match=chain):
+        said.with_pair("elsewhere", "a:1", "a:3")
+    assert said.with_pair("different", "a:1", "a:3")  # one place has several dstates
+    rejected = said.with_pair("elsewhere", "a:1", "a:2")
+    with pytest.raises(MapError, match="of elsewhere: a:1, a:2 and same: a:2, a:3"):
+        rejected.with_pair("same_place", "a:3", "a:1")
+    assert rejected.with_pair("same_place", "a:1", "a:2") != rejected  # replaces the opposite

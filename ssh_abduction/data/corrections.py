@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -243,13 +244,21 @@ class Corrections:
             second: Another step.
 
         Raises:
-            MapError: An argument is wrong.
+            MapError: An argument is wrong, or sentences about other steps contradict this one.
         """
         said = Said(kind, (first, second))
         about = [other for other in self.pairs if set(other.steps) == set(said.steps)]
         new = () if any(other.kind == kind for other in about) else (said,)
         wrong = [other for other in about if other.kind in _AGAINST[kind]]
-        return replace(self, pairs=(*(pair for pair in self.pairs if pair not in wrong), *new))
+        after = replace(self, pairs=(*(pair for pair in self.pairs if pair not in wrong), *new))
+        clash = _contradiction(after.pairs)
+        if said in clash:
+            others = " and ".join(str(one) for one in clash if one != said)
+            raise MapError(
+                f"{said}: expected what agrees with the other corrections, got a contradiction of "
+                f"{others}; say the opposite of one of these first"
+            )
+        return after
 
     def with_gateway(self, is_open: bool, seen: Iterable[tuple[str, float]]) -> Corrections:
         """Say that a gateway is open or closed. What was said about it before is replaced.
@@ -451,6 +460,20 @@ class Corrections:
             if near_quarter(way) == quarter and action is not None and action.kind == "travel":
                 why = f"the robot {what} {name} through it; say it is open"
                 raise self._contradicted(said, why)
+
+
+def _contradiction(pairs: Sequence[Said]) -> list[Said]:
+    """Find two steps that are said to be apart, and sentences that join them; empty if none."""
+    import networkx as nx
+
+    for kind, joins in (("different", ("same",)), ("elsewhere", ("same", "same_place"))):
+        joined = nx.Graph((*one.steps, {"said": one}) for one in pairs if one.kind in joins)
+        for apart in (one for one in pairs if one.kind == kind):
+            if joined.has_node(apart.steps[0]) and joined.has_node(apart.steps[1]):
+                with suppress(nx.NetworkXNoPath):
+                    chain = nx.shortest_path(joined, *apart.steps)
+                    return [apart, *(joined.edges[pair]["said"] for pair in pairwise(chain))]
+    return []
 
 
 def direction_in_words(way: float) -> str:
