@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import networkx as nx
 import numpy as np
 
 from perception.errors import LogError
@@ -423,7 +422,7 @@ class LiveNode:
         def answer(request: Any, response: Any) -> Any:
             try:
                 response.success, response.message = True, act(request)
-            except (AbductionError, nx.NetworkXException) as error:
+            except AbductionError as error:
                 response.success, response.message = False, str(error)
             return response
 
@@ -461,6 +460,8 @@ class LiveNode:
 
     def _route(self, _: Any) -> str:
         """The places on the shortest route, in metres, from `place` to `to`."""
+        import networkx as nx
+
         found = self.session.told
         at = {place["place"]: (place["x"], place["y"]) for place in found["places"]}
         graph = nx.Graph()
@@ -470,8 +471,10 @@ class LiveNode:
         if not at.keys() >= {*ends}:
             numbers = ", ".join(map(str, at)) or "none yet"
             raise LogError(f"places: expected two of {numbers}, got {ends}; set `place` and `to`")
-        way = nx.shortest_path(graph, *ends, "weight")
-        return " ".join(map(str, way))
+        try:
+            return " ".join(map(str, nx.shortest_path(graph, *ends, "weight")))
+        except nx.NetworkXNoPath as error:
+            raise LogError(str(error)) from None
 
     def _why(self, _: Any) -> str:
         """How sure the map is."""
