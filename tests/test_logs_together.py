@@ -18,6 +18,7 @@ import pytest
 from coarse import every_second_beam
 
 from perception.errors import LogError
+from perception.places import relations
 from perception.places.closures import VisitMatch
 from perception.places.importing import Imported, import_log, join_logs
 from perception.places.local_map import CELL, LocalScene, Match, Patch
@@ -188,6 +189,38 @@ def test_relations_of_three_drives_agree() -> None:
     # Without the third drive, nothing says which relation is right.
     assert agreeing_matches(drives, {(1, 2): wrong}) == {(1, 2): wrong}
     assert agreeing_matches(drives, {(1, 2): wrong + right}) == {(1, 2): []}
+
+
+@pytest.mark.parametrize(
+    ("here", "elsewhere", "told"),
+    [
+        ((0.97, 0.97, 0.97), (), True),
+        ((0.97, 0.97), (), False),  # too few
+        ((0.97, 0.97, 0.97), (0.85, 0.85, 0.85), True),
+        ((0.97, 0.97, 0.97), (0.94, 0.94, 0.94), False),  # it may be there as well
+        ((0.85, 0.85, 0.85, 0.85), (0.97, 0.97), False),  # fewer, but better
+    ],
+)
+def test_robot_is_located_where_walls_agree_best(
+    here: tuple[float, ...],
+    elsewhere: tuple[float, ...],
+    told: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = [
+        VisitMatch(k, k, Match(score, 0.0, np.array([x, 0.0]), 1.0, 0.1))
+        for x, scores in ((0.0, here), (20.0, elsewhere))
+        for k, score in enumerate(scores)
+    ]
+    poses = np.array([(0.0, 2.0 * k, 0.0) for k in range(len(here))])
+    empty = [LocalScene(np.zeros((0, 2)), np.zeros((1, 1), np.uint16), np.zeros(2))] * len(here)
+    drive = DriveScenes(empty, poses)
+    by_matches = lambda relation, *_: dict(  # noqa: E731 - as if walls agreed as matches do
+        enumerate(here if relation.here[0, 0] == 0.0 else elsewhere)
+    )
+    monkeypatch.setattr(relations, "_agreements", by_matches)
+    agreed = relations._surest(found, drive, drive)
+    assert agreed == (found[: len(here)] if told else [])
 
 
 def test_relation_that_puts_walls_into_free_space_does_not_count() -> None:

@@ -65,6 +65,16 @@ def test_match_that_slides_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     assert match(shifted, room) is None
 
 
+def test_only_shifts_with_enough_common_area_are_tried() -> None:
+    aside = Turned.of(scene(patch_of(0.0, 4.5, 0.0)), [0.0])  # its right part is out of reach
+    found = match(scene(patch_of()), aside)
+    assert found is not None
+    again = match(scene(patch_of()), aside, 0.5)
+    assert again is not None
+    assert again.shift.tolist() == found.shift.tolist()
+    assert match(scene(patch_of()), aside, 1.1) is None
+
+
 def test_match_of_another_room_scores_low() -> None:
     other = [(-5, -1), (5, -1), (5, 1), (-5, 1)]
     found = match(scene(patch_of()), Turned.of(scene(patch_of(corners=other)), ALL_TURNS.tolist()))

@@ -472,22 +472,28 @@ def _spread_out(at: Array) -> Array:
     return found.reshape(-1, SIDE, SIDE)
 
 
-def match(first: LocalScene, second: Turned) -> Match | None:
+def match(first: LocalScene, second: Turned, mutual: float = 0.0) -> Match | None:
     """Find the rotation and shift with which the maps of two places agree best.
 
     Returns None if the maps agree nowhere, or agree equally well at very different shifts. The
-    second place is given in the rotations to try.
+    second place is given in the rotations to try. Only shifts at which both maps observed at least
+    the share `mutual` of the area of the smaller one are tried. Without this, the two sides of a
+    wall agree best.
     """
     scene = second.scene
     least = OVERLAP * (len(first.walls) + len(scene.walls))
     if not least:
         return None
     scores = _scores(first.spectra, second.spectra, least)
+    if mutual:
+        area = min((one.codes & 1).sum() for one in (first, scene)) * (CELL / COARSE) ** 2
+        both = _correlated(first.spectra[2] * second.spectra[2])
+        scores = np.where(both >= mutual * area, scores, -np.inf)
     best = np.unravel_index(int(scores.argmax()), scores.shape)
     if scores[best] < HOPELESS or (spread := _spread(scores - scores[best])) >= SPREAD:
         return None
     coarse = np.array([_X[best[1:]], _Y[best[1:]]])
-    score, turn, shift = _refined(first, scene, float(second.turns[int(best[0])]), coarse)
+    score, turn, shift = refined(first, scene, float(second.turns[int(best[0])]), coarse)
     if math.dist(shift, coarse) > SLID:
         return None
     return Match(score, turn, shift, first.mutual(scene, turn, shift), spread)
@@ -518,7 +524,7 @@ def _spread(less: Array) -> float:
     return math.sqrt(float((weights * ((_X - x) ** 2 + (_Y - y) ** 2)).sum()))
 
 
-def _refined(
+def refined(
     first: LocalScene, second: LocalScene, turn: float, shift: Array
 ) -> tuple[float, float, Array]:
     """Improve a rotation and a shift step by step; return the score and both of them."""

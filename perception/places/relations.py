@@ -26,9 +26,9 @@ from statistics import median
 
 import numpy as np
 
-from perception.places.closures import KEPT, TURN, VisitMatch, is_reliable
+from perception.places.closures import KEPT, MUTUAL, SCORE, TURN, VisitMatch, is_reliable
 from perception.places.distinctive import Visit, patches_of
-from perception.places.local_map import LocalScene, Patch, Turned, match
+from perception.places.local_map import MOST, LocalScene, Patch, Turned, match, refined
 from perception.places.track import Array, Track, points_moved, points_turned
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.odometry import Pose
@@ -43,6 +43,10 @@ TURNS = [k * TURN for k in range(round(math.tau / TURN))]
 # most BESIDE metres apart, more than the share CLASHING of the wall points of the two visits lies
 # in free space of the other one.
 BESIDE, CLASHING = 6.0, 0.1
+# A station of a robot that may be anywhere shows WALLS pieces of wall that earlier stations did not
+# show. The known map lacks the share HIDDEN of the walls. A position is told if it is SURE times as
+# probable as any other.
+WALLS, HIDDEN, SURE = 10, 0.05, 100
 # Of a drive with cuts, at most this many visits are matched, as the time grows with the square.
 MATCHED = 200
 
@@ -125,7 +129,7 @@ class Relocation:
         self._scenes.append(LocalScene.of(patch, middle))
         self._poses.append(np.array([*middle, 0.0]))
         number = len(self._scenes) - 1
-        self._matching = _matched(self._known.scenes, self._scenes[number], number)
+        self._matching = _matched(self._known.scenes, self._scenes[number], number, MUTUAL)
         self._open = len(self._known.scenes)
 
     def go_on(self, share: float) -> tuple[Pose, Pose] | None:
@@ -142,7 +146,7 @@ class Relocation:
     def _located(self) -> tuple[Pose, Pose] | None:
         known, stations = self._known, DriveScenes(self._scenes, np.array(self._poses))
         kept = without_clashes(self._found, known, stations)
-        agreed = _largest(kept, _relations(kept, known.poses, stations.poses))
+        agreed = _surest(kept, known, stations)
         if not agreed:
             return None
         x, y, _ = here = stations.poses[-1].tolist()
@@ -157,12 +161,15 @@ def _reliable_matches(ours: DriveScenes, theirs: DriveScenes) -> list[VisitMatch
 
 
 def _matched(
-    scenes: Sequence[LocalScene], scene: LocalScene, number: int
+    scenes: Sequence[LocalScene], scene: LocalScene, number: int, mutual: float = 0.0
 ) -> Iterator[VisitMatch | None]:
-    """Match the scene with this number with each of some, in all rotations; None if unreliable."""
+    """Match the scene with this number with each of some, in all rotations; None if unreliable.
+
+    `mutual` is as in `match`.
+    """
     turned = Turned.of(scene, TURNS)
     for i, other in enumerate(scenes):
-        found = match(other, turned)
+        found = match(other, turned, mutual)
         yield VisitMatch(i, number, found) if found is not None and is_reliable(found) else None
 
 
@@ -320,6 +327,53 @@ def _largest(found: Sequence[VisitMatch], relations: _FrameMatches) -> list[Visi
     if max((votes[k] for k in np.flatnonzero(~best)), default=0) > most / 2:
         return []
     return [found[k] for k in np.flatnonzero(best).tolist()]
+
+
+def _surest(
+    found: Sequence[VisitMatch], known: DriveScenes, stations: DriveScenes
+) -> list[VisitMatch]:
+    """Find the relation of the frames that explains best what is seen, and list its matches.
+
+    The evidence for a relation is by how much the agreement at each station exceeds SCORE. The list
+    is empty if another relation has more than half of the evidence, and is not shown to be less
+    probable by the factor SURE. The robot may also be elsewhere. Then most stations match nothing
+    that is known to be there. So at least VOTES stations more have to match than do not.
+    """
+    sets, votes = _support(found, _relations(found, known.poses, stations.poses))
+    if max(votes, default=0) < VOTES:
+        return []
+    rest, options = np.ones(len(found), bool), list[tuple[float, int, dict[int, float]]]()
+    for k in sorted(range(len(found)), key=lambda k: -votes[k]):
+        if rest[k]:
+            rest &= ~sets[k]
+            agreed = [found[i] for i in np.flatnonzero(sets[k]).tolist()]
+            scores = _agreements(_relations(agreed, known.poses, stations.poses), known, stations)
+            options.append((sum(scores.values()) - SCORE * len(scores), k, scores))
+    (most, best, scores), *others = sorted(options, key=lambda option: -option[0])
+    for evidence, _, rival in others:
+        better = sum(scores[j] - rival[j] for j in scores.keys() & rival.keys())
+        odds = WALLS * better * math.log((1 - HIDDEN) / HIDDEN)
+        if evidence > most / 2 and odds < math.log(SURE):
+            return []
+    unmatched = len(scores) - votes[best]
+    if votes[best] - unmatched < VOTES:
+        return []
+    return [found[k] for k in np.flatnonzero(sets[best]).tolist()]
+
+
+def _agreements(
+    relation: _FrameMatches, known: DriveScenes, stations: DriveScenes
+) -> dict[int, float]:
+    """How well each station agrees with the nearest known local map, if one is near."""
+    found = {}
+    for j, (scene, (x, y, turned)) in enumerate(zip(stations.scenes, stations.poses, strict=True)):
+        at, turn, _ = relation.placed(np.array([x, y]))
+        far = np.hypot(*(known.poses[:, :2] - at).T)
+        if far.min() < MOST:
+            *middle, bent = known.poses[far.argmin()]
+            shift = points_turned(-bent, (at - middle)[None])[0]
+            found[j] = refined(known.scenes[far.argmin()], scene, turn + turned - bent, shift)[0]
+    return found
 
 
 def _support(
