@@ -24,10 +24,7 @@ from ssh_abduction.data.odometry import in_words
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.solver import Misfit, Search
 from ssh_abduction.solver.costs import weighing
-from ssh_abduction.solver.sources.metric.wrong_displacements import (
-    search_jumps,
-    wrong_displacements,
-)
+from ssh_abduction.solver.sources.metric.wrong_displacements import search_jumps
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.fields import FAULT
@@ -200,12 +197,6 @@ def test_annealing_with_a_jump_costs_at_most_the_true_cost() -> None:
     true = misfit.nats_of_course(*course, [jump]) + FAULT * search.theory.jumped
     assert min(found.values()) <= true + 1e-6 < found[()]
     assert parts.candidates.map_without((), most=true / 2) is None
-
-
-@pytest.mark.parametrize("jumps", [(), (17,), (11, 30)])
-def test_returns_vote_for_the_wrong_displacements(jumps: tuple[int, ...]) -> None:
-    labels = [t % 8 for t in range(48)]
-    assert sorted(wrong_displacements(circuit(48, jumps), labels, [None] * 48)) == list(jumps)
 
 
 def test_jumps_are_refused_where_unsupported() -> None:

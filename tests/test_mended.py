@@ -119,10 +119,10 @@ def test_unproven_maps_of_a_mended_trace_are_not_minimal() -> None:
     def too_late(
         mended: Trace, theory: Theory, most: int, seconds: float
     ) -> tuple[tuple[SSHMap, ...], bool]:
-        maps, _ = search._solve_mended(mended, theory, 1, seconds)
+        maps, _ = search._solve_part(mended, theory, 1, seconds)
         return (maps, True) if most == 1 else ((), False)
 
-    for solver, is_listed in ((search._solve_mended, True), (too_late, False)):
+    for solver, is_listed in ((search._solve_part, True), (too_late, False)):
         mending = Mending(search.parts.task, solver)
         (*_, best) = mending.maps()
         assert mending.minimal_maps(0) == ((best.map,), is_listed)
@@ -138,5 +138,5 @@ def test_piece_that_ran_out_of_time_is_no_clash(status: Status) -> None:
 
     trace = Trace.from_steps("abc", ["travel", "travel"])
     with patch.object(Search, "unranked", ended):
-        found = Search(trace)._solve_mended(trace, settle(trace, Theory()).theory, 1, 1.0)
+        found = Search(trace)._solve_part(trace, settle(trace, Theory()).theory, 1, 1.0)
     assert found == ((), status is Status.UNSATISFIABLE)

@@ -737,7 +737,7 @@ def test_unlisted_maps_of_least_cost_make_the_answer_incomplete(
     whole = solve(trace, work_limit=20)
     assert whole.complete
     with monkeypatch.context() as patched:
-        patched.setattr(Search, "_solve_mended", lambda *_, **__: ((), False))
+        patched.setattr(Search, "_solve_part", lambda *_, **__: ((), False))
         unlisted = solve(trace, work_limit=20)
     assert (unlisted.complete, unlisted.stopped) == (False, "work limit")
     monkeypatch.setattr(weighing, "RIVALS", 1)

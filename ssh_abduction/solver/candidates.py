@@ -81,13 +81,11 @@ class Candidates:
 
         It uses only the closures that are `believed`, given by their numbers; None means all.
         Later calls return the same beam, which goes on where it stopped. None without the speed-up
-        `greedy`, if the trace is long, or if the checker cannot check all axioms. Also None
-        if the trace has neither displacements nor stars at any angles, as sketches are better then.
+        `greedy`, if the trace is long, or if the checker cannot check all axioms. Only searches
+        that weigh maps ask for beams, so the trace has displacements.
         """
-        theory = self._task.theory
         if (
-            (theory.displacement != "use" and theory.star != "gateways")
-            or len(self._task.trace) > LONGEST
+            len(self._task.trace) > LONGEST
             or not self._task.speedups.greedy
             or not self._judging.can_accept
         ):
@@ -134,7 +132,7 @@ class Candidates:
     def joining(self) -> Joining | None:
         """Return a search that joins the maps of single drives.
 
-        None without displacements, or if lifts or faults within a drive are allowed.
+        None if lifts or faults within a drive are allowed.
         """
         if not (self._trusts_drives() and self._task.theory.several_drives):
             return None
@@ -151,7 +149,7 @@ class Candidates:
         the checker refuses the map. Also None where there are no beams, or with lifts or faults
         within a drive.
         """
-        if not (self._trusts_drives() and self._task.theory.displacement == "use"):
+        if not self._trusts_drives():
             return None
         from ssh_abduction.solver.sources.metric.overlay import smoothed_map  # loads numpy
 

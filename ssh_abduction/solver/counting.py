@@ -40,12 +40,12 @@ RELAXED = 1000
 class Counting:
     """Finds the minimal counts of maps in one search, and lists the maps that have them."""
 
-    def __init__(self, parts: Parts, solve_mended: Solver, *, goes_on: bool) -> None:
+    def __init__(self, parts: Parts, solve_part: Solver, *, goes_on: bool) -> None:
         """Prepare the search. The results are added to `parts.known`.
 
         If `goes_on`, the search goes on from an earlier search for the first steps.
         """
-        self._parts, self._solve_mended, self._goes_on = parts, solve_mended, goes_on
+        self._parts, self._solve_part, self._goes_on = parts, solve_part, goes_on
         # The minimal maps of a mended trace or of fewer rules, and whether they are all.
         self._minimal: tuple[tuple[SSHMap, ...], bool] | None = None
 
@@ -127,7 +127,7 @@ class Counting:
         from ssh_abduction.solver.mending import Mending  # loads numpy
 
         parts, known, most = self._parts, self._parts.known, self._parts.limits.most
-        mending = Mending(parts.task, self._solve_mended)
+        mending = Mending(parts.task, self._solve_part)
         try:
             for found in mending.maps():
                 parts.candidates.offer(found.map)
@@ -154,7 +154,7 @@ class Counting:
         """
         parts, known, task = self._parts, self._parts.known, self._parts.task
         most, theory = parts.limits.most or RELAXED, task.theory.replace(rules=())
-        maps, proven = self._solve_mended(task.trace, theory, most + 1, parts.watch.left())
+        maps, proven = self._solve_part(task.trace, theory, most + 1, parts.watch.left())
         obeying = [ssh_map for ssh_map in each_looking(maps) if parts.judging.accepts(ssh_map)]
         if proven and maps:
             first = Found.of(maps[0], task.theory)

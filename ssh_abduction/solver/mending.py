@@ -9,10 +9,8 @@ Two methods guess which steps have faults. If places have frames, visits are mer
 (`sources/symbolic/merging.py`). In any case, the causal theory with faults is solved
 (`exact/faulty.py`). A map with places becomes a map of that theory when its places are dropped.
 
-*Displacements.* Labels that were found without displacements show which displacements may be wrong
-(`sources/metric/wrong_displacements.py`). The labels of each better map may show further ones. A
-displacement that was guessed to be wrong may agree with the map after all. Then it is no fault of
-the map.
+*Displacements.* A sketch shows which displacements may be wrong. A displacement that was guessed to
+be wrong may agree with the map after all. Then it is no fault of the map.
 
 *Bound.* A map of the theory, without its places, is a causal map with the same dstates and with no
 more faults. So a lower bound for the causal theory holds here. If a mended trace has a map that
@@ -25,7 +23,7 @@ answer.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
@@ -34,7 +32,6 @@ from ssh_abduction.solution.values import Found
 from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.faulty import FaultyEngine
-from ssh_abduction.solver.sources.metric.wrong_displacements import wrong_displacements
 from ssh_abduction.solver.sources.symbolic.merging import Merging
 from ssh_abduction.solver.sources.symbolic.sketch import mended_sketch
 from ssh_abduction.solver.steps.faults import with_faults
@@ -44,7 +41,6 @@ from ssh_abduction.theory.theory import Theory
 # Mend the trace by at most this many cheapest causal maps. If there are more, the list of minimal
 # maps may be incomplete.
 MOST_CAUSAL = 200
-ROUNDS = 5  # the most rounds of finding wrong displacements; each begins with a better map
 # Solving a trace that was mended by merging takes at most MERGED seconds. Solving any mended trace
 # takes at most SHARE of the time that is left.
 MERGED, SHARE = 30.0, 0.5
@@ -78,17 +74,10 @@ class Mending:
 
     def maps(self) -> Iterator[Found]:
         """Yield maps of the whole trace, each better than the one before."""
-        if self._task.theory.jumped and self._task.theory.star == "frame":
-            merging = Merging(self._task.trace, self._task.theory, self._task.log.pairs)
-            merging.merge()
-            yield from self._by_missing_displacements(merging.labels(), merging.places())
-        yield from self._by_merging(self._task.trace)
+        yield from self._by_merging()
         self._causal.grow(len(self._task.trace))
         for causal in self._causal.improving_maps():
             yield from self._improving(self._minimal(self._mended(causal.map))[0])
-            if self._task.theory.jumped:
-                labels = causal.map.dstate_at
-                yield from self._by_missing_displacements(labels, [None] * len(labels))
         for mended in self._by_cheapest_causal_maps():
             yield from self._improving(self._minimal(mended)[0])
         yield from self._by_sketch()
@@ -123,39 +112,16 @@ class Mending:
             self._best = better
             yield better
 
-    def _by_merging(self, trace: Trace) -> Iterator[Found]:
+    def _by_merging(self) -> Iterator[Found]:
         """Yield a better map, found by merging visits robustly (`sources/symbolic/merging.py`).
 
-        Merging groups the visits, and the votes of the groups mend the trace. The trace is that of
-        the task, perhaps without some displacements.
+        Merging groups the visits, and the votes of the groups mend the trace.
         """
-        theory = self._task.theory
+        trace, theory = self._task.trace, self._task.theory
         if theory.star == "frame" and (theory.misread or theory.jumped):
             merging = Merging(trace, theory, self._problem(trace).pairs)
             merging.merge()
             yield from self._improving(self._minimal(merging.mended(), MERGED)[0])
-
-    def _by_missing_displacements(
-        self, labels: Sequence[int], places: Sequence[int | None]
-    ) -> Iterator[Found]:
-        """Yield better maps that treat displacements as wrong if they do not fit the labels.
-
-        If there is a better map, go on with its labels. Labels and places of steps were found
-        without displacements; an unknown place is None.
-        """
-        trace, tried = self._task.trace, set()
-        for _ in range(ROUNDS):
-            wrong = wrong_displacements(trace, labels, places)
-            if not wrong or wrong in tried:
-                return
-            tried.add(wrong)
-            before, without = self._best, trace.without_displacements_at(wrong)
-            yield from self._by_merging(without)
-            yield from self._improving(self._minimal(without, MERGED)[0])
-            if self._best is None or self._best is before:
-                return
-            labels = self._best.map.dstate_at
-            places = [self._best.map.dstates[label].place for label in self._best.map.dstate_at]
 
     def _by_cheapest_causal_maps(self) -> Iterator[Trace]:
         """Yield the distinct traces that the cheapest causal maps mend."""

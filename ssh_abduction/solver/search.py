@@ -54,7 +54,7 @@ from ssh_abduction.theory.theory import Theory
 if TYPE_CHECKING:
     from ssh_abduction.solver.costs.weighing import Weighing
 
-# The time limit of a search for the maps of a mended trace is at least this many seconds.
+# The time limit of a search for a part of the problem is at least this many seconds.
 SHORTEST = 0.05
 # Without a time limit, the proof of what all minimal maps share may take this many seconds, or as
 # long as the search took if that is more.
@@ -142,7 +142,7 @@ class Search:
                 problem, self.limits, checked_speedups(speedups), on_progress, begin, began
             )
             goes_on = begin.after is not None
-            self._counting = Counting(self.parts, self._solve_mended, goes_on=goes_on)
+            self._counting = Counting(self.parts, self._solve_part, goes_on=goes_on)
             self._answer = Answer(self.parts)
             self._weighing: Weighing | None = None
             if self.theory.weigh == "cost":
@@ -244,7 +244,7 @@ class Search:
         yield from self._searched()
         fall_back(parts, self._answer)
         self.clash = self.clash or late_clash(
-            parts, lambda trace, theory: self._solve_mended(trace, theory, 1, CLASHING, late=True)
+            parts, lambda trace, theory: self._solve_part(trace, theory, 1, CLASHING, late=True)
         )
         if self._weighing is not None:
             # If this takes too long after a limit, the map has no cost in nats.
@@ -310,7 +310,7 @@ class Search:
                 self.trace,
                 self.theory,
                 twos,
-                lambda trace, theory: self._solve_mended(trace, theory, 1, watch.left()),
+                lambda trace, theory: self._solve_part(trace, theory, 1, watch.left()),
             )
             return self.clash is not None
 
@@ -334,7 +334,7 @@ class Search:
         yield Source(fewest, lambda: True, find_fewest)
         # 4. The proof. One map more than wanted shows that not all are listed.
         most = self.limits.most and self.limits.most + 1
-        weighing.of_labels = lambda trace, theory, s: self._solve_mended(trace, theory, most, s)
+        weighing.of_labels = lambda trace, theory, s: self._solve_part(trace, theory, most, s)
         yield from weighing.proofs()
 
     def _run(self, sources: Iterable[Source], weighing: Weighing | None = None) -> None:
@@ -351,18 +351,19 @@ class Search:
             if self.status is Status.UNSATISFIABLE:
                 return
 
-    def _solve_mended(
-        self, mended: Trace, theory: Theory, most: int, seconds: float, *, late: bool = False
+    def _solve_part(
+        self, trace: Trace, theory: Theory, most: int, seconds: float, *, late: bool = False
     ) -> tuple[tuple[SSHMap, ...], bool]:
-        """Solve a mended trace (its faults are corrected) within the limits of this search.
+        """Solve a problem that is a part of this one, within the limits of this search.
 
-        The theory has no faults. At most `most` maps are listed; 0 for all. Returns the minimal
-        maps (none if the trace has no map) and True; or the best map known after that time and
-        False. If `late`, the limits of this search are over, and hold no more.
+        It may be a mended trace (its faults are corrected), a stretch of the trace, or a stricter
+        or weaker theory. The theory has no faults. At most `most` maps are listed; 0 for all.
+        Returns the minimal maps (none if the trace has no map) and True; or the best map known
+        after that time and False. If `late`, the limits of this search are over, and hold no more.
         """
         limits: dict[str, Any] = self.limits.of_part(max(seconds, SHORTEST))
         search = Search(
-            mended,
+            trace,
             theory,
             max_maps=most or None,
             speedups=self.parts.speedups,

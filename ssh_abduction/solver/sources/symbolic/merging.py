@@ -321,22 +321,6 @@ class Merging:
                         steps[t] = replace(steps[t], star=tuple(map(int, openings)))
         return replace(self._trace, steps=tuple(steps))
 
-    def labels(self) -> list[int]:
-        """Return a label for each step: 4 times its place, plus the slot (direction) there."""
-        return [
-            4 * self._group_of[number] + (slot + self._turn(number)) % 4
-            for number, visit in enumerate(self.visits)
-            for _, slot in visit.steps
-        ]
-
-    def places(self) -> list[int]:
-        """Return the place of each step, as a number."""
-        return [label // 4 for label in self.labels()]
-
-    def _turn(self, visit: int) -> int:
-        """Return the quarters by which a visit is turned in its group."""
-        return self._groups[self._group_of[visit]].members[visit]
-
     def _of_visit(self, number: int) -> _Group:
         """Make the group that consists of one visit."""
         views: dict[int, Counter[View]] = {}
