@@ -50,10 +50,14 @@ class World:
         self.building = building
         walls = building.segments.reshape(-1, 2)
         self.corner = walls.min(axis=0) - 1
-        self.blocked = np.zeros(np.ceil((np.ptp(walls, axis=0) + 2) / CELL).astype(int), bool)
-        for a, b in building.segments.reshape(-1, 2, 2):
-            self.blocked[line(*self.cell(a), *self.cell(b))] = True
-        self.clear = ndimage.distance_transform_edt(~self.blocked) * CELL
+        blocked = np.zeros(np.ceil((np.ptp(walls, axis=0) + 2) / CELL).astype(int), bool)
+        clear = []  # with open doors, and with shut ones
+        for segments in (building.segments, [opening.threshold for opening in building.openings]):
+            for a, b in np.array(segments).reshape(-1, 2, 2):
+                blocked[line(*self.cell(a), *self.cell(b))] = True
+            clear.append(ndimage.distance_transform_edt(~blocked) * CELL)
+        self.open, self.shut = clear
+        self.clear = self.open
 
     def cell(self, point: Any) -> tuple[int, int]:
         """The cell of a point."""
@@ -75,10 +79,13 @@ class World:
         return most
 
     def sees(self, point: Any, other: Any) -> bool:
-        """Whether no wall is between two points."""
+        """Whether neither a wall nor a shut door is between two points."""
         off = np.asarray(other) - point
         far = float(np.hypot(*off))
-        return self.ray(point, math.atan2(off[1], off[0]), far, 0.0) > far - 0.3
+        self.clear = self.shut
+        free = self.ray(point, math.atan2(off[1], off[0]), far, 0.0)
+        self.clear = self.open
+        return free > far - 0.3
 
     def metres(self, point: Any, other: Any) -> float:
         """The length of the shortest way between two points."""
@@ -99,8 +106,8 @@ class Follower:
         for said, onward in zip(sentences, [*sentences[1:], ""], strict=True):
             if said.startswith("turn around"):
                 self.bearing += math.pi
-            elif turn := re.match(r"turn (half |sharp )?(left|right)", said):
-                degrees = {None: 90, "half ": 45, "sharp ": 135}[turn[1]]
+            elif turn := re.match(r"turn (slightly |half |sharp )?(left|right)", said):
+                degrees = {None: 90, "slightly ": 25, "half ": 45, "sharp ": 135}[turn[1]]
                 go = re.match(r"go (\d+) m .*through", onward)
                 self.turn(degrees, turn[2], go and float(go[1]))
             elif said.startswith("go "):
@@ -108,7 +115,7 @@ class Follower:
 
     def walk(self, said: str) -> None:
         """Go as far as a sentence says."""
-        metres, nth = 0.0, re.search(r"to the (\w+) opening on the (left|right)", said)
+        metres, nth = 0.0, re.search(r"to the (?:(\w+) )?opening on the (left|right)", said)
         for part in said.split(", "):
             if far := re.match(r"(?:go )?(\d+) m", part):
                 metres = float(far[1])
@@ -136,16 +143,25 @@ class Follower:
         gone, self.trail, self.looked = 0.0, [self.at.copy()], [self.bearing]
         look_out = 2.0 if nth else 0.0  # The distance is rounded, so an opening may come later.
         while gone < metres + look_out:
-            if self.stride():
-                gone += STRIDE
+            if self.stride(shut=True) or (gone <= metres - 2.0 and self.stride()):
+                gone += math.dist(*self.trail[-2:])
             elif gone > metres - 2.0 or not self.look_around():
                 break  # This is far enough, or there is no other way.
         if nth:  # Go back to the opening.
             back = self.opening(metres, *nth)
             self.at, self.bearing = self.trail[back].copy(), self.looked[back]
 
-    def stride(self) -> bool:
-        """Make one stride ahead, in the middle of the way. False if there is a wall."""
+    def stride(self, shut: bool = False) -> bool:
+        """Make one stride ahead, in the middle of the way. False if there is a wall.
+
+        Words tell of each door on the way. So the follower takes a door for shut at first.
+        """
+        self.world.clear = self.world.shut if shut else self.world.open
+        made = self._made_stride()
+        self.world.clear = self.world.open
+        return made
+
+    def _made_stride(self) -> bool:
         turns = np.radians(np.arange(-40, 41, 10))
         score = [
             self.world.ray(self.at, self.bearing + turn, 3.0) - 1.5 * abs(turn) for turn in turns
@@ -153,7 +169,7 @@ class Follower:
         turn = float(turns[int(np.argmax(score))])
         ahead = np.array([math.cos(self.bearing + turn), math.sin(self.bearing + turn)])
         left = np.array([-ahead[1], ahead[0]])
-        options = [self.at + STRIDE * ahead + off * left for off in (-0.1, 0.0, 0.1)]
+        options = [self.at + STRIDE * ahead + off * left for off in (0.0, -0.1, 0.1)]
         options = [p for p in options if self.world.free(p)]
         if not options or max(score) < STRIDE:
             return False
@@ -178,7 +194,8 @@ class Follower:
             off = np.array(opening.middle) - self.at
             far, bend = float(np.hypot(*off)), self.bend(off)
             aslant = abs(math.sin(opening.along - self.bearing)) < ASLANT
-            ahead = far < max(metres + 1, VIEW) and abs(bend) < math.radians(60) and not aslant
+            fits = metres - max(2.0, 0.25 * metres) < far < max(metres + 1, VIEW)
+            ahead = fits and abs(bend) < math.radians(60) and not aslant
             if k not in passed and ahead and self.world.sees(self.at, opening.middle):
                 found.append((abs(bend) + 0.1 * abs(far - max(metres, 0.0)), k))
         return min(found)[1] if found else None
@@ -201,22 +218,21 @@ class Follower:
         """The turn from the direction of the follower to an offset, in radians."""
         return (math.atan2(off[1], off[0]) - self.bearing + math.pi) % math.tau - math.pi
 
-    def opening(self, metres: float, nth: str, side: str) -> int:
+    def opening(self, metres: float, nth: str | None, side: str) -> int:
         """The index of the point of the trail beside the nth opening on a side.
 
-        The follower counts the openings that it passed, and trusts its count if the distance fits.
-        Otherwise it takes the opening whose distance fits best.
+        The follower weighs its count and its distance: it may have counted one too many, or the
+        distance is rounded.
         """
         trail = np.array(self.trail)
         far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(trail, axis=0).T))])
         found = self.openings(trail, far, 1 if side == "left" else -1)
-        number = NTH.index(nth) if nth in NTH else int(re.sub(r"\D", "", nth)) - 1
         fits = max(1.5, 0.1 * metres)
-        if number < len(found) and abs(found[number] - metres) <= fits:
-            stop = found[number]
-        else:
-            stop = min([*found, math.inf], key=lambda s: abs(s - metres))
-            stop = stop if abs(stop - metres) <= fits else min(metres, far[-1])
+        likely = [(abs(s - metres) / fits, s) for s in found]
+        if nth:
+            number = NTH.index(nth) if nth in NTH else int(re.sub(r"\D", "", nth)) - 1
+            likely = [(abs(k - number) + error, s) for k, (error, s) in enumerate(likely)]
+        stop = min([*likely, (2.0, min(metres, far[-1]))])[1]
         return int(np.abs(far - stop).argmin())
 
     def openings(self, trail: Any, far: Any, side: int) -> list[float]:
@@ -254,9 +270,13 @@ class Follower:
             off = np.array(opening.middle) - self.at
             far, error = float(np.hypot(*off)), sign * self.bend(off) - math.radians(degrees)
             aslant = abs(math.sin(opening.along - math.atan2(off[1], off[0]))) < ASLANT
-            near = far < (to_door or 0.0) + VIEW and abs(error) < most and not aslant
+            metres = to_door or 0.0
+            fits = metres - max(2.0, 0.25 * metres) < far < metres + VIEW
+            # The follower may stand a metre aside, so the turn to a near door may differ.
+            wrong = max(0.0, abs(error) - (math.atan2(1.0, far) if to_door else 0.0))
+            near = fits and wrong < most and not (aslant and (far > 2.0 or not to_door))
             if near and self.world.sees(self.at, opening.middle):
-                doors.append((abs(error) + 0.1 * abs(far - (to_door or 0.0)), error))
+                doors.append((wrong + 0.1 * abs(far - metres), error))
         errors = np.radians(np.arange(-30, 31, 10))
         ways = self.bearing + sign * (math.radians(degrees) + errors)
         rays = [self.world.ray(self.at, way, 4.0) for way in ways]

@@ -14,6 +14,14 @@ The order of the places of a corridor of the map is judged by Kendall's tau: it 
 their true positions along the line that fits them best. A place is truly left of the path of a
 corridor if its shortest way through the free space of the plan leaves the path to the left. The
 path is the chain of the true positions of its places.
+
+    python benchmarks/indoors.py --drawn MAPS [MAPS ...]
+
+judges maps of real logs by `results/corridors.json`. A person drew these corridors on pictures of
+the scans, in the frame of the corrected poses of the log, before the paths were derived. A corridor
+of the map is turned and moved to the corrected positions of its places. Lines within BESIDE metres
+of each other are the same. A corridor of the map is false if less than PART of it is on a drawn
+one.
 """
 
 from __future__ import annotations
@@ -29,14 +37,21 @@ from typing import Any
 
 import numpy as np
 from follower import BODY, CELL, World
+from scipy.spatial.distance import cdist
 from skimage.graph import MCP_Geometric
+from skimage.transform import EuclideanTransform
 
+from perception.places.passages import resampled
 from simulator.plans import Plan
 from simulator.rounds import Building
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.building.derive import with_building
 from ssh_abduction.output.roads import place_of_steps
 from ssh_abduction.solution import Solution
+
+DRAWN = Path(__file__).parent / "results" / "corridors.json"
+BESIDE = 1.5  # metres
+WHOLE, PART = 0.8, 0.4  # of a drawn corridor is on one of the map
 
 
 def judged(
@@ -128,8 +143,50 @@ def left_of(line: Sequence[Any], where: dict[int, Any], world: World) -> dict[in
     return found
 
 
+def drawn(folder: Path) -> Counter[str]:
+    """Count the corridors of a real log that its map has whole, and print what is wrong."""
+    trace, counts = Trace.load(folder / "trace.jsonl"), Counter[str]()
+    ssh_map = with_building(Solution.load(folder / "maps.json").maps[0], trace)
+    seen: dict[int, list[Any]] = defaultdict(list)
+    for step, place in zip(trace.steps, place_of_steps(ssh_map), strict=True):
+        if place is not None:
+            seen[place].append(step.truth["pose"][:2])
+    where = {place: np.mean(poses, axis=0) for place, poses in seen.items()}
+    lines = {
+        name: resampled(np.array(line, float), CELL)
+        for name, line in json.loads(DRAWN.read_text())[trace.name].items()
+    }
+    at = {d.place: (p.x, p.y) for d, p in zip(ssh_map.dstates, ssh_map.fit.poses, strict=True)}
+    found = {}
+    for c in ssh_map.corridors:  # Each is turned and moved to the corrected positions.
+        moved = EuclideanTransform()
+        order = ssh_map.paths[c.path].order
+        moved.estimate(np.array([at[p] for p in order]), np.array([where[p] for p in order]))
+        found[f"{c.id} {c.order}"] = resampled(moved(np.array(c.line)), CELL)
+    for name, line in lines.items():
+        shares = {c: beside(line, other) for c, other in found.items()}
+        best = max(shares, key=lambda c: shares[c])
+        how = "whole" if shares[best] >= WHOLE else "broken" if shares[best] >= PART else "missed"
+        counts[how] += 1
+        print(f"  {name}: {how}, {shares[best]:.2f} of it is on corridor {best}")
+    for c, line in found.items():
+        if max(beside(line, other) for other in lines.values()) < PART:
+            counts["false"] += 1
+            print(f"  corridor {c}: false")
+    return counts
+
+
+def beside(line: Any, other: Any) -> float:
+    """The share of the points of a line, (n, 2) metres, that are beside another line."""
+    return float((cdist(line, other).min(axis=1) < BESIDE).mean())
+
+
 def main(arguments: list[str]) -> None:
     """Print a line for each map, and one for all."""
+    if arguments[0] == "--drawn":
+        for folder in arguments[1:]:
+            print(folder, dict(drawn(Path(folder))))
+        return
     total, maps = Counter[str](), 0
     for plan, log, folder in zip(*(iter(arguments),) * 3, strict=True):
         spaces = ET.parse(plan).getroot().iter("space")

@@ -28,6 +28,8 @@ from ssh_abduction.output.roads import place_of_steps
 # of less than HALF degrees is half a turn, and one of more than SHARP is sharp. A person who comes
 # to a door within ASLANT degrees sees it ahead.
 AHEAD, ASLANT, HALF, SHARP, BACK = 30, 45, 60, 120, 150
+# A bend that leads more than ASIDE metres to the side is told, even if it is a slight one.
+ASIDE = 4.0
 # Two bends to one side that are less than CLOSE metres apart are one corner.
 CLOSE = 2.0
 STRIDE = 2  # points of a course from one possible bend to the next
@@ -194,8 +196,10 @@ class Guide:
             pass  # The person turns behind the door.
         elif side in ("left", "right") and route.opens(begin, end, ("left", "right").index(side)):
             count = sum(b.side == side and b.metres > anchor + ONE for b in passed)
-            nth = NTH[count] if count < len(NTH) else f"{count + 1}th"
-            said.append(f"to the {nth} opening on the {side}")
+            nth = f"{NTH[count]} " if count < len(NTH) else f"{count + 1}th "
+            if any(b.side == side and abs(b.metres - anchor - ONE) < ONE for b in beside):
+                nth = ""  # Does the one at the beginning count?
+            said.append(f"to the {nth}opening on the {side}")
         said += [f"at {name}" for name in turning[:1]]
         return ", ".join(said)
 
@@ -261,11 +265,16 @@ class RouteCourse:
         while True:
             turn, spare = dict[int, float](), dict[int, float]()
             for before, at, after in zip(kept, kept[1:], kept[2:], strict=False):
-                start = at - 2 * near if at in out else before
-                bend = self._bearing(at, after) - self._bearing(start, at)
-                turn[at] = (bend + 180) % 360 - 180
+                door = at - near  # The way is across it.
+                came = (max(0, door - 2), door + 2) if at in out else (before, at)
+                bend = self._bearing(at, after) - self._bearing(*came)
+                bend = (bend + 180) % 360 - 180
+                if at in out and AHEAD < abs(bend) < BACK and self.corridor_of(at, after):
+                    bend = math.copysign(90, bend)  # The door is in the wall of the corridor.
+                turn[at] = bend
                 limit = ASLANT if at in to else AHEAD
-                if abs(turn[at]) < limit:
+                aside = math.sin(math.radians(turn[at])) * (self.metres[after] - self.metres[at])
+                if abs(turn[at]) < limit and abs(aside) < ASIDE:
                     spare[at] = abs(turn[at]) / limit
             if not spare:
                 break
@@ -298,15 +307,17 @@ class RouteCourse:
     def corridor_of(self, begin: int, end: int) -> Corridor | None:
         """Find the corridor that a leg leads along and not across, if any.
 
-        It has both ends of an edge with its middle in the leg. A leg leads across if it is less
-        than AHEAD degrees from straight across.
+        More than half of the leg is on edges with both ends in the corridor. A leg leads across if
+        it is less than AHEAD degrees from straight across.
         """
         leg, least = self.course[end] - self.course[begin], math.sin(math.radians(AHEAD))
         for corridor in self.corridors:
-            if any(
-                begin < (one + other) / 2 < end and {p, q} <= {*corridor.order}
+            inside = sum(
+                max(0, min(other, end) - max(one, begin))
                 for (p, one), (q, other) in pairwise(self.places)
-            ):
+                if {p, q} <= {*corridor.order}
+            )
+            if inside > (end - begin) / 2:
                 ahead = self._ahead(corridor, begin, end)
                 if abs(leg @ ahead) >= least * np.hypot(*leg) * np.hypot(*ahead):
                     return corridor
@@ -358,7 +369,8 @@ def _turn(degrees: float) -> str:
     """Say how to turn by some degrees to the left."""
     if abs(degrees) > BACK:
         return "turn around"
-    how = "half " if abs(degrees) < HALF else "sharp " if abs(degrees) > SHARP else ""
+    slight = "slightly " if abs(degrees) < AHEAD else "half "
+    how = slight if abs(degrees) < HALF else "sharp " if abs(degrees) > SHARP else ""
     return f"turn {how}{'left' if degrees > 0 else 'right'}"
 
 
