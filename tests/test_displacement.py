@@ -27,7 +27,8 @@ from ssh_abduction.data.odometry import Closure
 from ssh_abduction.runtime.clock import heeding
 from ssh_abduction.solver.asp.facts import causal_map
 from ssh_abduction.solver.geometry.fit import fit, poses_of
-from ssh_abduction.solver.geometry.poses import Poses, inverse, least_squares, system_solved
+from ssh_abduction.solver.geometry.linear import inverse, least_squares, system_solved
+from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.solver.geometry.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns

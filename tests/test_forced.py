@@ -28,7 +28,8 @@ from ssh_abduction.solver.costs import beams, forced
 from ssh_abduction.solver.costs.forced import Forcing
 from ssh_abduction.solver.costs.joined import Gains, Joined, Visits
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.geometry.poses import conditional, may_be_joined
+from ssh_abduction.solver.geometry import poses as poses_module
+from ssh_abduction.solver.geometry.poses import conditional, framed, may_be_joined
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.settle import settle
 
@@ -149,6 +150,72 @@ def test_slopes_of_the_spreads_are_those_by_differences(off: float) -> None:
     most = products[1:, 1:].max()
     assert most > 1e-5
     assert np.allclose(products[1:, 1:], slopes.T @ spread @ slopes, rtol=0, atol=0.01 * most)
+
+
+@pytest.mark.parametrize("level", ["topological", "causal"])
+@pytest.mark.parametrize("seed", [0, 1, 5, 18])
+def test_moves_of_joined_steps_bound_what_moves_of_each_map_cost(seed: int, level: str) -> None:
+    """Some joins of the true map are known. The bound holds for it, at its poses and at others."""
+    known = truth.random_walk(3, 30, seed, truth.Noise(Odometry(**ROUGH)))
+    theory, random = getattr(Theory, level)(), np.random.default_rng(seed)
+    problem = settle(known.trace, theory)
+    labels = partition(known.dstates)
+    places = partition(known.places) if level == "topological" else labels
+    misfit = Misfit(problem)
+    ((poses, _),) = misfit.bounding(labels, places)
+    at, frame = framed(poses)
+    if seed:
+        at = at * [0.2, 0.2, 0.5]  # a move may lead to many things
+    # Visits to some places are not joined yet.
+    open_place = random.random(max(places) + 1) < min(seed / 8, 0.5)
+    visit = [v if open_place[p] else -1 for v, p in zip(misfit.visit, places, strict=True)]
+    of, of_places = (partition([*zip(some, visit, strict=True)]) for some in (labels, places))
+    true, true_place = (
+        np.array([some[names.index(k)] for k in range(max(names) + 1)])
+        for some, names in ((labels, of), (places, of_places))
+    )
+    # Some of what is apart is known to be apart.
+    apart = (true[:, None] != true, true_place[:, None] != true_place)
+    hidden = [np.triu(random.random(some.shape) < seed / 8) for some in apart]
+    apart = apart[0] & ~(hidden[0] | hidden[0].T), apart[1] & ~(hidden[1] | hidden[1].T)
+    frames = np.zeros(len(true), dtype=int)
+    nats, saved, pulls = problem.prior.least_chosen(of, of_places, (at[true], frames), apart)
+    later = [[*some].index(k) < i for some in (true, true_place) for i, k in enumerate(some)]
+    low = nats - float(np.concatenate(saved) @ later)
+    joined = np.flatnonzero(later[: len(true)]).tolist()
+    assert nats > 0
+    assert len(pulls.first)
+
+    def off(laid: NDArray[np.float64], joined: Sequence[int] = ()) -> float:
+        (x, y, facing), moved = laid[pulls.first].T, pulls.moved.T
+        gone = (moved[0] + 1j * moved[1]) * np.exp(1j * facing) + x + 1j * y
+        gone -= laid[pulls.last, 0] + 1j * laid[pulls.last, 1]
+        turn = facing + moved[2] - laid[pulls.last, 2]
+        turn -= np.round(turn / (2 * np.pi)) * 2 * np.pi
+        square = np.stack([gone.real, gone.imag, turn], 1) ** 2 * pulls.weight
+        return float(square[~np.isin(pulls.of, joined)].sum() / 2)
+
+    for wide in (0.0, 0.3, 1.0, 3.0):
+        there = random.normal(size=(max(places) + 1, 2))[[places[labels.index(s)] for s in true]]
+        other = at[true] + wide * np.column_stack([there, random.normal(size=len(at))[true] / 5])
+        more = off(other) - off(at[true])
+        assert problem.prior.chosen(of, of_places, (other, frames)) >= nats + more - EQUAL
+        of_map = problem.prior.chosen(
+            labels, places, (other[[of[labels.index(s)] for s in range(len(at))]], frame)
+        )
+        assert of_map >= low + off(other, joined) - off(at[true], joined) - EQUAL
+    if not seed:  # dstates are those of the poses
+        unknown = poses.best[0]
+        slope, _ = poses_module._pulled(poses, unknown, pulls)
+
+        def cost(unknown: NDArray[np.float64]) -> float:
+            there = unknown[: 2 * poses._positions].reshape(-1, 2)[poses._place]
+            facing = unknown[2 * poses._positions : poses._known]
+            return off(np.column_stack([there, facing]))
+
+        tiny = 1e-5 * np.identity(len(unknown))
+        by_differences = [(cost(unknown + d) - cost(unknown - d)) / 2e-5 for d in tiny]
+        assert slope.sum(axis=1) == pytest.approx(by_differences, abs=1e-4)
 
 
 def test_without_a_displacement_the_bound_knows_no_covariance() -> None:

@@ -39,6 +39,7 @@ from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import fit
 from ssh_abduction.solver.geometry.poses import Poses
 from ssh_abduction.theory import prior as prior_module
+from ssh_abduction.theory.prior import AIM, UNKNOWN
 from ssh_abduction.theory.prior import _area as area
 from ssh_abduction.theory.settle import settle
 
@@ -223,6 +224,46 @@ def likelihood(trace: Trace, wide: list[float], samples: int = 200_000) -> float
     return float(np.exp(-square / 2).mean() / math.sqrt(np.linalg.det(math.tau * spread)))
 
 
+@pytest.mark.parametrize("last", ["travel", "left"])
+@pytest.mark.parametrize("theory", [Theory(star="none"), Theory.causal()], ids=["places", "causal"])
+def test_probabilities_of_where_a_move_leads_add_up_to_one(last: str, theory: Theory) -> None:
+    """After three sides of a square, a move leads to each of the known things or to a new one."""
+    way, turn = (9.0, 0.5, 0.1), (0.0, 0.0, 1.3)
+    actions = ["travel", "left", "travel", "left", "travel", last]
+    moved = [way, turn, way, turn, way, way if last == "travel" else turn]
+    trace = Trace.from_steps(range(7), actions, displacements=moved, odometry=Odometry())
+    problem = settle(trace, theory)
+    poses = np.zeros((7, 3))
+    for t, (dx, dy, angle) in enumerate(moved):
+        x, y, facing = poses[t]
+        cos, sin = math.cos(facing), math.sin(facing)
+        poses[t + 1] = x + cos * dx - sin * dy, y + sin * dx + cos * dy, facing + angle
+    known = [0, 1, 1, 2, 2, 3] if theory.level == "topological" else [*range(6)]
+    ways = [(known[s], s, poses[s]) for s in range(6)]
+    ways += [(place, 6, [*poses[known.index(place), :2], poses[6, 2]]) for place in {*known}]
+    total = 0.0
+    for place, dstate, pose in [*ways, (7, 6, poses[6])]:
+        stays, is_new = place == known[5], dstate == 6
+        if theory.level == "topological":
+            allowed = stays == (last == "left")
+        else:  # each dstate is a place
+            allowed = place == 7 if is_new else dstate < 5 or last == "left"
+        if allowed:
+            laid = np.array([*poses[:6], pose][: 6 + is_new]), np.zeros(6 + is_new, dtype=int)
+            course = [*range(6), dstate], [*known, place]
+            nats, others = (problem.prior.chosen(*course, laid, wrong) for wrong in ((), (6,)))
+            others -= float(problem.prior.saved[6] @ [place == 7, is_new])
+            total += math.exp(others - nats)
+    assert total == pytest.approx(1.0)
+
+
+def test_probabilities_of_what_a_step_shows_add_up_to_one() -> None:
+    all_shown = (Trace.from_steps(f"abcabcab{view}", ["travel", "left"] * 4) for view in "abc")
+    nats = [float(settle(trace, Theory()).prior.seen[-1, 0]) for trace in all_shown]
+    assert math.fsum(math.exp(-x) for x in nats) == pytest.approx(1.0)
+    assert min(nats) == nats[2]  # "c" came after the same view and action
+
+
 @pytest.mark.parametrize("off", [(0.0, 0.0, 0.0), (0.4, -0.2, 0.02)])
 def test_cost_of_a_loop_is_its_marginal_likelihood(off: tuple[float, float, float]) -> None:
     """Laplace's approximation and a random sample give the same density of a closed loop."""
@@ -238,8 +279,9 @@ def test_cost_of_a_loop_is_its_marginal_likelihood(off: tuple[float, float, floa
     prior, misfit = problem.prior, Misfit(problem)
     loop, way = ((0, 1, 2, 3, 0), (0, 1, 2, 3, 4))
     saved = misfit.nats_of_course(way, way) - misfit.nats_of_course(loop, loop)
-    # A new pose has the density 1 / (2 pi A), and there are as many as `crowd` says.
-    density = saved - float(prior.seen[0].sum()) + prior.crowd - math.log(math.tau * prior.area)
+    # The last move may lead to the first dstate or to a new pose. New poses lie around its end.
+    chance, wide = UNKNOWN.prod(), math.tau**1.5 * prior.near**2 * AIM
+    density = saved - float(prior.seen[4].sum()) + math.log(chance / wide)
     assert density == pytest.approx(math.log(likelihood(trace, prior.wide.tolist())), abs=0.05)
     for course in (loop, way):
         nats, _ = cost_of(trace, problem.theory, course, course, ())

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections import Counter
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from itertools import pairwise, product
 from statistics import median
@@ -32,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.data.errors import brief
-from ssh_abduction.data.groups import firsts, gathered
+from ssh_abduction.data.groups import NodeClasses, firsts, gathered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Closure, Covariance, Displacement, Odometry
 from ssh_abduction.data.trace import Trace
@@ -71,6 +70,10 @@ FAULT = 5.0
 SUSPECTED = 3.5
 # Where an alias lays a part on another one, dstates that face one way differ by less radians.
 TWIST = 0.4
+# A move may lead to headings within about this many radians of the one at its end.
+AIM = 0.5
+# How many new places, and new headings of a place, are there near known ones.
+PLACES, HEADINGS = 2 * math.exp(-2), AIM / math.sqrt(math.tau)
 # The direction from one place to another is too uncertain to use if they are closer than this many
 # metres.
 NEAR = 1.0
@@ -174,6 +177,7 @@ def cost_of(
     nats = square / 2 + errors.volume(model.wide) + model.of_steps()
     nats += FAULT * max(map(abs, aliases), default=0)
     nats += model.crowd * (len(at) - len(set(at)))
+    nats += model.chosen(dstates, at, errors.laid(dstates), wrong)
     for of, names in enumerate((dstates, at)):
         for name in set(names):
             nats += model.shown(of, [t for t, x in enumerate(names) if x == name])
@@ -215,6 +219,9 @@ class _Occam:
         each = median(usual) ** 2 if usual else area
         self.crowd, self.near = math.log(max(area / each / 2, 2)), math.sqrt(each) / 2
         self.wide: Array = np.diag([area / math.tau, area / math.tau, math.tau])
+        self._around = self.crowd - math.log(area / math.tau / self.near**2)
+        self._has_places = theory.level == "topological"
+        self._stays = self._has_places and "turn_stays" in theory.hard and not theory.jumped
         stars = [self._gateways(t) if theory.star != "none" else None for t in range(len(trace))]
         views = self._rarity(trace.views)
         self._shows: tuple[list[Any], list[Any]] = [*zip(trace.views)], [*zip(stars)]
@@ -236,20 +243,68 @@ class _Occam:
             ratio = (np.linalg.solve(spread[:k, :k], self.wide[:k, :k]) for k in (2, 3))
             dets = (np.linalg.slogdet(np.identity(len(some)) + some)[1] for some in ratio)
             position, both = (float(det) / 2 for det in dets)
-            nats += max(position - self.crowd, 0.0) + both - position
+            place, dstate = self._lucky(t)
+            nats += max(position - self.crowd + place, 0.0) - place
+            nats += max(both - position + dstate, 0.0) - dstate
+        return nats
+
+    def _lucky(self, t: int) -> tuple[float, float]:
+        """Return minus the nats that a new place, and heading, save at t, near nothing known."""
+        turns = self._stays and self._trace.actions[t - 1].kind == "turn"
+        return 0.0 if turns else self._around, math.log(HEADINGS)
+
+    def chosen(
+        self,
+        dstates: Sequence[int],
+        places: Sequence[int],
+        laid: Mapping[int, tuple[int, _Frame]],
+        wrong: Collection[int],
+    ) -> float:
+        """Return minus the logarithms of the probabilities of where new moves lead.
+
+        A move leads to something near its end: to a known dstate, to a new dstate of a known place,
+        or to a new place. `laid` has the piece of the map and the pose of each dstate.
+        """
+        first, first_at = ({x: t for t, x in [*enumerate(of)][::-1]} for of in (dstates, places))
+        moves = zip(dstates, self._trace.actions, dstates[1:], strict=False)
+        new = firsts(((s, a.name, x), (t, a.kind)) for t, (s, a, x) in enumerate(moves, 1))
+        nats = 0.0
+        for (begin, _, end), (t, kind) in new.items():
+            if (told := self._trace.steps[t].displacement) is None or t in wrong:
+                continue
+            stays = self._stays and kind == "turn"
+            goes = {(True, True), (False, False), (False, kind == "turn")}
+            there = _beyond(laid[begin][1], (complex(*told[:2]), told[2]))
+            near = 0.0 if stays else self.near
+            ways = 0.0 if stays else PLACES * HEADINGS
+            for s, u in first.items():
+                may = (stays, places[u] == places[t - 1]) in goes
+                if u < t and laid[s][0] == laid[begin][0] and may:
+                    far, turn = _unlikely(laid[s][1], there, near)
+                    ways += math.exp(-far - turn)
+                    if self._has_places and first_at[places[u]] == u:
+                        ways += HEADINGS * math.exp(-far)
+            is_new = first_at[places[t]] == t, first[end] == t
+            nats += sum(less for less, new in zip(self._lucky(t), is_new, strict=True) if new)
+            chosen = (PLACES if is_new[0] else 1.0) * (HEADINGS if is_new[1] else 1.0)
+            nats += max(math.log(ways / chosen) + sum(_unlikely(laid[end][1], there, near)), 0.0)
         return nats
 
     def shown(self, of: int, steps: Sequence[int]) -> float:
         """Return the nats of what steps at one dstate (of=0) or place (of=1) see."""
-        pick = min if self._theory.misread or self._theory.changed else max
-        return pick(self._seen[of][t] for t in steps)
+        return self._seen[of][self._showing(of, steps)]
+
+    def _showing(self, of: int, steps: Sequence[int]) -> int:
+        """Return the step of a dstate or place whose view or star counts: the first known one."""
+        if self._theory.misread or self._theory.changed:
+            return min(steps, key=self._seen[of].__getitem__)
+        return next((t for t in steps if self._seen[of][t]), steps[0])
 
     def repeated(self, of: int, steps: Sequence[int], others: Sequence[int]) -> float:
         """Return the nats saved if steps at one dstate or place see what it repeats of another."""
-        pick = min if self._theory.misread or self._theory.changed else max
         if not self._shows[of]:
             return 0.0
-        here, there = (pick(some, key=self._seen[of].__getitem__) for some in (steps, others))
+        here, there = (self._showing(of, some) for some in (steps, others))
         first, second = self._shows[of][here], self._shows[of][there]
         if None in (*first, *second):
             return 0.0
@@ -262,12 +317,23 @@ class _Occam:
         known = star is not None and all(gateway.open for gateway in star.gateways)
         return len(star.gateways) if star is not None and known else None
 
-    @staticmethod
-    def _rarity(seen: Sequence[Hashable]) -> list[float]:
-        """For each step, -log of the share of the steps that see the same; 0 if it is unknown."""
-        count = Counter(seen)
-        known = len(seen) - count[None]
-        return [0.0 if name is None else math.log(known / count[name]) for name in seen]
+    def _rarity(self, seen: Sequence[Hashable]) -> list[float]:
+        """For each step, -log of the probability of what it sees after the steps before it.
+
+        One more case stands for what was never seen before: after the same action where the same
+        was seen, the case is any view so far, and among all views so far, it is any view. What is
+        unknown has no cost.
+        """
+        kinds, nats = len({*seen} - {None}), list[float]()
+        before = [None, *zip((action.name for action in self._trace.actions), seen, strict=False)]
+        for t, name in enumerate(seen):
+            past = [(x, b) for x, b in zip(seen[:t], before, strict=False) if x is not None]
+            alike = [x for x, b in past if b == before[t] and t]
+            chance = (sum(x == name for x, _ in past) + 1 / max(kinds, 1)) / (len(past) + 1)
+            if t:
+                chance = (alike.count(name) + chance) / (len(alike) + 1)
+            nats.append(0.0 if name is None else -math.log(chance))
+        return nats
 
 
 class _Errors:
@@ -350,6 +416,15 @@ class _Errors:
             gone = pose[i, :2] + _turned(told, pose[i, 2]) - _turned(pose[j], angle)
             if alias:
                 motions[alias - 1] = np.append(gone, angle) / MISSING
+
+    def laid(self, dstates: Sequence[int]) -> dict[int, tuple[int, _Frame]]:
+        """Return the piece of the map, which displacements connect, and the pose of each dstate."""
+        pose, pieces = self._poses(self._best)[1], NodeClasses[int]()
+        moves = [(t - 1, t) for t in range(1, len(dstates)) if t not in self._missing]
+        for i, j in [*moves, *self._closures.T[self._alias == 0].tolist()]:
+            pieces.merge(dstates[i], dstates[j])
+        first = firsts((s, pose[t]) for t, s in enumerate(dstates)).items()
+        return {s: (pieces.of(s), (complex(x, y), float(turn))) for s, (x, y, turn) in first}
 
     def repeats(
         self, dstates: Sequence[int], places: Sequence[int], near: float
@@ -574,6 +649,16 @@ def _frames(
             yield _origin(beyond, pose[closure.last])
         if closure.first in stretch and closure.last in framed:
             yield _origin(pose[closure.last], beyond)
+
+
+def _unlikely(one: _Frame, other: _Frame, near: float) -> tuple[float, float]:
+    """Return how unlikely it is to come to a pose near another one: its position and heading.
+
+    If `near` is 0, the robot only turns.
+    """
+    far = abs(one[0] - other[0]) / near if near else 0.0
+    turn = math.remainder(one[1] - other[1], math.tau) / AIM
+    return far * far / 2, turn * turn / 2
 
 
 def _beyond(frame: _Frame, pose: _Frame) -> _Frame:

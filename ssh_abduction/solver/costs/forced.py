@@ -26,6 +26,7 @@ s be the slopes of their logarithms, as a vector, and C the covariance of the po
 are off by d raise χ²/2 by ½ d'C⁻¹d and lower the rest by at most s'd. So the cost is at least that
 at the poses of F less ½ s'Cs. This is the second order. The third is left out, so s'Cs is
 subtracted, twice as much. Products s'Cs of two classes that may both be joined are shared by them.
+What moves cost has slopes, too, and may make poses less sure (`Prior.least_chosen`).
 
 *All cheap maps.* If the bound is near the cost of the best map, list all maps of a cost below T.
 Take two classes that may be joined, and assume first that they are not, and then that they are. A
@@ -50,10 +51,10 @@ from ssh_abduction.runtime.clock import LONG_TURN, SHORT_TURN, look_at_clock
 from ssh_abduction.solver.costs.estimating import Course
 from ssh_abduction.solver.costs.joined import Gains, Ints, Joined, Visits
 from ssh_abduction.solver.costs.misfit import Misfit
-from ssh_abduction.solver.geometry.poses import Poses, conditional, may_be_joined
+from ssh_abduction.solver.geometry.poses import Poses, conditional, framed, may_be_joined
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
-from ssh_abduction.theory.prior import Array
+from ssh_abduction.theory.prior import Array, LeastMoves
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 
@@ -204,11 +205,9 @@ class Forcing:
             [*gathered(zip(of.tolist(), range(len(of)), strict=True)).values()]
             for of in (classes.node, classes.place)
         ]
-        shown = [
-            np.array([prior.least_shown(of, steps) for steps in some])
-            for of, some in enumerate(named)
-        ]
-        new = [prior.new[[steps[0] for steps in some], of] for of, some in enumerate(named)]
+        first = [[steps[0] for steps in some] for some in named]
+        shown = [prior.least_shown(of, steps) for of, steps in enumerate(first)]
+        new = [prior.new[steps, of] for of, steps in enumerate(first)]
         ways = self._bounding(tuple(classes.node.tolist()), tuple(classes.place.tolist()))
         for i, (poses, alias) in enumerate(ways):
             look_at_clock(LONG_TURN // 2)
@@ -217,10 +216,21 @@ class Forcing:
             least = poses.misfit() / 2 + sum(float(some[1:].sum()) for some in prices)
             found.append([Gains(least + alias, *prices)])
             if by_poses and may_be_joined(poses):
+                # Moves may end near nothing known.
+                known = [prior.saved[steps, 1 - of] for of, steps in enumerate(first)]
+                seen = [some - less for some, less in zip(seen, known, strict=True)]
                 nats = poses.likelihood(prior.wide)[1] + float(prior.base[-1]) + alias
                 nats += sum(float(some.sum()) for some in seen) - prior.crowd * len(named[1])
-                with suppress(np.linalg.LinAlgError):
-                    found[-1].append(self._joining(classes, named, poses, nats, seen))
+                ways_of_moves: list[LeastMoves | None] = [None]
+                if not i:
+                    course = classes.node.tolist(), classes.place.tolist()
+                    ways_of_moves.insert(
+                        0, prior.least_chosen(*course, framed(poses), classes.parted)
+                    )
+                for moves in ways_of_moves:
+                    with suppress(np.linalg.LinAlgError):
+                        found[-1].append(self._joining(classes, named, poses, nats, seen, moves))
+                        break
         return found
 
     def _joining(
@@ -230,11 +240,13 @@ class Forcing:
         poses: Poses,
         nats: float,
         seen: Sequence[Array],
+        moves: LeastMoves | None,
     ) -> Gains:
         """Compute what joins gain at most from how surely each class is predicted.
 
         `named` has the steps of each dstate and of each place, `nats` the cost of a map that joins
-        no classes, and `seen` what each dstate and place pays for what it shows.
+        no classes, `seen` what each dstate and place pays for what it shows, and `moves` what moves
+        cost.
         """
         prior = self._prior
         free = math.log(prior.wide[2]) / 2, math.log(prior.wide[0]) - prior.crowd
@@ -246,12 +258,15 @@ class Forcing:
             if steps[0] and classes.open[of][k]
         )
         columns = [[2 * k, 2 * k + 1] if of else [2 * len(named[1]) + k] for _, of, k in units]
-        logs, products = conditional(poses, [*chain(*columns)])
+        logs, products = conditional(poses, [*chain(*columns)], moves and moves.pulls)
         begins = np.cumsum([0, 1, *map(len, columns)])[:-1] if units else np.array([0])
         products = np.add.reduceat(np.add.reduceat(products, begins), begins, axis=1)
         # The least of cost + slope is half a product below the cost. Take it twice.
         more = 2 * products[0, 1:] + np.maximum(products[1:, 1:], 0.0).sum(1)
         more -= np.add.reduceat(logs, begins[1:] - 1) if units else 0.0
+        if moves:
+            nats += moves.nats
+            seen = [some + most for some, most in zip(seen, moves.saved, strict=True)]
         gains = [np.zeros(len(some)) for some in seen]
         for (_, of, k), nats_of in zip(units, more.tolist(), strict=True):
             gains[-of][k] = max(free[-of] + seen[-of][k] + nats_of, 0.0)

@@ -432,6 +432,11 @@ class Joined:
         return None
 
     @property
+    def parted(self) -> tuple[Flags, Flags]:
+        """Flag pairs of dstates, and of places, that are not joined."""
+        return self._dstates.apart, self._places.apart
+
+    @property
     def open(self) -> tuple[Flags, Flags]:
         """Flag the dstates, and the places, that may be joined with others."""
         return self._dstates.open, self._places.open

@@ -31,7 +31,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solution.values import Cost
 from ssh_abduction.solver.geometry.equations import Aliases, Equations, visits_by_turns
 from ssh_abduction.solver.geometry.fit import Explaining
-from ssh_abduction.solver.geometry.poses import Poses
+from ssh_abduction.solver.geometry.poses import Poses, framed
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.fields import FAULT
@@ -112,10 +112,11 @@ class Misfit:
         """
         prior = self._prior
         if aliases is None:
-            nats = self._explained(dstates, places, wrong)[1]
-            aliases = self.aliases_of(dstates, places, wrong)
+            _, nats, aliases = self._explained(dstates, places, wrong)
         else:
-            nats = self._explaining(_groups_of(dstates, places, wrong)).likelihood(aliases)[1]
+            of_map = self._explaining(_groups_of(dstates, places, wrong))
+            _, nats, _, poses = of_map.likelihood(aliases)
+            nats += prior.chosen(dstates, places, framed(poses), wrong)
         nats += float(prior.base[-1]) + prior.lost(wrong) + prior.shown(dstates, places)
         return nats - self._repeated(dstates, places, wrong, aliases)
 
@@ -170,7 +171,9 @@ class Misfit:
         """Return the misfit, the nats, and the aliases of the best explanation of the closures."""
         groups = _groups_of(dstates, places, wrong)
         if groups not in self._likelihood:
-            self._likelihood[groups] = found = self._explaining(groups).best()
+            square, nats, aliases, poses = self._explaining(groups).best()
+            nats += self._prior.chosen(dstates, places, framed(poses), wrong)
+            self._likelihood[groups] = found = square, nats, aliases
             if not self.trace.closures:
                 self._known[groups] = found[0]
         return self._likelihood[groups]

@@ -53,8 +53,7 @@ def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
 
 def poses_of(trace: Trace, ssh_map: SSHMap) -> Poses:
     """Collect the equations for the poses of a map of the whole trace, as it explains closures."""
-    of_map = Explaining.of_map(trace, ssh_map)
-    return of_map.poses(of_map.best()[2])
+    return Explaining.of_map(trace, ssh_map).best()[3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +97,8 @@ class Explaining:
         """Return the least chi-square with these aliases."""
         return self.poses(aliases).misfit()
 
-    def best(self) -> tuple[float, float, Aliases]:
-        """Return the chi-square, the cost in nats as in `Poses.likelihood`, and the aliases."""
+    def best(self) -> tuple[float, float, Aliases, Poses]:
+        """Return the chi-square, the nats as in `likelihood`, the aliases, and the poses."""
         n = self._closures
         believed = (0,) * n
         poses = self.poses(believed)
@@ -109,15 +108,15 @@ class Explaining:
             not n
             or (square - self.poses(believed, ()).minimum(poses.best[0])[1] - 3 * n) / 2 < FAULT
         ):
-            return square, nats, believed
-        found = self._assigned(n)
-        other, cost = self.likelihood(found)
-        return (square, nats, believed) if nats <= cost else (other, cost, found)
+            return square, nats, believed, poses
+        other = self.likelihood(self._assigned(n))
+        return (square, nats, believed, poses) if nats <= other[1] else other
 
-    def likelihood(self, aliases: Aliases) -> tuple[float, float]:
-        """Return the chi-square and the cost in nats with these aliases."""
-        square, nats = self.poses(aliases).likelihood(self.wide)
-        return square, nats + FAULT * _count(aliases)
+    def likelihood(self, aliases: Aliases) -> tuple[float, float, Aliases, Poses]:
+        """Return what `best` does with these aliases: the nats are those of `Poses`, and theirs."""
+        poses = self.poses(aliases)
+        square, nats = poses.likelihood(self.wide)
+        return square, nats + FAULT * _count(aliases), aliases, poses
 
     def repeats(self, aliases: Aliases, near: float) -> tuple[dict[int, int], dict[int, int]]:
         """Find the dstates, and the places, that repeat earlier ones: aliases lay one on the other.

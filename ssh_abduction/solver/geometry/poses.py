@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Sequence
-from contextlib import suppress
 from copy import copy
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -22,7 +21,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.sparse.linalg import splu
 from scipy.special import gammaincc
@@ -32,7 +31,19 @@ from ssh_abduction.data.maps import Fit, Pose
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import FIT, FIT_OF_ONE, look_at_clock
 from ssh_abduction.solver.geometry.equations import Equations
+from ssh_abduction.solver.geometry.linear import (
+    DENSE_INVERSE,
+    dense,
+    difference_matrix,
+    inverse,
+    least_squares,
+    matrix,
+    raised,
+    system_solved,
+    weighted,
+)
 from ssh_abduction.theory.evidence.loops import vectors_turned
+from ssh_abduction.theory.prior import Pulls
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -48,11 +59,6 @@ SWEEPS, HELD = 20, 1e-2
 # a weight that keeps poses in place if no equation determines them.
 LEAST_DAMPING, MOST_DAMPING, ROUNDS, STILL, NEARLY = 1e-12, 1e8, 100, 1e-10, 1e-4
 HELD_STILL = 1e-9
-# With at most this many unknowns, compute an inverse from a dense matrix. A matrix whose product
-# with itself takes at most DENSE_PRODUCT multiplications is dense.
-DENSE_INVERSE, DENSE_PRODUCT = 3000, 3_000_000
-# The share of the diagonal that least squares add to it, far above the rounding errors.
-DAMPING = 1e-10
 
 
 class Poses:
@@ -136,7 +142,7 @@ class Poses:
         for i, other in enumerate(others):
             by = other._jacobian(unknown, of_world=True)[: 3 * len(other._moved)]
             off = other._residuals(unknown)[: by.shape[0]].reshape(-1, 3)[rows]
-            by = _dense(by).reshape(-1, 3, self._size)[rows]
+            by = dense(by).reshape(-1, 3, self._size)[rows]
             spread = factor.solve(by.reshape(-1, self._size).T).T.reshape(by.shape)
             whole = np.identity(3) + np.einsum("nij,nkj->nik", by, spread)
             squares[i] = np.einsum("ni,ni->n", off, np.linalg.solve(whole, off[..., None])[..., 0])
@@ -221,7 +227,7 @@ class Poses:
         off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
         off -= math.tau * np.round(off / math.tau)
         heading = reckoned + least_squares(
-            _differences(self._from, self._to, self._headings), off, self._weights(2)
+            difference_matrix(self._from, self._to, self._headings), off, self._weights(2)
         )
         if self._group.max() > 0:
             onward = vectors_turned(self._moved[:, :2], heading[self._from])
@@ -287,18 +293,18 @@ class Poses:
         weights = self._weights(0)
         vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
         size = len(vectors), int(self._group.max()) + 1
-        turns = _matrix(vectors, np.arange(size[0]), self._group[self._from], size)
-        moves = _weighted(weights, self._moves())
-        mixed = _dense(moves.T @ turns)
+        turns = matrix(vectors, np.arange(size[0]), self._group[self._from], size)
+        moves = weighted(weights, self._moves())
+        mixed = dense(moves.T @ turns)
         square = moves.T @ moves
         held = 1e-9 * max(float(square.diagonal().max()), 1.0)
         best = system_solved(square, np.full(self._positions, held), mixed)
-        form: NDArray[np.complex128] = _dense(turns.conj().T @ turns) - mixed.conj().T @ best
+        form: NDArray[np.complex128] = dense(turns.conj().T @ turns) - mixed.conj().T @ best
         return form
 
     def _moves(self) -> Any:
         """Make the matrix that maps the x (or y) of positions to the x (or y) of displacements."""
-        return _differences(self._place[self._from], self._place[self._to], self._positions)
+        return difference_matrix(self._place[self._from], self._place[self._to], self._positions)
 
     def _weights(self, axis: int) -> Array:
         """Return about 1 / the standard deviation of displacements in x, y or turn (0, 1, 2).
@@ -390,7 +396,7 @@ class Poses:
             of = np.append(of, np.repeat(np.concatenate([motion + k for k in range(3)]), 3))
         # Scale and drift have a prior each: a last row with a single 1.
         rows, of = np.append(rows, [3 * m, 3 * m + 1]), np.append(of, self._size - np.array([2, 1]))
-        return _matrix(np.append(values, [1.0, 1.0]), rows, of, (3 * m + 2, self._size))
+        return matrix(np.append(values, [1.0, 1.0]), rows, of, (3 * m + 2, self._size))
 
     def _factored(self, unknown: Array, wide: Array) -> Any:
         """Factor the information matrix of the unknowns.
@@ -412,7 +418,7 @@ class Poses:
         first = np.zeros(self._size)
         x = 2 * int(self._place[self._origin])
         first[[x, x + 1, 2 * self._positions + self._origin]] = 1 / wide
-        return splu(csc_array(_raised(jacobian.T @ jacobian, first)))
+        return splu(csc_array(raised(jacobian.T @ jacobian, first)))
 
     def _volume(self, unknown: Array, wide: Array) -> float:
         """Compute -log of the marginal likelihood without the misfit.
@@ -456,7 +462,7 @@ class Poses:
         settled = 0
         if exact.any():
             look_at_clock()
-            rows = _dense(self._jacobian(unknown)[: len(exact)][exact])
+            rows = dense(self._jacobian(unknown)[: len(exact)][exact])
             # Turns at one place say nothing about positions. So most rows and columns are zero.
             rows = rows[rows.any(axis=1)][:, rows.any(axis=0)]
             settled = int(np.linalg.matrix_rank(rows)) if rows.size else 0
@@ -532,30 +538,34 @@ def may_be_joined(poses: Poses) -> bool:
     return not len(poses._missing[0]) and poses._size <= DENSE_INVERSE
 
 
-def conditional(poses: Poses, entries: Sequence[int]) -> tuple[Array, Array]:
+def conditional(
+    poses: Poses, entries: Sequence[int], pulls: Pulls | None = None
+) -> tuple[Array, Array]:
     """Compute how far some unknowns may be off if all before them in a list are known.
 
     The pose of the first step is known. `entries` are n entries of the vector of `gaussian`.
-    This is for poses without aliases, and no displacement may be missing.
+    This is for poses without aliases, and no displacement may be missing. Negative pulls make poses
+    less sure, but only in the products below.
 
     Raises:
-        numpy.linalg.LinAlgError: Some unknowns are known too exactly.
+        numpy.linalg.LinAlgError: Some unknowns are known too exactly, or pulls are too strong.
 
     Returns:
         The logarithms of the standard deviations, (n,).
         The products of the gradients of n + 1 functions of the unknowns, by their covariance,
-        (n + 1, n + 1): half of the logarithm of the determinant of the information matrix, and
-        then these n logarithms.
+        (n + 1, n + 1): half of the logarithm of the determinant of the information matrix, with
+        the pulls, and then these n logarithms, less the pulls of their dstates.
     """
     unknown, x = poses.best[0], 2 * int(poses._place[poses._origin])
     free = np.setdiff1d(range(poses._size), [x, x + 1, 2 * poses._positions + poses._origin])
     places = 2 * int(poses._place[: poses._dstates].max()) + 2
     of = np.array(entries, dtype=int)
     of = np.searchsorted(free, of + (of >= places) * (2 * poses._positions - places))
-    jacobian = _dense(poses._jacobian(unknown, of_world=True))[:, free]
+    jacobian = dense(poses._jacobian(unknown, of_world=True))[:, free]
     look_at_clock(poses._size**2 // 4)  # microunits: most of the time goes to filling matrices
     # The columns of this root are a basis of the unknowns, in which they have unit covariance.
-    root = np.linalg.inv(np.linalg.cholesky(jacobian.T @ jacobian)).T
+    information = jacobian.T @ jacobian
+    root = np.linalg.inv(np.linalg.cholesky(information)).T
     lower = np.linalg.cholesky(root[of] @ root[of].T)
     # The derivative of such a logarithm is that of -½ v'Hv, for a fixed vector v (below).
     vectors = np.zeros((poses._size, len(of)))
@@ -563,8 +573,28 @@ def conditional(poses: Poses, entries: Sequence[int]) -> tuple[Array, Array]:
     whole = np.zeros((poses._size, len(free)))
     whole[free] = root
     bent = np.column_stack([_bent(poses, unknown, whole).sum(1), -_bent(poses, unknown, vectors)])
+    if pulls is not None and len(pulls.first):
+        slope, weaker = _pulled(poses, unknown, pulls)
+        bent[:, 0] += slope.sum(axis=1)
+        for k, entry in enumerate(entries):
+            if entry >= places:
+                bent[:, k + 1] -= slope[:, pulls.of == entry - places].sum(axis=1)
+        root = np.linalg.inv(np.linalg.cholesky(information - weaker[free][:, free])).T
     slopes = root.T @ bent[free]
     return np.log(lower.diagonal()), slopes.T @ slopes
+
+
+def _pulled(poses: Poses, unknown: Array, pulls: Pulls) -> tuple[Array, Array]:
+    """Compute the gradients of n pulls, (size, n), and the information that they may take."""
+    other, n = copy(poses), len(pulls.first)
+    other._from, other._to, other._moved = pulls.first, pulls.last, pulls.moved
+    other._way, other._scaled, other._alias = np.zeros(n), np.zeros(n), np.zeros(n, dtype=int)
+    other._whitening = np.tile(np.identity(3), (n, 1, 1))
+    by, off = dense(other._jacobian(unknown))[:-2], other._residuals(unknown)[:-2]
+    weight = pulls.weight.ravel()
+    taken = np.where(np.repeat(pulls.of < 0, 3), np.maximum(-weight, 0.0), abs(weight))
+    slopes = by.T * (weight * off)
+    return slopes.reshape(-1, n, 3).sum(axis=2), by.T @ (taken[:, None] * by)
 
 
 def _bent(poses: Poses, unknown: Array, vectors: Array) -> Array:
@@ -609,104 +639,12 @@ def laid_with_motions(poses: Poses) -> tuple[Array, Array, NDArray[np.int_], Arr
     return at[: int(place.max()) + 1], facing[: poses._dstates], place, motions
 
 
+def framed(poses: Poses) -> tuple[Array, NDArray[np.int_]]:
+    """Return the best pose of each dstate, (dstates, 3), and its group of connected headings."""
+    at, facing, place, _ = laid_with_motions(poses)
+    return np.column_stack([at[place], facing]), poses._group[: len(place)]
+
+
 def _graph(first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
     """Make a graph of `size` nodes from the ends of its edges, as a sparse matrix."""
     return csr_array((np.ones(len(first)), (first, second)), shape=(size, size))
-
-
-def _matrix(
-    values: NDArray[Any], rows: NDArray[np.int_], columns: NDArray[np.int_], shape: tuple[int, int]
-) -> Any:
-    """Make a matrix. Add up values with the same row and column.
-
-    A small one is dense, as scipy takes longer to make it sparse than to multiply it.
-    """
-    if shape[0] * shape[1] ** 2 > DENSE_PRODUCT:
-        return csr_array((values, (rows, columns)), shape=shape)
-    made = np.zeros(shape, dtype=values.dtype)
-    np.add.at(made, (rows, columns), values)
-    return made
-
-
-def _dense(matrix: Any) -> NDArray[Any]:
-    """Return a dense or sparse matrix as a dense one."""
-    dense: NDArray[Any] = matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
-    return dense
-
-
-def _weighted(weights: Array, matrix: Any) -> Any:
-    """Multiply each row of a dense or sparse matrix by its weight."""
-    if isinstance(matrix, np.ndarray):
-        return weights[:, None] * matrix
-    return diags_array(weights) @ matrix
-
-
-def _raised(square: Any, added: Array) -> Any:
-    """Add n numbers to the diagonal of a dense or sparse n x n matrix."""
-    return square + (np.diag(added) if isinstance(square, np.ndarray) else diags_array(added))
-
-
-def _differences(first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> Any:
-    """Make the matrix that maps a vector x to the differences x[second] - x[first]."""
-    each = np.arange(len(first))
-    values, rows = np.repeat([1.0, -1.0], len(first)), np.concatenate([each, each])
-    return _matrix(values, rows, np.concatenate([second, first]), (len(first), size))
-
-
-def system_solved(square: Any, added: Array, right: Any) -> Any:
-    """Solve a linear system after adding n numbers to the diagonal of its n x n matrix."""
-    whole = _raised(square, added)
-    if isinstance(whole, np.ndarray):
-        return np.linalg.solve(whole, right)
-    return splu(whole.tocsc().astype(right.dtype)).solve(right)
-
-
-def least_squares(some: Any, values: Array, weights: Array) -> Array:
-    """Solve a system by weighted least squares. Of several solutions return nearly the smallest.
-
-    `values` may have several columns. Each is solved for by itself.
-    """
-    weighted = _weighted(weights, some)
-    normal = weighted.T @ weighted
-    scale = normal.diagonal()
-    # A little damping makes the matrix regular, even if there are no equations.
-    damping = DAMPING * (scale + (scale.max() or 1.0))
-    right = weighted.T @ (values.T * weights).T
-    found: Array = system_solved(normal, damping, right)
-    return found
-
-
-def inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
-    """Compute some rows, and the same columns, of the inverse of a symmetric n x n matrix.
-
-    The n numbers in `added` are added to its diagonal.
-    """
-    block = connected_components(csr_array(square), directed=False)[1]
-    found = np.zeros((len(rows), len(rows)))
-    for name in np.unique(block[rows]):
-        look_at_clock()
-        own, wanted = np.flatnonzero(block == name), np.flatnonzero(block[rows] == name)
-        part = square[own][:, own]
-        found[np.ix_(wanted, wanted)] = _block_inverse(
-            part, added[own], np.searchsorted(own, rows[wanted])
-        )
-    return found
-
-
-def _block_inverse(square: Any, added: Array, rows: NDArray[np.intp]) -> Array:
-    """Compute the same as `inverse` at once."""
-    if square.shape[0] <= DENSE_INVERSE:
-        # If these rows come last, the wanted part of the inverse depends only on the last block of
-        # the Cholesky factor.
-        order = np.concatenate([np.setdiff1d(np.arange(len(added)), rows), rows])
-        with suppress(np.linalg.LinAlgError):
-            whole = _raised(_dense(square), added)
-            factor = np.linalg.cholesky(whole[np.ix_(order, order)])
-            first = len(order) - len(rows)
-            root = solve_triangular(factor[first:, first:], np.identity(len(rows)), lower=True)
-            part: Array = root.T @ root
-            return part
-    columns = np.zeros((len(added), len(rows)))
-    columns[rows, np.arange(len(rows))] = 1.0
-    found: Array = system_solved(square, added, columns)[rows]
-    return found

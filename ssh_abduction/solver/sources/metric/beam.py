@@ -30,6 +30,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
+import numpy as np
+
 from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.drives import frames_of
 from ssh_abduction.data.maps import SSHMap
@@ -47,6 +49,7 @@ from ssh_abduction.solver.sources.metric.sights import DEAREST, Sights
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.fields import FAULT
+from ssh_abduction.theory.prior import UNKNOWN
 from ssh_abduction.theory.settle import Problem
 
 # The checker checks the beam after each CHECKED_EVERY steps.
@@ -157,16 +160,38 @@ class Extending:
         landing = self._landing(moved, t)
         dstate, new_place = (self._dstate[t], self._place[t]) if joins else (0.0, 0.0)
         options = []
+        new, at_place, at_dstate = self._chosen(moved, t)
         if not stays and landing is None:
-            options.append(Extension(moved.nats + dstate + new_place, None, None, moved))
+            options.append(Extension(moved.nats + dstate + new_place + new, None, None, moved))
         possible = [p for p in self._possible(moved, t, stays=stays) if landing in (None, p)]
         for place, square, cost, near in self._near(moved, t, possible):
             if stays or square / 2 <= DEAREST:
                 nats = moved.nats + (0.0 if stays else self.sights.changes(moved.sights[place], t))
                 if self._has_places:
-                    options.append(Extension(nats + dstate + cost, place, None, near, square))
-                options += self._at_known_dstates(moved, nats, place, t)
+                    more = dstate + cost + at_place[moved.places.index(place)]
+                    options.append(Extension(nats + more, place, None, near, square))
+                options += self._at_known_dstates(moved, nats, place, t, at_dstate)
         return self._cheapest(options, t)
+
+    def _chosen(self, moved: Hypothesis, t: int) -> tuple[float, list[float], list[float]]:
+        """Return the nats that the choice of where step t is costs, as `Prior.chosen` has them.
+
+        They are those of a new place, of a new dstate at the place of each dstate, and of each
+        dstate.
+        """
+        prior, (poses, piece) = self._problem.prior, moved.laid
+        known = piece[None] == moved.pieces.here
+        nats, far, turned = np.zeros(1), np.zeros(known.shape), np.zeros(known.shape)
+        place, dstate = prior.saved[t]
+        if self._trace.steps[t].displacement is not None and (t, "jumped") not in moved.faults:
+            places = np.array(moved.places)
+            here, laid = places[[moved.here]], (poses, places)
+            nats, far, turned, *_ = prior.choices(
+                np.array([t]), moved.mean[None, -3:], here, laid, known
+            )
+            place, dstate = -np.log(UNKNOWN)
+        near, turned = np.where(known, [nats[:, None] + far, turned], 0.0)[:, 0]
+        return float(nats[0]) + place + dstate, (near + dstate).tolist(), (near + turned).tolist()
 
     def _along_link(self, moved: Hypothesis, dstate: int, t: int) -> list[Extension]:
         """List the way, if it is allowed, to the dstate to which a known link leads."""
@@ -209,14 +234,19 @@ class Extending:
         )
 
     def _at_known_dstates(
-        self, moved: Hypothesis, nats: float, place: int, t: int
+        self, moved: Hypothesis, nats: float, place: int, t: int, more: Sequence[float]
     ) -> Iterator[Extension]:
-        """Yield the ways to the known dstates of a place. `nats` is their cost without misfit."""
+        """Yield the ways to the known dstates of a place. `nats` is their cost without misfit.
+
+        Each dstate has `more` nats for being chosen.
+        """
         for s, p in enumerate(moved.places):
             if p == place and (misread := self._misread(moved, s, t)) < math.inf:
                 facing = fitted(moved, place, s)
                 (square,), (cost,) = self.reckoning.squares(facing, t, [place], s)
-                yield Extension(nats + misread + float(cost), place, s, facing, float(square))
+                yield Extension(
+                    nats + misread + float(cost) + more[s], place, s, facing, float(square)
+                )
 
     def _cheapest(self, options: Sequence[Extension], t: int) -> list[Extension]:
         """List the allowed options that cost little more than the cheapest one, by cost."""
@@ -464,9 +494,9 @@ class Beam:
         """Return the cost of a hypothesis besides its displacements, in nats."""
         labels = [*found.labels.values()]
         places = [found.places[s] for s in labels]
-        price = self._problem.prior.shown(labels, places) + float(
-            self._problem.prior.base[len(labels) - 1]
-        )
+        prior, wrong = self._problem.prior, [t for t, kind in found.faults if kind == "jumped"]
+        price = prior.shown(labels, places) + float(prior.base[len(labels) - 1])
+        price += prior.chosen(labels, places, found.laid, wrong)
         price += sum(map(self._sights.along, found.sights))
         price += sum(self._fault[kind][t] for t, kind in found.faults)
         if "misread" in self._fault:

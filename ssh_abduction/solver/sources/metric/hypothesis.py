@@ -204,6 +204,11 @@ class Hypothesis:
         """The position and the heading of each dstate."""
         return self.positions[self.places], self.mean[self.heading]
 
+    @property
+    def laid(self) -> tuple[Array, NDArray[np.int_]]:
+        """The pose of each dstate, (dstates, 3), and its piece."""
+        return np.column_stack(self.poses), np.array(self.pieces.of_heading)
+
     def slips(self, t: int) -> bool:
         """Whether the action to step t, the newest step, slipped."""
         return self.faults[-1:] == ((t - 1, "slipped"),)

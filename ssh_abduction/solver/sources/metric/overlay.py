@@ -103,7 +103,8 @@ class Overlay:
         slack = SLACK * both.usual_travel(problem.trace)
         self._spreads = spreads_of(problem.trace).max(axis=0) + np.array([slack, slack, SLACK]) ** 2
         # What each dstate shows of itself, and of its place, in nats; and a dstate of each place.
-        self._shown = problem.prior.seen[[self._step_at[s] for s in range(len(both.places))]]
+        begins = firsts((s, t) for t, s in sorted(both.labels.items()))
+        self._shown = problem.prior.seen[[begins[s] for s in range(len(both.places))]]
         self._first = firsts(zip(both.places, range(len(both.places)), strict=True))
         links: list[dict[int, int]] = [{} for _ in both.places]
         for (s, action), x in both.links.items():
@@ -346,8 +347,9 @@ class Overlay:
             p, q = sorted(state.place[self._both.places[i]] for i in (s, x))
             headings = self._heading[s], self._heading[x]
             # The merged dstate has the most frequent view if views may be misread (`Prior.shown`).
-            saved = max if self._problem.theory.misread else min
-            state.nats -= float(saved(self._shown[[s, x], 0]))
+            one, other = self._shown[[s, x], 0]
+            is_misread = self._problem.theory.misread
+            state.nats -= float(max(one, other) if is_misread else other * (one > 0))
             if p == q:
                 self._condition([headings])
             else:
