@@ -14,6 +14,7 @@ the goal.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import re
@@ -50,14 +51,15 @@ class World:
         self.building = building
         walls = building.segments.reshape(-1, 2)
         self.corner = walls.min(axis=0) - 1
-        blocked = np.zeros(np.ceil((np.ptp(walls, axis=0) + 2) / CELL).astype(int), bool)
-        clear = []  # with open doors, and with shut ones
-        for segments in (building.segments, [opening.threshold for opening in building.openings]):
-            for a, b in np.array(segments).reshape(-1, 2, 2):
-                blocked[line(*self.cell(a), *self.cell(b))] = True
-            clear.append(ndimage.distance_transform_edt(~blocked) * CELL)
-        self.open, self.shut = clear
-        self.clear = self.open
+        self.blocked = np.zeros(np.ceil((np.ptp(walls, axis=0) + 2) / CELL).astype(int), bool)
+        self._block(building.segments)
+        self.shut = copy.deepcopy(self)  # with shut doors
+        self.shut._block([opening.threshold for opening in building.openings])
+
+    def _block(self, segments: Any) -> None:
+        for a, b in np.array(segments).reshape(-1, 2, 2):
+            self.blocked[line(*self.cell(a), *self.cell(b))] = True
+        self.clear = ndimage.distance_transform_edt(~self.blocked) * CELL
 
     def cell(self, point: Any) -> tuple[int, int]:
         """The cell of a point."""
@@ -82,10 +84,7 @@ class World:
         """Whether neither a wall nor a shut door is between two points."""
         off = np.asarray(other) - point
         far = float(np.hypot(*off))
-        self.clear = self.shut
-        free = self.ray(point, math.atan2(off[1], off[0]), far, 0.0)
-        self.clear = self.open
-        return free > far - 0.3
+        return self.shut.ray(point, math.atan2(off[1], off[0]), far, 0.0) > far - 0.3
 
     def metres(self, point: Any, other: Any) -> float:
         """The length of the shortest way between two points."""
@@ -156,24 +155,16 @@ class Follower:
 
         Words tell of each door on the way. So the follower takes a door for shut at first.
         """
-        self.world.clear = self.world.shut if shut else self.world.open
-        made = self._made_stride()
-        self.world.clear = self.world.open
-        return made
-
-    def _made_stride(self) -> bool:
-        turns = np.radians(np.arange(-40, 41, 10))
-        score = [
-            self.world.ray(self.at, self.bearing + turn, 3.0) - 1.5 * abs(turn) for turn in turns
-        ]
+        world, turns = self.world.shut if shut else self.world, np.radians(np.arange(-40, 41, 10))
+        score = [world.ray(self.at, self.bearing + turn, 3.0) - 1.5 * abs(turn) for turn in turns]
         turn = float(turns[int(np.argmax(score))])
         ahead = np.array([math.cos(self.bearing + turn), math.sin(self.bearing + turn)])
         left = np.array([-ahead[1], ahead[0]])
         options = [self.at + STRIDE * ahead + off * left for off in (0.0, -0.1, 0.1)]
-        options = [p for p in options if self.world.free(p)]
+        options = [p for p in options if world.free(p)]
         if not options or max(score) < STRIDE:
             return False
-        clear = [min(self.world.clear[self.world.cell(p)], 1.2) for p in options]
+        clear = [min(world.clear[world.cell(p)], 1.2) for p in options]
         self.at = options[int(np.argmax(clear))]
         self.bearing += 0.25 * turn
         self.trail.append(self.at.copy())

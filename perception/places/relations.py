@@ -43,9 +43,9 @@ TURNS = [k * TURN for k in range(round(math.tau / TURN))]
 # most BESIDE metres apart, more than the share CLASHING of the wall points of the two visits lies
 # in free space of the other one.
 BESIDE, CLASHING = 6.0, 0.1
-# A station of a robot that may be anywhere shows WALLS pieces of wall that earlier stations did not
-# show. The known map lacks the share HIDDEN of the walls. A position is told if it is SURE times as
-# probable as any other.
+# Where is a robot that may be anywhere? Each station shows WALLS pieces of wall that earlier
+# stations did not show. The known map lacks the share HIDDEN of all walls. A position is told to
+# the user if each other one is SURE times less probable.
 WALLS, HIDDEN, SURE = 10, 0.05, 100
 # Of a drive with cuts, at most this many visits are matched, as the time grows with the square.
 MATCHED = 200

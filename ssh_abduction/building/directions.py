@@ -28,7 +28,7 @@ from ssh_abduction.output.roads import place_of_steps
 # of less than HALF degrees is half a turn, and one of more than SHARP is sharp. A person who comes
 # to a door within ASLANT degrees sees it ahead.
 AHEAD, ASLANT, HALF, SHARP, BACK = 30, 45, 60, 120, 150
-# A bend that leads more than ASIDE metres to the side is told, even if it is a slight one.
+# Slight bends are told only if they lead more than ASIDE metres to the side.
 ASIDE = 4.0
 # Two bends to one side that are less than CLOSE metres apart are one corner.
 CLOSE = 2.0

@@ -20,6 +20,7 @@ import json
 import math
 import os
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -28,6 +29,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
+from ssh_abduction.data import groups
 from ssh_abduction.data.checks import (
     a_flag,
     a_list,
@@ -464,15 +466,14 @@ class Corrections:
 
 def _contradiction(pairs: Sequence[Said]) -> list[Said]:
     """Find two steps that are said to be apart, and sentences that join them; empty if none."""
-    import networkx as nx
-
     for kind, joins in (("different", ("same",)), ("elsewhere", ("same", "same_place"))):
-        joined = nx.Graph((*one.steps, {"said": one}) for one in pairs if one.kind in joins)
+        said = {frozenset(one.steps): one for one in pairs if one.kind in joins}
+        joined = defaultdict[str, dict[str, None]](
+            dict, groups.linked(one.steps for one in said.values())
+        )
         for apart in (one for one in pairs if one.kind == kind):
-            if joined.has_node(apart.steps[0]) and joined.has_node(apart.steps[1]):
-                with suppress(nx.NetworkXNoPath):
-                    chain = nx.shortest_path(joined, *apart.steps)
-                    return [apart, *(joined.edges[pair]["said"] for pair in pairwise(chain))]
+            if chain := groups.way(*apart.steps, joined.__getitem__):
+                return [apart, *(said[frozenset(pair)] for pair in pairwise(chain))]
     return []
 
 

@@ -313,7 +313,7 @@ class Prior:
         # As an action leads to one dstate, no link leads to a dstate before its first step.
         perhaps = ~counts & links.new[:, 1]
         nats[perhaps] -= new[perhaps, 0]
-        new[perhaps] = np.stack([0 * nats, nats], axis=1)[perhaps]
+        new[perhaps, 0], new[perhaps, 1] = 0.0, nats[perhaps]
         counts |= perhaps & (nats > 0)
         saved = np.zeros((2, len(of)))
         np.add.at(saved[0], end[counts], new[counts, 1])

@@ -221,17 +221,17 @@ class Forcing:
                 seen = [some - less for some, less in zip(seen, known, strict=True)]
                 nats = poses.likelihood(prior.wide)[1] + float(prior.base[-1]) + alias
                 nats += sum(float(some.sum()) for some in seen) - prior.crowd * len(named[1])
-                ways_of_moves: list[LeastMoves | None] = [None]
-                if not i:
-                    course = classes.node.tolist(), classes.place.tolist()
-                    ways_of_moves.insert(
-                        0, prior.least_chosen(*course, framed(poses), classes.parted)
-                    )
-                for moves in ways_of_moves:
+                # If an alias explains closures, or poses are too unsure, moves may cost nothing.
+                least_moves = [] if i else [self._moves(classes, poses)]
+                for moves in (*least_moves, None):
                     with suppress(np.linalg.LinAlgError):
                         found[-1].append(self._joining(classes, named, poses, nats, seen, moves))
                         break
         return found
+
+    def _moves(self, classes: Joined, poses: Poses) -> LeastMoves:
+        course = classes.node.tolist(), classes.place.tolist()
+        return self._prior.least_chosen(*course, framed(poses), classes.parted)
 
     def _joining(
         self,
