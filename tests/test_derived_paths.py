@@ -405,10 +405,14 @@ def with_one_place(ssh_map: SSHMap) -> SSHMap:
 def test_doors_are_narrow_with_wider_space_on_both_sides() -> None:
     wide = np.full(40, 3.0)
     wide[18:20] = 0.9
-    assert [*doors_in(wide)] == [18]
-    assert [*doors_in(np.full(40, 1.2))] == []  # a narrow corridor is no door
+    assert doors_in(wide) == [18]
+    assert doors_in(np.full(40, 1.2)) == []  # a narrow corridor is no door
     wide[20:] = 0.9  # nor is one end of a narrow corridor
-    assert [*doors_in(wide)] == []
+    assert doors_in(wide) == []
+    wide[8:33] = 1.3  # but both ends can be doors
+    wide[[8, 9, 31, 32]] = 1.0
+    wide[33:] = 3.0
+    assert doors_in(wide) == [8, 31]
 
 
 def test_openings_are_deep_parts_of_a_wall() -> None:

@@ -26,9 +26,9 @@ STEP, EVERY, REACH, STRETCH = 0.25, 0.3, 3.0, 2.0
 # ALONG metres of it, measured along the course.
 WIDE, ALONG = 4.0, 0.3
 # A door is at most DOOR metres wide. Within NEAR metres before and behind it, the free space is
-# wider by WIDER metres.
-DOOR, NEAR, WIDER = 1.45, 2.0, 0.4
-SAME = 0.05  # widths that differ by less than this, in metres, are equal
+# wider by WIDER metres. A wall is known to half a cell, so two widths of one passage differ by two
+# cells at most.
+DOOR, NEAR, WIDER = 1.45, 2.0, 2.5 * CELL
 # A part of a wall is an opening if there the free space reaches DEEP metres farther than beside it,
 # over a length from LEAST to MOST metres. Beside it means within BESIDE metres.
 DEEP, LEAST, MOST, BESIDE = 0.6, 0.5, 1.8, 2.5
@@ -154,19 +154,16 @@ def directions(way: Array) -> Array:
     return np.asarray(off / np.maximum(np.hypot(*off.T), 1e-6)[:, None])
 
 
-def doors_in(wide: Array) -> Iterator[int]:
-    """Yield the points of a course at which it passes a door.
+def doors_in(wide: Array) -> list[int]:
+    """Find the points of a course at which it passes a door.
 
     `wide` has the free space across the course, (n,) metres, every STEP metres.
     """
-    reach = round(NEAR / STEP)
-    parts, count = ndimage.label(wide <= DOOR)
-    for part in range(1, count + 1):
-        inside = np.flatnonzero(parts == part)
-        k = int(inside[wide[inside] < wide[inside].min() + SAME].mean())
-        sides = wide[max(0, k - reach) : k], wide[k + 1 : k + 1 + reach]
-        if min(side.max(initial=0.0) for side in sides) >= wide[k] + WIDER:
-            yield k
+    from scipy.signal import find_peaks
+
+    window = 2 * round(NEAR / STEP) + 1
+    found, _ = find_peaks(-wide, height=-DOOR, prominence=WIDER, wlen=window)
+    return [int(k) for k in found]
 
 
 def openings_in(free: Array) -> Iterator[tuple[float, float]]:
