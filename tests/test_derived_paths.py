@@ -239,6 +239,14 @@ def test_a_slim_room_has_one_way_though_the_robot_drove_from_door_to_door() -> N
     assert not [*faults_of_paths(found), *faults_of_corridors(found)]
 
 
+def test_a_straight_way_through_a_room_is_free() -> None:
+    """A corridor of 40 m with an arm of 12 m: the middle of the room around both is a wall."""
+    points = [(10.0 * k, 0.0) for k in range(5)] + [(0.0, 6.0), (0.0, 12.0)]
+    found = with_building(*drive(points, [6, 5, 0, 1, 2, 3, 4], 3.0))
+    assert [c.width for c in found.corridors] == pytest.approx([3.0, 3.0], abs=0.1)
+    assert {min(c.order, c.order[::-1]) for c in found.corridors} == {(0, 1, 2, 3, 4), (0, 5, 6)}
+
+
 def test_parts_that_share_wide_free_space_are_one_room() -> None:
     """The robot leaves a hall by one door, and comes back into it by another one."""
     points = [(0.0, 0.0), (6.0, 0.0), (6.0, 8.0), (0.0, 8.0), (0.0, 2.2), (3.5, 2.2)]

@@ -358,6 +358,7 @@ def outlines_of(spaces: Mapping[int, RoomSpace]) -> dict[int, tuple[Point, ...]]
 
 
 ONWARD = math.radians(45)  # An edge that leaves within this angle goes on straight.
+FREE = 0.5  # At least this share of a straight way through a room is free.
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,6 +398,9 @@ def straightened(
             continue
         others = [edge for edge in edges if all(edge is not e for e in inner)]
         far = sorted((box.along(spots[p].at), p) for p in spots if room.get(p) == number)
+        line = box.middle + np.array([[far[0][0]], [far[-1][0]]]) * box.ahead
+        if space.beside(resampled(line, STEP)).any(axis=1).mean() < FREE:
+            continue  # The room bends.
         frame = spots[far[0][1]].frame
         for end, sign in ((far[0], -1), (far[-1], 1)):
             more = box.length / 2 - sign * end[0]
