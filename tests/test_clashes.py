@@ -65,6 +65,20 @@ def test_clash_of_turns_within_a_visit_uses_displacements() -> None:
     assert clash_in(trace, settle(trace, None).theory, [within], maps_of) == within
 
 
+@pytest.mark.parametrize(("kind", "steps"), [("same", (4, 12)), ("same_place", (30, 9))])
+def test_asserted_pair_that_displacements_exclude_is_the_clash(
+    kind: str, steps: tuple[int, int]
+) -> None:
+    """With misread views and more than 60 steps, no source proves that there is no map."""
+    moved = [(2.0, 0.0, 0.0)] * 69
+    trace = Trace.from_steps(["hall"] * 70, ["travel"] * 69, displacements=moved)
+    theory = Theory(misread=0.9, weigh="cost", star="none").replace(**{kind: (steps,)})
+    search = Search(trace, theory, work_limit=1)
+    assert not [*search]
+    assert search.status is Status.UNSATISFIABLE
+    assert search.clash == range(min(steps), max(steps) + 1)
+
+
 def test_steps_at_which_a_refused_map_breaks_axioms_come_from_one_check() -> None:
     search = Search(wrong_turn())
     with patch.object(candidates, "violations", side_effect=AssertionError):

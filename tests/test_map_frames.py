@@ -105,7 +105,8 @@ def test_residuals_name_the_worst_point(house: Path, capsys: pytest.CaptureFixtu
         ("step,x,y\nmonday:99,1,2", "line 2: step"),
         ("place,x,y\np0,1,2", "expected two points"),
         ("place,x,y,yaw\np0,1,2,3", "line 2: yaw: expected none for a place"),
-        ("time,x,y\n1,2,3", "expected two points"),
+        ("time,x,y\n1,2,3", "time: expected poses at the times of the log"),
+        ("place,x,y\np0,1,2\np1,1,2", "expected two points"),
     ],
 )
 def test_wrong_files_are_refused(house: Path, text: str, expected: str) -> None:

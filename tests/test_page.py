@@ -484,6 +484,9 @@ def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, An
         == "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; "
         "the paths of steps 18–22 differ"
     )
+    assert browser.execute_script(
+        "return figures[0].nodes.filter((node) => node.name).length === mapOf(0).places.size"
+    )
     page.click("one")
     page.click("paths")
     assert page["number"].get_attribute("value") == "2"

@@ -31,9 +31,15 @@ def test_each_change_reaches_the_page_or_is_said_on_it(house: Path) -> None:
     assert "before the last correction" in notice(page)
     assert main(["name", str(house), "p0", "cellar"]) == 0
     assert "before the last correction" in notice(page)  # still waits for a search
+    other = house.parent / "other.html"
+    words = ["view", str(house), "--set", "open=false", "-o", str(other)]
+    assert main(words) == 0
+    assert "before the last correction" in other.read_text()
     before = (house / "recogniser.skops").read_bytes()
     assert main(["solve", str(house), "--theory", "causal", "-o", str(maps)]) == 0
     assert notice(page) == ""
+    assert main(words) == 0
+    assert "before the last correction" not in other.read_text()
     last = ground_in(page, steps)
     assert last is not None
     assert last.seen == first.seen  # the page keeps its walls, and says whose they are

@@ -22,7 +22,7 @@ from ssh_abduction.cli.correct import as_corrected, correct_pair
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import pose, trace_path, verb
 from ssh_abduction.cli.text import describe, table
-from ssh_abduction.data.corrections import beside
+from ssh_abduction.data.corrections import CORRECTED, beside
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.errors import (
     AbductionError,
@@ -424,7 +424,9 @@ def run_view(options: argparse.Namespace) -> int:
     if trace is not None and theory is not None:
         recorded = trace, theory
         trace, theory = as_corrected(trace, theory, options.maps)
-        flags += [] if (trace, theory) == recorded else ["--corrections", str(beside(maps))]
+        if (trace, theory) != recorded:
+            flags += ["--corrections", str(beside(maps))]
+            listing = replace(listing, warnings=(*listing.warnings, CORRECTED))
     called = Called(
         shlex.quote(maps),
         shlex.quote(options.trace) if options.trace else "TRACE",

@@ -520,6 +520,7 @@ def _a_note(note: object) -> None:
 
 
 FILE = "corrections.yaml"  # the name of the file beside a map
+CORRECTED = "Made before the last correction. Solve again to obey it."  # said on the page
 LARGEST = 2**24  # bytes
 HEAD = """\
 # Names and corrections of a person. You can edit this file, or use `ssh-abduction name` and

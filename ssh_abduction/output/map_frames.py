@@ -61,10 +61,11 @@ class MapFrame:
             points: Points by their names, each in the map and in the frame, in metres.
 
         Raises:
-            MapError: There are fewer than two points, or all are at one position.
+            MapError: There are fewer than two points, or all are at one position in the map or in
+                the frame.
         """
         pairs = [*points.values()]
-        if max((abs(a - b) for a, _ in pairs for b, _ in pairs), default=0.0) < NEAREST:
+        if min((_spread(side) for side in zip(*pairs, strict=True)), default=0.0) < NEAREST:
             raise MapError(
                 f"frame: expected two points that are {NEAREST:g} m apart or more, got "
                 f"{len(pairs)} within less; give points that are far apart"
@@ -117,6 +118,11 @@ class MapFrame:
             paths=tuple(replace(path, line=line(path.line)) for path in ssh_map.paths),
             building=building,
         )
+
+
+def _spread(points: Sequence[complex]) -> float:
+    """The largest distance between two points."""
+    return max(abs(a - b) for a in points for b in points)
 
 
 def _extent(pairs: Sequence[tuple[complex, complex]], side: int) -> float:
@@ -189,6 +195,11 @@ def frame_of_file(
             raise MapError(f"{named(path)}: line {rows.line_num}: {error}") from None
     if keys == ["time"]:
         points = dict(_at_steps(sorted(timed, key=lambda pose: pose[0]), ssh_map, trace))
+        if not points:
+            raise MapError(
+                f"{named(path)}: time: expected poses at the times of the log, at most "
+                f"{SECONDS:g} s apart, got none around a step; give those of a localiser there"
+            )
     try:
         return MapFrame.of_points(points)
     except MapError as error:

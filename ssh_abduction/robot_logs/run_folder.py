@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from ssh_abduction.data.corrections import beside, load_corrections
+from ssh_abduction.data.corrections import CORRECTED, beside, load_corrections
 from ssh_abduction.data.drives import fingerprints_of
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.trace import Trace
@@ -20,7 +20,6 @@ from ssh_abduction.robot_logs.log_report import OF_LOG
 from ssh_abduction.solution import Solution, with_names
 
 NOTICE = re.compile(r'<p id="made-before" role="alert">.*?</p>\n', re.DOTALL)
-CORRECTED = "Made before the last correction. Solve again to obey it."
 SOLVED = (
     "The map was solved again. The walls are where the map before it put them. To draw them anew, "
     "map the log again into this folder."

@@ -47,7 +47,7 @@ from ssh_abduction.solver.geometry.ranking import Ranking
 from ssh_abduction.solver.parts import Answer, Limits, Parts, Priced, Start
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.sources.exact.choosing import FEW_STEPS
-from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups
 from ssh_abduction.theory.theory import Theory
 
@@ -290,6 +290,10 @@ class Search:
     def _find_least(self) -> None:
         """Find the least counts, or cost, of the maps."""
         parts = self.parts
+        self.clash = _refuted(parts.task.problem)
+        if self.clash:
+            parts.known.status = Status.UNSATISFIABLE
+            return
         # Some map by greedy merging: clingo then has to find a better one.
         if self.status is not Status.OPTIMAL and len(self.trace) > FEW_STEPS:
             parts.candidates.merge()
@@ -563,6 +567,16 @@ def fall_back(parts: Parts, answer: Answer) -> None:
         known.status = Status.FEASIBLE
 
 
+def _refuted(problem: Problem) -> range | None:
+    """Return the steps of an asserted pair that the evidence excludes, from one to the other."""
+    theory, pairs = problem.theory, problem.pairs
+    for said, apart in ((theory.same, pairs.apart), (theory.same_place, pairs.elsewhere)):
+        for first, last in map(sorted, said):
+            if first in apart.get(last, ()):
+                return range(first, last + 1)
+    return None
+
+
 def clash_in(
     trace: Trace,
     theory: Theory,
@@ -625,16 +639,13 @@ def late_clash(
     """Look for a short clash if a stopped search has no map.
 
     A clash is consecutive steps that have no map by themselves. It may end at a step that
-    contradicted a sketch, or at a step that the theory asserts to be at the dstate or place of an
-    earlier one. `maps_of` is as in `clash_in`. `parts.known` gets the status if there is a clash.
+    contradicted a sketch. `maps_of` is as in `clash_in`. `parts.known` gets the status if there is
+    a clash.
     """
     known, task, clash = parts.known, parts.task, None
     if known.best is not None or not known.stopped or known.status is not Status.UNKNOWN:
         return None
-    # While a robot drives, the theory may already assert something about later steps.
-    said = [max(pair) for pair in (*task.theory.same, *task.theory.same_place)]
-    ends = dict.fromkeys((*parts.candidates.contradicting, *said))
-    stretches = _stretches(task.trace, [end for end in ends if end < len(task.trace)])
+    stretches = _stretches(task.trace, parts.candidates.contradicting)
     part = Watch().part(CLASHING, None if counts_work() else time.thread_time)
     with suppress(LimitError, KeyboardInterrupt), heeding(part.check):
         clash = clash_in(task.trace, task.theory, stretches, maps_of)

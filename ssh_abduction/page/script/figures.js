@@ -15,13 +15,23 @@ function overviewFigure() {
           "in colours that show how many",
   };
   const isPlaces = dstates.length > 0;
+  // A place that the first map has is called as there.
+  const first = mapOf(0),
+    numbers = new Map([...first.ofPlace].map(([p, steps]) => [`${steps}`, p]));
   figure.nodes = isPlaces
-    ? nodes.map((node) => ({
-        at: [node.x, node.y],
-        kind: share(node.maps),
-        steps: node.steps,
-        title: `place of ${stretches(node.steps)}: in ${node.maps} of ${all} maps`,
-      }))
+    ? nodes.map((node) => {
+        const p = numbers.get(`${node.steps}`),
+          place = p === undefined ? "a place" : first.called("place", p);
+        return {
+          at: [node.x, node.y],
+          name: p === undefined ? undefined : `${p}`,
+          own: first.names[`place ${p}`],
+          passed: first.passed.has(p),
+          kind: share(node.maps),
+          steps: node.steps,
+          title: `${place}: ${stretches(node.steps)}: in ${node.maps} of ${all} maps`,
+        };
+      })
     : [];
   for (const [k, node] of nodes.entries())
     for (const t of node.steps) if (!together.has(t)) together.set(t, k);
