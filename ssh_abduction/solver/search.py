@@ -645,7 +645,7 @@ def late_clash(
     known, task, clash = parts.known, parts.task, None
     if known.best is not None or not known.stopped or known.status is not Status.UNKNOWN:
         return None
-    stretches = _stretches(task.trace, parts.candidates.contradicting)
+    stretches = _stretches(task.trace, [*parts.candidates.contradicting])
     part = Watch().part(CLASHING, None if counts_work() else time.thread_time)
     with suppress(LimitError, KeyboardInterrupt), heeding(part.check):
         clash = clash_in(task.trace, task.theory, stretches, maps_of)
