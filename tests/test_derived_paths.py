@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from perception.places.passages import STEP, doors_in, openings_in, resampled
-from ssh_abduction import SSHMap, Trace
+from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.building.derive import buildings_of, with_building
 from ssh_abduction.building.directions import RouteCourse, directions_to
 from ssh_abduction.building.edges import PlanEdge
@@ -29,6 +29,7 @@ from ssh_abduction.data.parts_of_dstates import number_at
 from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.online.routes import route
 from ssh_abduction.robot_logs.log_maps import BARE
+from ssh_abduction.solution.values import Cost
 
 Point = tuple[float, float]
 TRAVEL = Action.of("travel")
@@ -492,6 +493,26 @@ def test_all_best_buildings_are_listed(tmp_path: Path, capsys: pytest.CaptureFix
     arguments = ["show", str(tmp_path / "map.json"), "--paths", "--trace"]
     assert main([*arguments, str(tmp_path / "trace.jsonl")]) == 0
     assert capsys.readouterr().out.count("or, equally good:") == 1
+
+
+def test_parts_that_a_file_does_not_hold_can_be_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Files of version 0.1 hold maps without paths and rooms, which follow from the trace."""
+    ssh_map, trace = drive(CROSS, TOUR, doors=[(1, 4), (2, 5), (1, 2)])
+    file, beside = (str(tmp_path / name) for name in ("maps.json", "trace.jsonl"))
+    trace.save(beside)
+    cost = Cost(len(ssh_map.dstates), len(ssh_map.places), 0)
+    found = solve(trace, Theory.causal())
+    assert found.bound
+    bound = replace(found.bound, dstates=cost.dstates)
+    replace(found, maps=(ssh_map,), cost=cost, bound=bound).save(file)
+    for thing in ("path0", "corridor0", "room0"):
+        assert main(["name", file, thing, f"my {thing}"]) == 0
+    capsys.readouterr()
+    assert main(["show", file, "--paths", "--trace", beside]) == 0
+    said = capsys.readouterr().out
+    assert all(f"({name})" in said for name in ("my corridor0", "my room0"))
 
 
 def test_edges_of_other_directions_are_not_on_one_path() -> None:

@@ -6,12 +6,11 @@ import functools
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.building.derive import with_building
 from ssh_abduction.building.telling import corridor_in_words, room_in_words, summary, told
 from ssh_abduction.cli import shared
 from ssh_abduction.cli.correct import SavedMap, correct_pair, give_name
@@ -89,9 +88,7 @@ class KnownMap:
         saved, trace = SavedMap.load(file), shared.mapped_trace(str(file))
         if trace is None:
             raise MapError(f"{named(folder)}: expected a trace beside the map, got none; map again")
-        if saved.map.building is None:
-            saved = replace(saved, map=with_building(saved.map, trace))
-        return cls(saved, shared.listing_of(str(file)), trace)
+        return cls(saved.built(), shared.listing_of(str(file)), trace)
 
     @property
     def map(self) -> SSHMap:

@@ -367,7 +367,8 @@ def run_name(options: argparse.Namespace) -> int:
     The name is written to corrections.yaml beside the map, for a step at this place. Solving again
     may renumber the places, but the name stays with the place of that step.
     """
-    print(give_name(SavedMap.load(options.maps, options.map), options.what, options.name))
+    saved = SavedMap.load(options.maps, options.map).built()
+    print(give_name(saved, options.what, options.name))
     return 0
 
 
@@ -432,6 +433,15 @@ class SavedMap:
     def trace(self) -> Trace | None:
         """The trace of the map; None if it is not beside the map, nor in its file."""
         return shared.mapped_trace(str(self.file))
+
+    def built(self) -> SavedMap:
+        """Return the same map with paths, corridors, doors and rooms, derived if it has none."""
+        if self.map.building is not None or self.trace is None:
+            return self
+        from ssh_abduction.building.derive import with_building  # loads numpy
+
+        built = replace(self, map=with_building(self.map, self.trace))
+        return built.named(self.corrections)
 
     @property
     def in_quarters(self) -> bool:

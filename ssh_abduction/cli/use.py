@@ -22,7 +22,7 @@ from ssh_abduction.cli.correct import as_corrected, correct_pair
 from ssh_abduction.cli.outcome import warn
 from ssh_abduction.cli.parsing import pose, trace_path, verb
 from ssh_abduction.cli.text import describe, table
-from ssh_abduction.data.corrections import CORRECTED, beside
+from ssh_abduction.data.corrections import CORRECTED, beside, named_beside
 from ssh_abduction.data.drives import Drive, drives_of
 from ssh_abduction.data.errors import (
     AbductionError,
@@ -286,7 +286,7 @@ def _built(options: argparse.Namespace, listing: Listing, ssh_map: SSHMap) -> SS
             "the trace that was mapped with --trace"
         )
     with said_of(named(options.maps), MapError):
-        return with_building(ssh_map, trace)
+        return named_beside([with_building(ssh_map, trace)], listing.drives, options.maps)[0]
 
 
 def _with_regions(ssh_map: SSHMap) -> str:
