@@ -219,6 +219,20 @@ def test_replay_keeps_the_folder_of_another_program(
     assert main(call) == 1
     assert "got maps.json, which is not of map" in capsys.readouterr().err
     assert (tmp_path / "maps.json").read_text() == "{}"
+    (tmp_path / "run.json").write_text('{"format": "ssh-run"}')
+    assert main(call) == 1
+    assert "or one that live saved to, got one that map wrote" in capsys.readouterr().err
+
+
+def test_replay_keeps_a_state_that_it_cannot_read(
+    scans: tuple[Scan, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also without the names, which older versions did not save."""
+    write_carmen(tmp_path / "a.log", [replace(scan, corrected=None) for scan in scans[:4]])
+    (tmp_path / STATE).write_text("{}")
+    main(["live", "--replay", str(tmp_path / "a.log"), "--save", str(tmp_path)])
+    assert "the map is kept in memory, and not saved" in capsys.readouterr().err
+    assert (tmp_path / STATE).read_text() == "{}"
 
 
 @pytest.mark.slow

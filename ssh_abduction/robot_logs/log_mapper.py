@@ -31,6 +31,7 @@ from perception.places.importing import Grown, Imported, Tell, assembled, tell_n
 from perception.places.live import LiveLog, LivePlace
 from perception.places.passages import spaced
 from perception.places.relations import Relocation
+from perception.places.saved import STATE
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.checks import an_instance, one_of
 from ssh_abduction.data.errors import named
@@ -507,7 +508,7 @@ class OnlineLogMapper:
     @staticmethod
     def is_saved(folder: str | os.PathLike[str]) -> bool:
         """Whether a folder has the state of a drive."""
-        return (Path(folder) / NAMES).exists()
+        return any((Path(folder) / name).exists() for name in (STATE, NAMES))
 
     @staticmethod
     def load(folder: str | os.PathLike[str], tell: Tell = tell_nobody) -> OnlineLogMapper:

@@ -53,8 +53,8 @@ PARAMETERS = {
     **{"place": 0, "to": 0, "first": 0, "second": 0, "text": ""},
 }
 MISSING = (
-    "live: expected ROS 2, got none; pip install 'ssh-abduction[ros2]', source its setup file, or "
-    "give --replay LOG"
+    "live: expected ROS 2, got none; pip install '.[ros2]' in your clone, or source its setup "
+    "file, or give --replay LOG"
 )
 
 
