@@ -64,6 +64,12 @@ def fed(*items: tuple[str, float]) -> tuple[list[tuple[float, float]], dict[str,
         # The clock starts anew.
         ([("p", 9), ("s", 9.5), ("p", 0), ("s", 0.5), ("p", 1)], [(0.5, 0.5)], {"no odometry": 1}),
         ([("p", 9), ("p", 0), ("s", 0.5), ("p", 1)], [(0.5, 0.5)], {}),
+        # A scan by the clock before comes after the first pose by the new one.
+        (
+            [("p", 9), ("s", 9), ("p", 0), ("s", 9.5), ("s", 0.5), ("p", 1)],
+            [(9, 9), (0.5, 0.5)],
+            {"no odometry": 1},
+        ),
         # Poses are missing.
         ([("p", 0), ("s", 0), ("s", 1), ("p", 2), ("s", 2)], [(0, 0), (2, 2)], {"no odometry": 1}),
     ],

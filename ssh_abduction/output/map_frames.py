@@ -196,10 +196,8 @@ def frame_of_file(
     if keys == ["time"]:
         points = dict(_at_steps(sorted(timed, key=lambda pose: pose[0]), ssh_map, trace))
         if not points:
-            raise MapError(
-                f"{named(path)}: time: expected poses at the times of the log, at most "
-                f"{SECONDS:g} s apart, got none around a step; give those of a localiser there"
-            )
+            said = "expected poses at the times of the log, got none around a step; give such poses"
+            raise MapError(f"{named(path)}: time: {said}")
     try:
         return MapFrame.of_points(points)
     except MapError as error:

@@ -36,6 +36,7 @@ from perception.readers.bags import measured
 from perception.readers.scans import Damaged, Scan
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.odometry import Pose
+from ssh_abduction.data.words import counted
 from ssh_abduction.robot_logs.log_mapper import LiveSession, OnlineLogMapper
 from ssh_abduction.robot_logs.stamps import BACK, MOST_POSES, StampPairing
 
@@ -248,9 +249,10 @@ class LiveNode:
             node.trigger_configure()
             node.trigger_activate()
 
-    def _once(self, text: str) -> None:
-        if text not in self._said:
-            self._said.add(text)
+    def _once(self, text: str, about: str = "") -> None:
+        """Say something once, or one thing about something."""
+        if (about or text) not in self._said:
+            self._said.add(about or text)
             self._say(text)
 
     @contextmanager
@@ -298,7 +300,9 @@ class LiveNode:
         from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 
         is_late = time.monotonic() - self._begun > PATIENCE
-        topics = dict(self.node.get_topic_names_and_types())
+        own = (self.node.get_fully_qualified_name(), "/parameter_events", "/rosout")
+        named_types = sorted(self.node.get_topic_names_and_types())
+        there = [f"{t} ({' '.join(of)})" for t, of in named_types if not t.startswith(own)]
         for topic, (kind, call) in self._kinds.items():
             sources = self.node.get_publishers_info_by_topic(topic)
             if len(sources) > 1:
@@ -313,10 +317,11 @@ class LiveNode:
                 how = "reliable" if is_reliable else "best effort, so messages may be lost"
                 self._once(f"listening to {topic}, {how}")
             if is_late and kind not in self._came:
-                there = ", ".join(f"{name} ({' '.join(of)})" for name, of in sorted(topics.items()))
                 self._once(
                     f"{topic}: expected messages {kind.__name__}, got none for {PATIENCE:.0f} s "
-                    f"from {len(sources)} publishers; there are {there}; name the topic"
+                    f"from {counted(len(sources), 'publishers')}; other topics: "
+                    f"{', '.join(there) or 'none'}; name the topic",
+                    f"{topic} is silent",
                 )
         if is_late and self._by_frames and not self._frames.base:
             known = ", ".join(
@@ -324,7 +329,8 @@ class LiveNode:
             )
             self._once(
                 f"expected transforms from {self._frames.odom} for {PATIENCE:.0f} s, got "
-                f"{known or 'none'}; set the parameter odom_frame"
+                f"{known or 'none'}; set the parameter odom_frame",
+                "no transforms",
             )
 
     def _on_odom(self, message: Any) -> None:

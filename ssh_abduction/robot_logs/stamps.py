@@ -45,7 +45,7 @@ class StampPairing:
         self._scans: deque[tuple[float, Any]] = deque()
         self._times: list[float] = []
         self._poses: list[Pose] = []
-        self._last = -math.inf
+        self._last, self._went_back = -math.inf, False
 
     def add_pose(self, time: float, pose: Pose) -> None:
         """Add a pose at a time in seconds. A pose that comes late is dropped."""
@@ -53,9 +53,8 @@ class StampPairing:
             if self._times[-1] - time <= BACK:
                 return
             self.restarts += 1
-            self.lost += Counter({"no odometry": len(self._scans)})
-            self._scans.clear()
-            self._times, self._poses, self._last = [], [], -math.inf
+            self._drop_waiting()
+            self._times, self._poses, self._went_back = [], [], True
         self._times.append(time)
         self._poses.append(pose)
         if len(self._times) > MOST_POSES:
@@ -63,6 +62,10 @@ class StampPairing:
 
     def add_scan(self, time: float, scan: Any) -> None:
         """Add a scan at a time in seconds."""
+        if self._went_back and time < self._last - BACK:
+            # Scans by the clock before may have come after the first pose by the new one.
+            self._drop_waiting()
+            self._last, self._went_back = -math.inf, False
         if time == self._last:
             self.lost["doubled"] += 1
         elif time < self._last:
@@ -73,6 +76,10 @@ class StampPairing:
             if len(self._scans) > MOST_SCANS:
                 self._scans.popleft()
                 self.lost["too many"] += 1
+
+    def _drop_waiting(self) -> None:
+        self.lost += Counter({"no odometry": len(self._scans)})
+        self._scans.clear()
 
     def ready(
         self, may_go: Callable[[Any], bool] = lambda _: True
