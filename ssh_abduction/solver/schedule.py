@@ -164,7 +164,7 @@ WEIGHED = (
     SourceTurn(
         "forced joins",
         "no faults but misread views, up to 2,500 steps",
-        "They raise the bound most. If it is near, all cheap maps are listed: this is a proof.",
+        "Branch and bound over joins raises the bound most. If it ends, this is a proof.",
         share=0.9,
         most=30.0,
     ),

@@ -5,9 +5,14 @@ be joins that every map of a cost below T has. At first F is empty. Each such ma
 cost of F less what further joins may gain (next paragraph). Now take a further join. If every map
 without it costs T or more, then every map of a cost below T has the join, and F gets it. Then F
 costs more, and fewer joins may follow. If the bound is T or more, then no map costs less than T.
-Only joins of the best known map are tried. If F gets no further join, assume that a map lacks a
-certain join, and find what all cheap maps without this join have. If no map without it costs less
-than T, F gets it. If this fails for single joins, assume that a map lacks two.
+Only joins of the best known map are tried.
+
+*Branch and bound.* If F gets no further join, halve the maps: those without a certain join, and
+those with it. Both halves have a bound of their own, and all that their cheap maps have. The half
+with the lowest bound is halved next, so this bound holds for all maps. A half ends if its bound is
+T or more, or if no two classes may be joined: this is a map. If no half is left, these are all maps
+of a cost below T. A low T is fast. So first take T to be between the first bound and the cost of
+the best map.
 
 *What a join may gain.* There are two bounds, and the greater one counts. For the first one, a join
 gains at most what a new place, or a new dstate, costs at its first step (`theory/prior.py`). The
@@ -27,10 +32,6 @@ are off by d raise χ²/2 by ½ d'C⁻¹d and lower the rest by at most s'd. So 
 at the poses of F less ½ s'Cs. This is the second order. The third is left out, so s'Cs is
 subtracted, twice as much. Products s'Cs of two classes that may both be joined are shared by them.
 What moves cost has slopes, too, and may make poses less sure (`Prior.least_chosen`).
-
-*All cheap maps.* If the bound is near the cost of the best map, list all maps of a cost below T.
-Take two classes that may be joined, and assume first that they are not, and then that they are. A
-branch ends if its bound is T or more, or if no two classes may be joined.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
-from itertools import chain, combinations
+from heapq import heappop, heappush
+from itertools import chain, combinations, count
 from typing import NamedTuple
 
 import numpy as np
@@ -58,30 +60,24 @@ from ssh_abduction.theory.prior import Array, LeastMoves
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 
-# Search for a higher bound until it is known to these shares: before a proof, and after it failed.
-ROUGHLY, NEARLY = 0.05, 0.01
+# First look for bounds that leave these shares of the gap at the root.
+SHARES = 0.5, 0.25
 # The bound compares all pairs of visits, so it is only for traces of at most LONGEST steps.
 LONGEST = 2500
 # Consider joins of each visit with the last visits to its place, with at least one. Of all visits
 # together, consider about this many joins at most.
 PAIRS = 5000
-# List all cheap maps only if the bound is at least this share of their cost.
-NEAR = 0.9
-# To list all cheap maps, make at most LISTED steps.
-LISTED = 100
 # Keep the poses of the last KEPT sets of classes.
-KEPT = 8
-# Give up if assuming the lack of a join added nothing to F, BRANCHES times in a row.
-BRANCHES = 3
+KEPT = 50
 
 
-class _Proven(NamedTuple):
-    """Joins that every cheap map is proven to have.
+class _Part(NamedTuple):
+    """Some of the maps, and joins that all cheap ones among them are proven to have.
 
     Attributes:
         visits: The visits, with what is known to be apart or to meet.
         joins: The class of each visit.
-        low: A lower bound on the cost of maps with these joins.
+        low: A lower bound on the cost of these maps.
         lacking: Pairs of visits that are joined in the best map, but perhaps not in all cheap maps.
             Maps that do not join the first pair cost most.
     """
@@ -93,29 +89,31 @@ class _Proven(NamedTuple):
 
 
 class Forcing:
-    """Finds joins (pairs of visits at one place) that every cheap map has.
+    """Finds joins (pairs of visits at one place) that every cheap map has, and all cheap maps.
 
     Attributes:
-        visits: The visits of the trace.
-        joins: The joins that every cheap map is proven to have: the class of each visit.
-        low: A lower bound on the cost of every map with these joins.
+        found: The dstates and places of maps, for each step. If a search ends, these are all maps
+            that cost less than its limit, and perhaps some more.
+        is_complete: Whether this is true.
     """
 
     def __init__(self, problem: Problem, log: Log, misfit: Misfit, ssh_map: SSHMap) -> None:
         """Chart the trace of a problem. `ssh_map` is its best known map."""
         self._misfit, self._prior = misfit, problem.prior
         self._is_causal = problem.theory.level == "causal"
-        self.visits = Visits.of(problem, log, ssh_map)
-        at: dict[int, list[int]] = indices_of(self.visits.place.tolist())
-        most = max(PAIRS // len(self.visits.place), 1)
+        visits = Visits.of(problem, log, ssh_map)
+        at: dict[int, list[int]] = indices_of(visits.place.tolist())
+        most = max(PAIRS // len(visits.place), 1)
         self._pairs = [
             (i, j)
             for some in at.values()
             for k, j in enumerate(some)
             for i in some[max(k - most, 0) : k]
         ]
-        self.joins = self.visits.joined(np.arange(len(self.visits.place)), [])
-        self.low = 0.0
+        self._all = _Part(visits, visits.joined(np.arange(len(visits.place)), []))
+        # The parts that may have cheap maps, by their bounds, and the maps that were found.
+        self._open, self._leaves, self._most = [(-math.inf, 0, self._all)], list[_Part](), math.inf
+        self.found, self.is_complete = list[Course](), False
         # A map is bounded again if two of its classes are apart, or by its poses.
         self._bounding = lru_cache(maxsize=KEPT)(misfit.bounding)
 
@@ -128,77 +126,72 @@ class Forcing:
         is_known = row("visits").holds_for(theory) or row("clique").holds_for(theory)
         return is_known and not theory.has_faults and len(problem.trace) <= LONGEST
 
-    @property
-    def returns(self) -> list[Equality]:
-        """The returns that every cheap map is proven to have."""
-        return self.visits.returns(self.joins)
+    def returns(self, most: float) -> list[Equality]:
+        """List returns that every map of a cost below `most` is proven to have."""
+        parts = [part for *_, part in self._open] + self._leaves
+        if not parts or self._most < most:
+            return []
+        common = np.unique([part.joins for part in parts], axis=1, return_inverse=True)[1]
+        return self._all.visits.returns(common.ravel())
 
-    def bounds(
-        self, most: float, low: float = 0.0, depth: int = 0, nearly: float = NEARLY
-    ) -> Iterator[float]:
-        """Yield lower bounds, above `low` and at most `most`, on the cost of all maps.
+    def search(self, most: float) -> Iterator[float]:
+        """Find all maps of a cost below `most`, and yield lower bounds on the cost of all maps."""
+        least = self._grown(self._all, most, False).low
+        yield least
+        for share in SHARES:
+            yield from self.bounds(most - share * (most - least))
+        yield from self.bounds(most)
 
-        Up to `depth` joins at a time are assumed to be lacking. `joins` does not change. All maps
-        of a cost below `most` have these joins, and more joins the less such a map may cost. End
-        if the highest such bound is known to the share `nearly`.
-        """
-        state, gap = _Proven(self.visits, self.joins), nearly * most
-        while most - low > gap:
-            middle = (low + most) / 2
-            found = self._forced(state, middle, depth)
-            if found.low >= middle:
-                low = middle
-                yield low
-            else:
-                state, most = found, middle
+    def bounds(self, most: float) -> Iterator[float]:
+        """The same with only this limit."""
+        self._open, self._leaves, self._most = [(-math.inf, 0, self._all)], [], most
+        self.found, self.is_complete, number = [], True, count()
+        part = self._grown(self._all, most, False)
+        self._open = [(part.low, next(number), part)] * (part.low < most)
+        while self._open:
+            part = self._open[0][2]
+            yield min(one.low for one in (part, *self._leaves))
+            halves = [*self._halves(part, most)]
+            heappop(self._open)  # if a limit ends the halving, the part stays
+            for half in halves:
+                if (low := max(half.low, part.low)) < most:
+                    heappush(self._open, (low, next(number), half._replace(low=low)))
+        yield min((part.low for part in self._leaves), default=most)
 
-    def force(self, most: float, depth: int) -> None:
-        """Find joins that every map of a cost below `most` has, until no more are found.
-
-        Up to `depth` joins at a time are assumed to be lacking.
-        """
-        self._forced(_Proven(self.visits, self.joins), most, depth, keep=True)
-
-    def courses(self, most: float) -> list[Course] | None:
-        """List the dstates and places of all maps of a cost below `most`, and perhaps some more.
-
-        Returns None if they are too many. Each pair of classes that may be joined is taken to be
-        joined, and then not to be joined.
-        """
-        found, waiting = list[Course](), [_Proven(self.visits, self.joins)]
-        if self.low < NEAR * most:
-            return None
-        for _ in range(LISTED):
-            if not waiting:
-                return found
-            visits, joins, low, _ = self._grown(waiting.pop(), most, True)
-            if low >= most:
-                continue
+    def _halves(self, part: _Part, most: float) -> Iterator[_Part]:
+        """Halve the maps, and grow both halves. Keep the map if there is only one."""
+        if not part.lacking:
+            part = self._grown(part, most, True)
+        visits, joins, low, lacking = part
+        if low >= most:
+            return
+        if lacking:
+            pair = lacking[0]
+        else:
             classes = self._classes(visits, joins)
-            if (pair := classes.open_pair()) is None:
-                if classes.may_turn:
-                    return None
+            if (steps := classes.open_pair()) is None:
                 places = [0] * len(classes.place) if self._is_causal else classes.place.tolist()
-                found.append((tuple(numbered(classes.node.tolist())), tuple(places)))
-                continue
-            kind, i, j = pair
+                self.found.append((tuple(numbered(classes.node.tolist())), tuple(places)))
+                self._leaves.append(part)
+                self.is_complete &= not classes.may_turn
+                return
+            kind, i, j = steps
             if kind == "place":
-                waiting.append(_Proven(visits.parted([(i, j)]), joins))
-                waiting.append(_Proven(replace(visits, met=(*visits.met, (i, j))), joins))
-            else:
-                v, w = int(visits.visit[i]), int(visits.visit[j])
-                waiting.append(_Proven(visits.lacking(v, w), joins))
-                waiting.append(_Proven(visits, visits.joined(joins, [(v, w)])))
-        return None
+                yield self._grown(part._replace(visits=visits.parted([(i, j)])), most, False)
+                met = replace(visits, met=(*visits.met, (i, j)))
+                yield self._grown(part._replace(visits=met), most, False)
+                return
+            pair = int(visits.visit[i]), int(visits.visit[j])
+        yield self._grown(part._replace(visits=visits.lacking(*pair)), most, False)
+        yield self._grown(part._replace(joins=visits.joined(joins, [pair])), most, False)
 
     def _classes(self, visits: Visits, joins: Ints) -> Joined:
         return Joined(visits, joins, self._misfit.visit, self._is_causal)
 
-    def _ways(self, classes: Joined, by_poses: bool) -> list[list[Gains]]:
+    def _ways(self, classes: Joined) -> list[list[Gains]]:
         """Bound the cost of a map that joins no classes, and what joins gain at most.
 
-        There is a list for each way in which maps may explain closures. The bound by how surely
-        poses are known takes longer, and is made if `by_poses`.
+        There is a list for each way in which maps may explain closures.
         """
         prior, found = self._prior, []
         named = [
@@ -215,7 +208,7 @@ class Forcing:
             prices = [some + more for some, more in zip(seen, new, strict=True)]
             least = poses.misfit() / 2 + sum(float(some[1:].sum()) for some in prices)
             found.append([Gains(least + alias, *prices)])
-            if by_poses and may_be_joined(poses):
+            if may_be_joined(poses):
                 # Moves may end near nothing known.
                 known = [prior.saved[steps, 1 - of] for of, steps in enumerate(first)]
                 seen = [some - less for some, less in zip(seen, known, strict=True)]
@@ -250,12 +243,13 @@ class Forcing:
         """
         prior = self._prior
         free = math.log(prior.wide[2]) / 2, math.log(prior.wide[0]) - prior.crowd
+        may_join = classes.open
         # In the order of first steps, each class may be joined with any class before it.
         units = sorted(
             (steps[0], -of, k)
             for of, some in enumerate(named)
             for k, steps in enumerate(some)
-            if steps[0] and classes.open[of][k]
+            if steps[0] and may_join[of][k]
         )
         columns = [[2 * k, 2 * k + 1] if of else [2 * len(named[1]) + k] for _, of, k in units]
         logs, products = conditional(poses, [*chain(*columns)], moves and moves.pulls)
@@ -272,48 +266,17 @@ class Forcing:
             gains[-of][k] = max(free[-of] + seen[-of][k] + nats_of, 0.0)
         return Gains(nats - float(products[0, 0]), *gains)
 
-    def _forced(self, state: _Proven, most: float, depth: int, *, keep: bool = False) -> _Proven:
-        """Add joins that every map of a cost below `most` has.
-
-        Up to `depth` joins at a time are assumed to be lacking. If `keep`, keep what is found.
-        """
-        wanted = 1  # look for twice as many joins each time before what they imply
-        while True:
-            state = self._grown(state, most, False)
-            if keep:
-                self.visits, self.joins, self.low = state.visits, state.joins, state.low
-            if state.low >= most:
-                return state
-            visits, joins, _, lacking = state
-            for less in range(depth):
-                found, failed = 0, 0
-                for i, j in lacking:
-                    if found == wanted or failed == BRANCHES:
-                        break
-                    if joins[i] != joins[j]:
-                        branch = _Proven(visits.lacking(i, j), joins)
-                        if self._forced(branch, most, less).low >= most:
-                            joins, found, failed = visits.joined(joins, [(i, j)]), found + 1, 0
-                        else:
-                            failed += 1
-                state = state._replace(joins=joins)
-                if found:
-                    break
-            else:
-                return state
-            wanted *= 2
-
-    def _grown(self, state: _Proven, most: float, is_last: bool) -> _Proven:
+    def _grown(self, part: _Part, most: float, is_last: bool) -> _Part:
         """Add joins that every map of a cost below `most` has, as far as bounds alone show them.
 
         If `is_last`, also find places that are not one in these maps.
         """
-        visits, joins = state.visits, state.joins
+        visits, joins = part.visits, part.joins
         while True:
             look_at_clock(LONG_TURN // 2)
             classes = self._classes(visits, joins)
             if classes.fails:
-                return _Proven(visits, joins, math.inf)
+                return _Part(visits, joins, math.inf)
             # Of each two classes that may join, try one pair of visits.
             left = firsts(
                 ((min(a, b), max(a, b)), pair)
@@ -321,21 +284,19 @@ class Forcing:
                 for a, b in [joins[[*pair]].tolist()]
                 if a != b and not classes.apart[0, a, b]
             )
-            for by_poses in (False, True):  # first, force what the faster bound forces
-                ways = self._ways(classes, by_poses)
-                if (low := classes.low(ways)) >= most:
-                    return _Proven(visits, joins, low)
-                lacking = list[tuple[float, tuple[int, int]]]()
-                for (a, b), pair in left.items():
-                    look_at_clock(SHORT_TURN // 2)
-                    lacking.append((classes.low_lacking(ways, a, b), pair))
-                if forced := [pair for nats, pair in lacking if nats >= most]:
-                    break
+            ways = self._ways(classes)
+            if (low := classes.low(ways)) >= most:
+                return _Part(visits, joins, low)
+            lacking = list[tuple[float, tuple[int, int]]]()
+            for (a, b), pair in left.items():
+                look_at_clock(SHORT_TURN // 2)
+                lacking.append((classes.low_lacking(ways, a, b), pair))
+            forced = [pair for nats, pair in lacking if nats >= most]
             met = [] if forced else self._met(classes, ways, most)
             far = [] if forced or met or not is_last else self._far(visits, joins, classes, most)
             if not forced and not met and not far:
                 lacking.sort(reverse=True)
-                return _Proven(visits, joins, low, [pair for _, pair in lacking])
+                return _Part(visits, joins, low, [pair for _, pair in lacking])
             joins = visits.joined(joins, forced)
             visits = replace(visits.parted(far), met=(*visits.met, *met))
 
@@ -343,7 +304,7 @@ class Forcing:
         self, classes: Joined, ways: Sequence[Sequence[Gains]], most: float
     ) -> list[tuple[int, int]]:
         """Find pairs of steps that are at one place in every map of a cost below `most`."""
-        place, at = classes.place.tolist(), self.visits.at
+        place, at = classes.place.tolist(), self._all.visits.at
         first = firsts((p, t) for t, p in enumerate(place))
         found = []
         for t, p in enumerate(place):
@@ -364,13 +325,13 @@ class Forcing:
 
         They are at different places of the best map.
         """
-        at = self.visits.at
+        at = self._all.visits.at
         first = [*firsts((p, t) for t, p in enumerate(classes.place.tolist())).items()]
         found = []
         for (p, i), (q, j) in combinations(first, 2):
             if at[i] != at[j] and classes.may_meet(p, q):
                 look_at_clock(LONG_TURN // 2)
                 meeting = self._classes(replace(visits, met=(*visits.met, (i, j))), joins)
-                if any(meeting.low(self._ways(meeting, poses)) >= most for poses in (False, True)):
+                if meeting.low(self._ways(meeting)) >= most:
                     found.append((i, j))
         return found

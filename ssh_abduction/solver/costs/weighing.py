@@ -55,7 +55,7 @@ from ssh_abduction.solver.costs.estimating import (
     rivals_of,
     rivals_with_misread_views,
 )
-from ssh_abduction.solver.costs.forced import NEARLY, ROUGHLY, Forcing
+from ssh_abduction.solver.costs.forced import Forcing
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.parts import Parts, Priced
 from ssh_abduction.solver.schedule import Source, turn
@@ -206,39 +206,24 @@ class Weighing:
         ]
 
     def _force(self) -> None:
-        """Find joins that all cheap maps have. Raise the bound, and let clingo assert the joins."""
-        task, best = self._task, self.candidates[0]
-        forcing = Forcing(task.problem, task.log, self._misfit, best.map)
+        """Find all cheap maps, or joins that they have, and raise the bound.
+
+        If a limit ends this, clingo asserts the joins.
+        """
+        task, most = self._task, self._most
+        forcing = Forcing(task.problem, task.log, self._misfit, self.candidates[0].map)
         try:
-            forcing.force(self._most, 1)
-            if self._lists_all(forcing):
-                return
-            self._bound(forcing, ROUGHLY)
-            forcing.force(self._most, 2)  # this takes longer, but may be a proof
-            if not self._lists_all(forcing):
-                self._bound(forcing, NEARLY)
+            for bound in forcing.search(most):
+                self._raise_bound(bound)
+            known = {dstates_and_places(candidate.map) for candidate in self.candidates}
+            others = [one for one in forcing.found if one not in known]
+            if forcing.is_complete and all(map(self._knows, others)):
+                self.bound, self.proven = self._nats, True
+                self._parts.known.status = Status.OPTIMAL
         finally:
-            self._raise_bound(forcing.low)
-            returns = forcing.returns
+            returns = forcing.returns(most)
             self._forced = [(one.first, one.second) for one in returns if one.of == "dstate"]
             self._base = max(self._base, self._misfit.of_returns(returns) / 2)
-
-    def _bound(self, forcing: Forcing, nearly: float) -> None:
-        """Raise the bound until the highest one by forced joins is known to the share `nearly`."""
-        self._raise_bound(forcing.low)
-        for depth in (0, 1):
-            for bound in forcing.bounds(self._most, self.bound, depth, nearly):
-                self._raise_bound(bound)
-
-    def _lists_all(self, forcing: Forcing) -> bool:
-        """Add all maps that are worth finding. Return whether this is a proof."""
-        courses = forcing.courses(self._most)
-        known = {dstates_and_places(candidate.map) for candidate in self.candidates}
-        if courses is None or not all(one in known or self._knows(one) for one in courses):
-            return False
-        self.bound, self.proven = self._nats, True
-        self._parts.known.status = Status.OPTIMAL
-        return True
 
     def _knows(self, course: Course) -> bool:
         """Add a map with these dstates and places, if there is one. Return whether this is sure."""
