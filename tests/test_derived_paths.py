@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perception.places.passages import STEP, doors_in, openings_in, resampled
+from perception.places.passages import STEP, WIDE, doors_in, openings_in, resampled
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.building.derive import buildings_of, with_building
 from ssh_abduction.building.directions import RouteCourse, directions_to
@@ -238,6 +238,13 @@ def test_a_slim_room_has_one_way_though_the_robot_drove_from_door_to_door() -> N
     told_sides = [o.side for o in corridor.openings if o.door is not None]
     assert told_sides in (["left", "right"] * 3 + ["left"], ["right", "left"] * 3 + ["right"])
     assert not [*faults_of_paths(found), *faults_of_corridors(found)]
+
+
+def test_a_corridor_has_walls() -> None:
+    """A hall of 60 m, so wide that no wall was seen, is no corridor."""
+    points = [(15.0 * k, 0.0) for k in range(5)]
+    for width, count in ((7.0, 1), (2 * WIDE, 0)):
+        assert len(with_building(*drive(points, [*range(5)], width)).corridors) == count
 
 
 def test_a_straight_way_through_a_room_is_free() -> None:

@@ -301,10 +301,12 @@ def _corridor(way: PairedWay, parts: list[Part]) -> Part | None:
 
 
 def _is_room(way: PairedWay, part: Part, share: float) -> bool:
-    """Whether a part of a way is short for its width."""
+    """Whether a part of a way is short for its width, or has no walls within WIDE metres."""
     begin, end = part
-    wide = float(np.percentile(way.widths[begin : end + 1], 100 - WIDEST))
-    return bool(way.metres[end] - way.metres[begin] < max(SHORT, share * wide))
+    widths = way.widths[begin : end + 1]
+    short = max(SHORT, share * float(np.percentile(widths, 100 - WIDEST)))
+    is_open = np.median(widths) >= 2 * (WIDE - GRID)
+    return bool(way.metres[end] - way.metres[begin] < short or is_open)
 
 
 def rooms_of(
