@@ -98,7 +98,7 @@ def test_forced_joins_are_in_all_cheap_maps_and_the_bound_holds(kind: str, seed:
     for ssh_map in {solution.maps[0], solution.maps[-1]}:
         forcing = forcing_of(trace, theory, ssh_map)
         # Two drives have too many maps.
-        assert max(islice(forcing.search(most), 40)) <= weighed.nats + EQUAL
+        assert max(islice(forcing.bounds(most), 40)) <= weighed.nats + EQUAL
         for rival in cheap:
             for join in forcing.returns(most):
                 names = rival.dstates if join.of == "dstate" or not rival.places else rival.places
@@ -114,7 +114,7 @@ def test_forced_joins_prove_a_maze_of_sixty_steps() -> None:
     known = truth.random_walk(4, 60, 3001, truth.Noise(Odometry(**FINE)))
     trace, theory, solution, weighed = solved(known.trace, Theory.topological())
     forcing = forcing_of(trace, theory, solution.maps[0])
-    *_, low = forcing.search(weighed.nats + 1)
+    *_, low = forcing.bounds(weighed.nats + 1)
     assert weighed.nats - 2 < low <= weighed.nats + EQUAL
     assert [weighed.rivals[0].dstates, weighed.rivals[0].places] in map(list, forcing.found)
 
@@ -272,7 +272,7 @@ def test_forced_bound_holds_if_views_may_be_misread(data: st.DataObject) -> None
         assert nats == pytest.approx(solution.weighed.nats, abs=0.05)
         nats = max(nats, solution.weighed.nats)
         forcing = forcing_of(trace, theory, ssh_map)
-        assert max(islice(forcing.search(nats + 1e-3), 20)) <= nats + EQUAL
+        assert max(islice(forcing.bounds(nats + 1e-3), 20)) <= nats + EQUAL
         assert max(islice(forcing.bounds(2 * nats), 20)) <= nats + EQUAL
 
 

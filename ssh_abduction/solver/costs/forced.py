@@ -12,7 +12,8 @@ those with it. Both halves have a bound of their own, and all that their cheap m
 with the lowest bound is halved next, so this bound holds for all maps. A half ends if its bound is
 T or more, or if no two classes may be joined: this is a map. If no half is left, these are all maps
 of a cost below T. A low T is fast. So first take T to be between the first bound and the cost of
-the best map.
+the best map, then this cost, which proves that the map is the best one, and last a higher one, to
+find all rivals.
 
 *What a join may gain.* There are two bounds, and the greater one counts. For the first one, a join
 gains at most what a new place, or a new dstate, costs at its first step (`theory/prior.py`). The
@@ -60,7 +61,7 @@ from ssh_abduction.theory.prior import Array, LeastMoves
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 
-# First look for bounds that leave these shares of the gap at the root.
+# First prove bounds that leave these shares of the gap between the first one and the best map.
 SHARES = 0.5, 0.25
 # The bound compares all pairs of visits, so it is only for traces of at most LONGEST steps.
 LONGEST = 2500
@@ -92,7 +93,7 @@ class Forcing:
     """Finds joins (pairs of visits at one place) that every cheap map has, and all cheap maps.
 
     Attributes:
-        found: The dstates and places of maps, for each step. If a search ends, these are all maps
+        found: The dstates and places of maps, for each step. If `bounds` ends, these are all maps
             that cost less than its limit, and perhaps some more.
         is_complete: Whether this is true.
     """
@@ -134,16 +135,19 @@ class Forcing:
         common = np.unique([part.joins for part in parts], axis=1, return_inverse=True)[1]
         return self._all.visits.returns(common.ravel())
 
-    def search(self, most: float) -> Iterator[float]:
-        """Find all maps of a cost below `most`, and yield lower bounds on the cost of all maps."""
+    def limits(self, nats: float, most: float) -> list[float]:
+        """List limits for `bounds`, one after the other. The best known map costs `nats`.
+
+        A low limit is fast, and proves a bound. The last ones are `nats` and `most`.
+        """
         least = self._grown(self._all, most, False).low
-        yield least
-        for share in SHARES:
-            yield from self.bounds(most - share * (most - least))
-        yield from self.bounds(most)
+        return [one for share in SHARES if (one := nats - share * (nats - least)) > least] + [
+            nats,
+            most,
+        ]
 
     def bounds(self, most: float) -> Iterator[float]:
-        """The same with only this limit."""
+        """Find all maps of a cost below `most`, and yield lower bounds on the cost of all maps."""
         self._open, self._leaves, self._most = [(-math.inf, 0, self._all)], [], most
         self.found, self.is_complete, number = [], True, count()
         part = self._grown(self._all, most, False)

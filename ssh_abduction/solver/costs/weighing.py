@@ -107,8 +107,7 @@ class Weighing:
         candidates: The maps found that cost little more than the best one, the best one first.
         bound: A proven lower bound on the cost of every map, in nats.
         of_labels: Lists the minimal maps of a theory within some time; None before the proof.
-        proven: Whether it is proven that no map costs less than the best one, and that all its
-            rivals are found.
+        proven: Whether it is proven that no map costs less than the best one.
     """
 
     def __init__(self, parts: Parts) -> None:
@@ -123,6 +122,9 @@ class Weighing:
         self._places = 0
         self._base = 0.0
         self._within = max(WITHIN, parts.limits.within)
+        self._listed = (
+            0.0  # all maps are known that cost less than this much more than the best one
+        )
         self.candidates: list[Candidate] = []
         self.bound = 0.0
         self.proven = False
@@ -213,17 +215,22 @@ class Weighing:
         task, most = self._task, self._most
         forcing = Forcing(task.problem, task.log, self._misfit, self.candidates[0].map)
         try:
-            for bound in forcing.search(most):
-                self._raise_bound(bound)
-            known = {dstates_and_places(candidate.map) for candidate in self.candidates}
-            others = [one for one in forcing.found if one not in known]
-            if forcing.is_complete and all(map(self._knows, others)):
-                self.bound, self.proven = self._nats, True
-                self._parts.known.status = Status.OPTIMAL
+            for limit in forcing.limits(self._nats + 2 * EQUAL, most):
+                for bound in forcing.bounds(limit):
+                    self._raise_bound(bound)
+                known = {dstates_and_places(candidate.map) for candidate in self.candidates}
+                others = [one for one in forcing.found if one not in known]
+                if limit > self._nats and forcing.is_complete and all(map(self._knows, others)):
+                    self._keep_proof(limit - self._nats)
         finally:
             returns = forcing.returns(most)
             self._forced = [(one.first, one.second) for one in returns if one.of == "dstate"]
             self._base = max(self._base, self._misfit.of_returns(returns) / 2)
+
+    def _keep_proof(self, listed: float) -> None:
+        """Remember that all maps are known that cost less than this much more than the best one."""
+        self.bound, self.proven, self._listed = self._nats, True, listed
+        self._parts.known.status = Status.OPTIMAL
 
     def _knows(self, course: Course) -> bool:
         """Add a map with these dstates and places, if there is one. Return whether this is sure."""
@@ -271,9 +278,7 @@ class Weighing:
         if last is None and not self.candidates:
             parts.known.status = Status.UNSATISFIABLE
             return
-        self.bound = self._nats
-        self.proven = True
-        parts.known.status = Status.OPTIMAL
+        self._keep_proof(self._within)
 
     def keep_best(self) -> None:
         """Compute the cost of the search's best map. Make the cheapest known map the best one.
@@ -312,7 +317,8 @@ class Weighing:
             maps, proven = self._with_other_paths(ssh_map)
             complete &= proven
             yield from ((one, parts.known.cost) for one in maps)
-        parts.rivals.listed = complete = complete and len(self.minimal()) < RIVALS
+        complete &= len(self.minimal()) < RIVALS and self._listed >= parts.limits.within
+        parts.rivals.listed = complete
         most = self._nats + parts.limits.within
         for rank, candidate in enumerate(self.candidates[len(self.minimal()) :]):
             if candidate.nats <= most:
@@ -425,7 +431,7 @@ class Weighing:
         every = (*found, *self._estimated(found[0], set(rivals)), *suspected)
         return Weighed(
             bound=self.bound,
-            within=self._within if self.proven else 0.0,
+            within=min(self._listed, self._within),
             rivals=tuple(map(self._with_aliases, every)),
             searched=is_likely and self.beams.found(self._nats),
             broken=self.beams.broken,
@@ -472,7 +478,7 @@ class Weighing:
 
         If it found all maps below a cost, estimated rivals below it break axioms: leave them out.
         """
-        least = best.nats + self._within if self.proven else -math.inf
+        least = best.nats + min(self._listed, self._within) if self.proven else -math.inf
         problem, ssh_map = self._task.problem, self.candidates[0].map
         for rival in rivals_of(problem, self._misfit, ssh_map, self._estimating):
             if rival.nats >= least and (rival.dstates, rival.places) not in known:
