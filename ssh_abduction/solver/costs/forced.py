@@ -68,6 +68,8 @@ LONGEST = 2500
 # Consider joins of each visit with the last visits to its place, with at least one. Of all visits
 # together, consider about this many joins at most.
 PAIRS = 5000
+# Without the bound by poses, halving is slower than clingo. Then halve the maps this many times.
+HALVED = 20
 # Keep the poses of the last KEPT sets of classes.
 KEPT = 50
 
@@ -93,9 +95,8 @@ class Forcing:
     """Finds joins (pairs of visits at one place) that every cheap map has, and all cheap maps.
 
     Attributes:
-        found: The dstates and places of maps, for each step. If `bounds` ends, these are all maps
-            that cost less than its limit, and perhaps some more.
-        is_complete: Whether this is true.
+        found: The dstates and places of maps that may cost less than the limit, for each step.
+        is_complete: Whether these are all such maps.
     """
 
     def __init__(self, problem: Problem, log: Log, misfit: Misfit, ssh_map: SSHMap) -> None:
@@ -115,6 +116,7 @@ class Forcing:
         # The parts that may have cheap maps, by their bounds, and the maps that were found.
         self._open, self._leaves, self._most = [(-math.inf, 0, self._all)], list[_Part](), math.inf
         self.found, self.is_complete = list[Course](), False
+        self._may_turn = False  # whether a map that was found may be several maps
         # A map is bounded again if two of its classes are apart, or by its poses.
         self._bounding = lru_cache(maxsize=KEPT)(misfit.bounding)
 
@@ -149,10 +151,15 @@ class Forcing:
     def bounds(self, most: float) -> Iterator[float]:
         """Find all maps of a cost below `most`, and yield lower bounds on the cost of all maps."""
         self._open, self._leaves, self._most = [(-math.inf, 0, self._all)], [], most
-        self.found, self.is_complete, number = [], True, count()
+        self._may_turn = False
+        self.found, self.is_complete, number = [], False, count()
         part = self._grown(self._all, most, False)
         self._open = [(part.low, next(number), part)] * (part.low < most)
-        while self._open:
+        classes = self._classes(self._all.visits, self._all.joins)
+        poses, _ = self._bounding(tuple(classes.node.tolist()), tuple(classes.place.tolist()))[0]
+        for _ in count() if may_be_joined(poses) else range(HALVED):
+            if not self._open:
+                break
             part = self._open[0][2]
             yield min(one.low for one in (part, *self._leaves))
             halves = [*self._halves(part, most)]
@@ -160,7 +167,9 @@ class Forcing:
             for half in halves:
                 if (low := max(half.low, part.low)) < most:
                     heappush(self._open, (low, next(number), half._replace(low=low)))
-        yield min((part.low for part in self._leaves), default=most)
+        self.is_complete = not self._open and not self._may_turn
+        left = [*self._leaves, *(part for *_, part in self._open)]
+        yield min((part.low for part in left), default=most)
 
     def _halves(self, part: _Part, most: float) -> Iterator[_Part]:
         """Halve the maps, and grow both halves. Keep the map if there is only one."""
@@ -177,7 +186,7 @@ class Forcing:
                 places = [0] * len(classes.place) if self._is_causal else classes.place.tolist()
                 self.found.append((tuple(numbered(classes.node.tolist())), tuple(places)))
                 self._leaves.append(part)
-                self.is_complete &= not classes.may_turn
+                self._may_turn |= classes.may_turn
                 return
             kind, i, j = steps
             if kind == "place":

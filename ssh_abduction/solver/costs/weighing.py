@@ -81,7 +81,8 @@ RIVALS = 50
 # If the robot may be off the poses of its dstates, by errors with heavy tails, a misfit may be this
 # many times as large as expected. Then standard deviations are 1.5 times too small.
 EXCESS = 2.25
-# Without a time limit, give up after PATIENCE seconds plus MORE times the time of the best map.
+# Without a time limit, end Benders cuts after PATIENCE seconds plus MORE times the time of the best
+# map.
 PATIENCE, MORE = 10.0, 5.0
 # Estimating rivals may end OVERTIME seconds late. It gets at least LEAST_ESTIMATING seconds.
 OVERTIME, LEAST_ESTIMATING = 0.5, 0.1
@@ -134,7 +135,8 @@ class Weighing:
         self._forced: list[tuple[int, int]] = []  # pairs of steps at one dstate in all cheap maps
         # Faults need the readable encodings, which take too much memory for a long trace.
         self._is_long = has_faults and len(parts.task.trace) > READABLE
-        self._improved = 0.0  # the seconds on the clock when the best map was found
+        # The seconds on the clock when the best map was found, and when Benders cuts began.
+        self._improved = self._begun = 0.0
 
     @property
     def best(self) -> Candidate | None:
@@ -258,6 +260,7 @@ class Weighing:
     def _cut(self) -> None:
         """List maps by their counts, and exclude those whose misfit is too expensive."""
         parts, task = self._parts, self._task
+        self._begun = parts.watch.elapsed()
         if self._is_long:
             raise LimitError("no proof")
         if self._forced and row("visits").holds_for(task.theory):
@@ -373,7 +376,8 @@ class Weighing:
         """
         look_at_clock()
         watch = self._parts.watch
-        if watch.left() == math.inf and watch.elapsed() > PATIENCE + MORE * self._improved:
+        lasts = watch.elapsed() - self._begun
+        if watch.left() == math.inf and lasts > PATIENCE + MORE * self._improved:
             raise LimitError("no proof")
         least = self._cost_of_others(ssh_map)
         self._raise_bound(least)
