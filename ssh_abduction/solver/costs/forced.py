@@ -62,7 +62,7 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 
 # First prove bounds that leave these shares of the gap between the first one and the best map.
-SHARES = 0.5, 0.25
+SHARES = 0.75, 0.6, 0.5, 0.4, 0.3, 0.2
 # The bound compares all pairs of visits, so it is only for traces of at most LONGEST steps.
 LONGEST = 2500
 # Consider joins of each visit with the last visits to its place, with at least one. Of all visits
