@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ssh_abduction.cli import import_log
 from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c, warn
-from ssh_abduction.cli.parsing import verb
+from ssh_abduction.cli.parsing import RUN, verb
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named
 from ssh_abduction.runtime.loggers import begin_stage, log_progress, stages
@@ -53,7 +53,7 @@ def run_live(options: argparse.Namespace) -> int:
 
     where = options.save if options.save is not None else options.onto
     folder = None if where is None else Path(where)
-    if folder is not None and (folder / "run.json").exists():
+    if folder is not None and (folder / RUN).exists():
         raise AbductionError(
             f"{named(folder)}: expected a new folder, or one that live saved to, got one that map "
             "wrote; name another folder"

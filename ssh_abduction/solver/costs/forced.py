@@ -41,7 +41,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from heapq import heappop, heappush
 from itertools import chain, combinations, count
 from typing import NamedTuple
@@ -129,6 +129,13 @@ class Forcing:
         is_known = row("visits").holds_for(theory) or row("clique").holds_for(theory)
         return is_known and not theory.has_faults and len(problem.trace) <= LONGEST
 
+    @cached_property
+    def _is_by_poses(self) -> bool:
+        """Whether there is the bound by poses if no classes are joined."""
+        classes = self._classes(self._all.visits, self._all.joins)
+        poses, _ = self._bounding(tuple(classes.node.tolist()), tuple(classes.place.tolist()))[0]
+        return may_be_joined(poses)
+
     def returns(self, most: float) -> list[Equality]:
         """List returns that every map of a cost below `most` is proven to have."""
         parts = [part for *_, part in self._open] + self._leaves
@@ -155,14 +162,12 @@ class Forcing:
         self.found, self.is_complete, number = [], False, count()
         part = self._grown(self._all, most, False)
         self._open = [(part.low, next(number), part)] * (part.low < most)
-        classes = self._classes(self._all.visits, self._all.joins)
-        poses, _ = self._bounding(tuple(classes.node.tolist()), tuple(classes.place.tolist()))[0]
-        for _ in count() if may_be_joined(poses) else range(HALVED):
+        for _ in count() if self._is_by_poses else range(HALVED):
             if not self._open:
                 break
             part = self._open[0][2]
             yield min(one.low for one in (part, *self._leaves))
-            halves = [*self._halves(part, most)]
+            halves = self._halves(part, most)
             heappop(self._open)  # if a limit ends the halving, the part stays
             for half in halves:
                 if (low := max(half.low, part.low)) < most:
@@ -171,13 +176,13 @@ class Forcing:
         left = [*self._leaves, *(part for *_, part in self._open)]
         yield min((part.low for part in left), default=most)
 
-    def _halves(self, part: _Part, most: float) -> Iterator[_Part]:
+    def _halves(self, part: _Part, most: float) -> list[_Part]:
         """Halve the maps, and grow both halves. Keep the map if there is only one."""
         if not part.lacking:
             part = self._grown(part, most, True)
         visits, joins, low, lacking = part
         if low >= most:
-            return
+            return []
         if lacking:
             pair = lacking[0]
         else:
@@ -187,16 +192,16 @@ class Forcing:
                 self.found.append((tuple(numbered(classes.node.tolist())), tuple(places)))
                 self._leaves.append(part)
                 self._may_turn |= classes.may_turn
-                return
+                return []
             kind, i, j = steps
             if kind == "place":
-                yield self._grown(part._replace(visits=visits.parted([(i, j)])), most, False)
                 met = replace(visits, met=(*visits.met, (i, j)))
-                yield self._grown(part._replace(visits=met), most, False)
-                return
+                halves = part._replace(visits=visits.parted([(i, j)])), part._replace(visits=met)
+                return [self._grown(half, most, False) for half in halves]
             pair = int(visits.visit[i]), int(visits.visit[j])
-        yield self._grown(part._replace(visits=visits.lacking(*pair)), most, False)
-        yield self._grown(part._replace(joins=visits.joined(joins, [pair])), most, False)
+        without = part._replace(visits=visits.lacking(*pair))
+        halves = without, part._replace(joins=visits.joined(joins, [pair]))
+        return [self._grown(half, most, False) for half in halves]
 
     def _classes(self, visits: Visits, joins: Ints) -> Joined:
         return Joined(visits, joins, self._misfit.visit, self._is_causal)

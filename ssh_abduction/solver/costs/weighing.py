@@ -123,9 +123,7 @@ class Weighing:
         self._places = 0
         self._base = 0.0
         self._within = max(WITHIN, parts.limits.within)
-        self._listed = (
-            0.0  # all maps are known that cost less than this much more than the best one
-        )
+        self._listed = 0.0  # all maps are known that cost up to this much more than the best one
         self.candidates: list[Candidate] = []
         self.bound = 0.0
         self.proven = False
