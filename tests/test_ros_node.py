@@ -70,6 +70,18 @@ def fed(*items: tuple[str, float]) -> tuple[list[tuple[float, float]], dict[str,
             [(9, 9), (0.5, 0.5)],
             {"no odometry": 1},
         ),
+        # Scans by the new clock come before its first pose, and before the last one by the old.
+        (
+            [("s", 9), ("s", 9.5), ("s", 0.5), ("p", 9), *2 * [("s", 0.7)], ("p", 0), ("p", 1)],
+            [(9, 9), (0.5, 0.5), (0.7, 0.7)],
+            {"doubled": 1, "no odometry": 1},
+        ),
+        # Late scans are no new clock, not even if several come.
+        (
+            [("p", 5), ("s", 9), ("s", 7), ("s", 8.5), ("s", 9.5), ("p", 9), ("p", 9.5)],
+            [(9, 9), (9.5, 9.5)],
+            {"out of order": 2},
+        ),
         # Poses are missing.
         ([("p", 0), ("s", 0), ("s", 1), ("p", 2), ("s", 2)], [(0, 0), (2, 2)], {"no odometry": 1}),
     ],

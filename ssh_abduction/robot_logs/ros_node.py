@@ -379,6 +379,7 @@ class LiveNode:
     def _tick(self) -> None:
         from std_msgs.msg import String
 
+        self._work()  # a scan that waited for its mount may go now
         if self.session.tick():
             self._publish()
         for text in self.session.events[self._told_events :]:

@@ -43,6 +43,8 @@ class StampPairing:
         self.lost: Counter[str] = Counter()
         self.restarts = 0
         self._scans: deque[tuple[float, Any]] = deque()
+        # Scans that went back: of a clock that started anew before its first pose, or just late.
+        self._early: deque[tuple[float, Any]] = deque()
         self._times: list[float] = []
         self._poses: list[Pose] = []
         self._last, self._went_back = -math.inf, False
@@ -54,7 +56,10 @@ class StampPairing:
                 return
             self.restarts += 1
             self._drop_waiting()
-            self._times, self._poses, self._went_back = [], [], True
+            self._times, self._poses, self._went_back = [], [], not self._early
+            if self._early:
+                self._scans, self._early = self._early, self._scans
+                self._last = self._scans[-1][0]
         self._times.append(time)
         self._poses.append(pose)
         if len(self._times) > MOST_POSES:
@@ -66,16 +71,22 @@ class StampPairing:
             # Scans by the clock before may have come after the first pose by the new one.
             self._drop_waiting()
             self._last, self._went_back = -math.inf, False
-        if time == self._last:
-            self.lost["doubled"] += 1
-        elif time < self._last:
-            self.lost["out of order"] += 1
-        else:
+        waiting, last = self._scans, self._last
+        if time < last - BACK or (self._early and self._early[-1][0] < time <= last):
+            waiting = self._early
+            last = waiting[-1][0] if waiting else -math.inf
+        if time <= last:
+            self.lost["doubled" if time == last else "out of order"] += 1
+            return
+        if waiting is self._scans:
             self._last = time
-            self._scans.append((time, scan))
-            if len(self._scans) > MOST_SCANS:
-                self._scans.popleft()
-                self.lost["too many"] += 1
+            if self._early:  # The clock goes on, so they were just late.
+                self.lost["out of order"] += len(self._early)
+                self._early.clear()
+        waiting.append((time, scan))
+        if len(waiting) > MOST_SCANS:
+            waiting.popleft()
+            self.lost["too many"] += 1
 
     def _drop_waiting(self) -> None:
         self.lost += Counter({"no odometry": len(self._scans)})
