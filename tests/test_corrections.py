@@ -884,16 +884,28 @@ def test_correct_says_what_a_pair_is(
     assert re.search(told, capsys.readouterr().err)
 
 
-def test_corrections_of_one_command_count_in_their_order(folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("kinds", "about"),
+    [
+        ("different same", "monday:1,tuesday:0"),
+        ("same different same", "monday:1,tuesday:0"),
+        ("elsewhere same-place", "p1,p0"),
+        ("open closed", "monday:1 back"),
+    ],
+)
+def test_corrections_of_one_command_agree(
+    kinds: str, about: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     building = str(folder / "building")
-    for first, then in (("same", "different"), ("different", "same")):
-        steps = "monday:1,tuesday:0"
-        assert main(["correct", building, f"--{first}", steps, f"--{then}", steps]) == 0
-        (said,) = load_corrections(building).pairs
-        assert said.kind == then
-    assert main(["name", building, "p1", "den"]) == 0
-    assert main(["correct", building, "--elsewhere", "den,p0"]) == 0
-    assert [pair.kind for pair in load_corrections(building).pairs] == ["same", "elsewhere"]
+    both = [text for kind in kinds.split() for text in (f"--{kind}", about)]
+    assert main(["correct", building, *both]) == 1
+    first, second, *_ = kinds.split()
+    assert re.search(f"--{second} .*: this call also says {first}: .*", capsys.readouterr().err)
+    assert not (folder / "building" / "corrections.yaml").exists()
+    # The opposite of what was said before replaces it.
+    for kind in ("same", "different"):
+        assert main(["correct", building, f"--{kind}", "monday:1,tuesday:0"]) == 0
+        assert [pair.kind for pair in load_corrections(building).pairs] == [kind]
 
 
 def test_solve_warns_of_names_that_the_map_does_not_have(

@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -246,7 +247,7 @@ def sentences_of(corrections: Corrections) -> Iterator[str]:
 
 
 class _InOrder(argparse.Action):
-    """Appends an option and its value to `said`. So a later option can replace an earlier one."""
+    """Appends an option and its value to `said`, so that errors are about the later option."""
 
     def __call__(
         self,
@@ -275,11 +276,18 @@ def run_correct(options: argparse.Namespace) -> int:
     saved = SavedMap.load(options.maps, options.map)
     given = getattr(options, "said", ())
     before = said = saved.corrections
+    now = replace(before, names=(), pairs=(), gateways=())  # what this call says
     for kind, value in given:
         if kind in ASSERTIONS:
-            said = said.with_pair(kind, *_pair(saved, kind, value))
+            say = methodcaller("with_pair", kind, *_pair(saved, kind, value))
         else:
-            said = said.with_gateway(kind == "open", saved.gateway(value))
+            say = methodcaller("with_gateway", kind == "open", saved.gateway(value))
+        said, after = say(said), say(now)
+        for earlier in (*now.pairs, *now.gateways):
+            if earlier not in (*after.pairs, *after.gateways):
+                flag = f"--{kind.replace('_', '-')} {shlex.quote(value)}"
+                raise MapError(f"{flag}: this call also says {earlier}; say only one of them")
+        now = after
     if said == before and given:
         print("nothing changed: this was said before")
         return 0
@@ -289,8 +297,8 @@ def run_correct(options: argparse.Namespace) -> int:
         return 0
     file = saved.save(said)
     keep_folder_whole(saved.file, "corrections")
-    now: tuple[Said | Passage, ...] = (*said.pairs, *said.gateways)
-    for one in now:
+    every: tuple[Said | Passage, ...] = (*said.pairs, *said.gateways)
+    for one in every:
         if one not in (*before.pairs, *before.gateways):
             print(printable(saved.in_words(one)))
     warn(_unlike(saved, said, [pair for pair in said.pairs if pair not in before.pairs]))
