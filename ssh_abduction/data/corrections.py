@@ -252,15 +252,7 @@ class Corrections:
         about = [other for other in self.pairs if set(other.steps) == set(said.steps)]
         new = () if any(other.kind == kind for other in about) else (said,)
         wrong = [other for other in about if other.kind in _AGAINST[kind]]
-        after = replace(self, pairs=(*(pair for pair in self.pairs if pair not in wrong), *new))
-        clash = _contradiction(after.pairs)
-        if said in clash:
-            others = " and ".join(str(one) for one in clash if one != said)
-            raise MapError(
-                f"{said}: expected what agrees with the other corrections, got a contradiction of "
-                f"{others}; say the opposite of one of these first"
-            )
-        return after
+        return replace(self, pairs=(*(pair for pair in self.pairs if pair not in wrong), *new))
 
     def with_gateway(self, is_open: bool, seen: Iterable[tuple[str, float]]) -> Corrections:
         """Say that a gateway is open or closed. What was said about it before is replaced.
@@ -420,8 +412,18 @@ class Corrections:
         )
 
     def __post_init__(self) -> None:
-        """Raise MapError if a name is a number or given twice, or a thing is named twice."""
+        """Raise MapError if a name is a number or given twice, or if pairs are contradictory."""
         where = self.source or "corrections"
+        for part, kind in (("names", Naming), ("pairs", Said), ("gateways", Passage)):
+            mend = f"make it with {kind.__name__}"
+            checked = all_instances(part, getattr(self, part), kind, MapError, mend=mend)
+            object.__setattr__(self, part, checked)
+        if clash := _contradiction(self.pairs):
+            raise MapError(
+                f"{where}: {clash[0]}: expected what agrees with the other corrections, got a "
+                f"contradiction of {' and '.join(map(str, clash[1:]))}; drop one of these, or say "
+                "the opposite of it first"
+            )
         first: dict[tuple[str, ...], int] = {}
         for i, naming in enumerate(self.names):
             drive, _, number = naming.name.rpartition(":")
