@@ -21,7 +21,7 @@ from simulator.tours import record
 from simulator.world import World
 from ssh_abduction.cli import main
 from ssh_abduction.cli.simulate import scans_of
-from ssh_abduction.data.errors import MapError, TraceError
+from ssh_abduction.data.errors import AbductionError, MapError, TraceError
 from ssh_abduction.data.odometry import displacement_between, moved
 from ssh_abduction.robot_logs import log_mapper
 from ssh_abduction.robot_logs.live_page import LivePage
@@ -176,6 +176,19 @@ def test_next_is_the_least_sure_join() -> None:
     assert mapper.next().startswith("drive through place 2: the visits of scans 10 and 30")
     mapper.accept(replace(found(0, 1, 0, 2), sure={"doubtful": doubtful, "rivals": []}))
     assert mapper.next().endswith("at one place with probability 0.90")
+    rivals[0]["probability"] = 0.0001
+    mapper.accept(replace(found(0, 1, 0, 2), sure={"doubtful": [], "rivals": rivals}))
+    assert mapper.next() == "no join is known to be doubtful"
+
+
+def test_names_are_those_of_one_place() -> None:
+    mapper = OnlineLogMapper()
+    mapper.accept(found(0, 1))
+    assert str(mapper.name(0, " hall ")) == "place 0 was renamed"
+    for place, text in ((1, "hall"), (1, ""), (1, "p0"), (1, "a\nb"), (2, "den")):
+        with pytest.raises(AbductionError, match="expected"):
+            mapper.name(place, text)
+    assert [place["name"] for place in mapper.to_dict()["places"]] == ["hall", None]
 
 
 def test_corrections_of_other_scans_are_refused() -> None:

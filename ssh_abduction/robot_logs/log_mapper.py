@@ -34,6 +34,7 @@ from perception.places.relations import Relocation
 from perception.places.saved import STATE
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.checks import an_instance, one_of
+from ssh_abduction.data.corrections import Corrections, Naming
 from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import json_line, mend_of, parse_json, read_file, write_file
 from ssh_abduction.data.groups import first_index_of, indices_of
@@ -61,6 +62,7 @@ POLL = 0.2  # seconds to wait for a search
 # Units of work of a search, each about a second of a quiet core.
 WORK = 5.0
 RIVALS = 5  # rivals that are told
+SURE = 0.005  # a join of less probability is not doubtful
 # What a person says of two visits, as in corrections: a place is the same, or another one.
 SAID = ("same_place", "elsewhere")
 
@@ -426,22 +428,29 @@ class OnlineLogMapper:
         one_of("kind", kind, SAID, LogError)
         scans, pair = self._names.place_of, (min(first, second), max(first, second))
         if first == second or not scans.keys() >= {*pair}:
+            known = ", ".join(map(str, sorted(scans))) or "no map yet"
             raise LogError(
-                f"scans: expected two different ones of {', '.join(map(str, sorted(scans)))}, got "
-                f"{first} and {second}; take scans of the map"
+                f"scans: expected two different ones of {known}, got {first} and {second}; take "
+                "scans of the map"
             )
         self._names.said = [one for one in self._names.said if tuple(one[1:]) != pair]
         self._names.said.append((kind, *pair))
         self._asked = -1
 
     def name(self, place: int, text: str) -> Event:
-        """Name a place by its number. Raises LogError if there is none of this number."""
+        """Name a place by its number.
+
+        Raises LogError if there is none of this number, and MapError if the name is that of another
+        place, or no name.
+        """
         if place not in self._names.middles:
             raise LogError(
                 f"place: expected one of {counted(len(self._names.middles), 'places')}, got "
                 f"{place}; take a number of the map"
             )
-        self._names.texts[place] = text
+        texts = {**self._names.texts, place: text}
+        Corrections(names=tuple(Naming(one, "place", f"place:{n}") for n, one in texts.items()))
+        self._names.texts[place] = text.strip()
         return Event("renamed", place)
 
     def _provisional(self) -> list[list[float]]:
@@ -461,6 +470,7 @@ class OnlineLogMapper:
         pairs = [(one["probability"], *one["scans"]) for one in self.sure.get("doubtful") or ()]
         for rival in self.sure.get("rivals", ()):
             pairs += [(rival["probability"], *pair) for pair in rival["joined"]]
+        pairs = [pair for pair in pairs if SURE < pair[0] < 1 - SURE]
         if not pairs:
             return "no join is known to be doubtful"
         p, first, second = min(pairs, key=lambda pair: abs(pair[0] - 0.5))
@@ -656,7 +666,7 @@ class LiveSession:
     def restart(self, mapper: OnlineLogMapper) -> None:
         """Begin a new drive. The search ends, and the next save replaces the old state."""
         self._search.end()
-        self.mapper, self.seen = mapper, None
+        self.mapper, self.seen, self.told = mapper, None, mapper.to_dict()
 
     def save(self) -> None:
         """Save the state. If the folder cannot be written, say so once."""

@@ -226,13 +226,14 @@ class LiveNode:
         self._listening, self._came = set[str](), set[Any]()
         last = session.mapper.live.log.scans[-1].time if len(session.mapper) else None
         self._after = -math.inf if last is None else last
-        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._topics = {
             name: node.create_publisher(kind, f"~/{name}", quality)
             for name, kind, quality in (
                 ("markers", MarkerArray, latched),
                 ("map", String, latched),
-                ("events", String, latched),
+                ("events", String, kept),
                 ("belief", String, 10),
             )
         }
