@@ -763,6 +763,11 @@ def test_page_over_walls_in_the_browser(browser: Any, house: Path) -> None:
     assert len(browser.find_elements("css selector", "#scans svg")) == 2
     page.click("reject")
     assert "ssh-abduction correct maps.json --elsewhere round:0,round:3" in page["answer"].text
+    for text in ("d1", "round:1", "round:99"):
+        page["find"].clear()
+        page["find"].send_keys(f"{text}\ue007")
+        known = "nothing is called round:99" if "99" in text else f"{text} at place 1"
+        assert page["found"].text == known
     assert browser.find_elements("css selector", "#report details:not([open])")
     browser.execute_script("document.querySelector('#drawings svg').focus()")
     before = browser.execute_script("return camera.dx")

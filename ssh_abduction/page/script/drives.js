@@ -24,7 +24,7 @@ function numberOf(text) {
     drive = data.drives.find((drive) => drive.name === name);
   if (dstate) return [...labelsOf(0)].findIndex((label) => label === Number(dstate[1]));
   if (number === undefined) return thingCalled(said)?.steps?.[0] ?? NaN;
-  if (name === undefined) return Number(number);
+  if (name === undefined || (name === data.name && !data.drives.length)) return Number(number);
   return drive && Number(number) < drive.stop - drive.first ? drive.first + Number(number) : NaN;
 }
 

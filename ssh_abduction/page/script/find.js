@@ -20,7 +20,7 @@ function showLayers() {
   }
 }
 
-// All that has a name or a number in the first map, with its position and its steps.
+// All that has a name or a number in the first map, with its position and its steps, but no dstates.
 function things() {
   const ssh = mapOf(0),
     { corridors = [], rooms = [], doors = [] } = data.indoors;
@@ -60,7 +60,11 @@ function thingCalled(text) {
 
 function find(text) {
   const wanted = text.trim(),
-    one = thingCalled(text);
+    ssh = mapOf(0),
+    t = /^(d|step ?)\d+$|:\d+$/.test(wanted) ? numberOf(wanted) : NaN,
+    dstate = ssh.dstates[ssh.labels[t]],
+    where = dstate && (dstate.place === null ? "" : ` at ${ssh.called("place", dstate.place)}`),
+    one = dstate ? { text: wanted + where, at: dstate.at, steps: [t] } : thingCalled(text);
   $("found").textContent = !wanted ? "" : one ? one.text : `nothing is called ${wanted}`;
   state.found = wanted && one ? one.at : null;
   if (state.found) {
