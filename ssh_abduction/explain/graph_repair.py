@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -153,8 +153,9 @@ def _wrong_in(model: clingo.Model) -> tuple[int, ...]:
     return tuple(sorted(symbol.arguments[0].number for symbol in model.symbols(shown=True)))
 
 
-def _turned_in(model: clingo.Model) -> list[clingo.Symbol]:
-    return [symbol for symbol in model.symbols(atoms=True) if symbol.name == "turned"]
+def _turned_in(model: clingo.Model) -> str:
+    """The action of the only edge that is turned."""
+    return next(s.arguments[1].string for s in model.symbols(atoms=True) if s.name == "turned")
 
 
 class _GraphAxioms:
@@ -181,7 +182,8 @@ class _GraphAxioms:
         if self._mends([]):
             yield replace(found, fewest=0, repairs=((),), complete=True, blamed=(), turns=((),))
             return
-        for wrong in self._asker.answers(_wrong_in, "ignore", 1):
+        as_they_are = [(_mended(e), False) for e in range(len(self.moves))]
+        for wrong in self._asker.answers(_wrong_in, "ignore", 1, assumptions=as_they_are):
             yield (found := replace(found, fewest=len(wrong), repairs=(wrong,)))
         wrong = tuple(sorted(minimal_part(self._mends, [*found.repairs[0]])))
         yield (found := replace(found, fewest=len(wrong), repairs=(wrong,)))
@@ -190,6 +192,7 @@ class _GraphAxioms:
             lambda model: (_wrong_in(model), model.optimality_proven),
             "optN",
             0,
+            assumptions=as_they_are,
             on_bound=lambda bound: self.bounds.append(bound[0]),
         ):
             smallest |= {wrong} if is_smallest else set()
@@ -221,15 +224,16 @@ class _GraphAxioms:
     def _turns(self, wrong: tuple[int, ...]) -> tuple[tuple[str, ...], ...]:
         """For each edge of a repair, find the actions with which it is right."""
         kept = [(_wrong(e), e in wrong) for e in range(len(self.moves))]
-
-        def actions(edge: int) -> Iterator[str]:
-            made = [(clingo.Function("mended", [clingo.Number(e)]), e == edge) for e in wrong]
-            while found := self._answer([*kept, *made], read=_turned_in):
-                turned = next(t for t in found if t.arguments[0].number == edge)
-                made.append((turned, False))
-                yield turned.arguments[1].string
-
-        return tuple(tuple(sorted(actions(edge))) for edge in wrong)
+        found = (
+            self._asker.answers(
+                _turned_in,
+                "ignore",
+                0,
+                assumptions=[*kept, *((_mended(e), e == edge) for e in wrong)],
+            )
+            for edge in wrong
+        )
+        return tuple(tuple(sorted(each)) for each in found)
 
     def _clash(self, edges: Collection[int]) -> bool:
         """Whether these edges cannot all be right."""
@@ -247,19 +251,16 @@ class _GraphAxioms:
         return tuple(name for name, one in found if one._clash(range(len(some))))
 
     def _holds(self, assumptions: list[tuple[clingo.Symbol, bool]], mode: str = "ignore") -> bool:
-        return self._answer(assumptions, mode) is not None
-
-    def _answer(
-        self,
-        assumptions: list[tuple[clingo.Symbol, bool]],
-        mode: str = "ignore",
-        read: Callable[[clingo.Model], Any] = _wrong_in,
-    ) -> Any:
-        return next(self._asker.answers(read, mode, 1, assumptions=assumptions), None)
+        answers = self._asker.answers(_wrong_in, mode, 1, assumptions=assumptions)
+        return next(answers, None) is not None
 
 
 def _wrong(edge: int) -> clingo.Symbol:
     return clingo.Function("wrong", [clingo.Number(edge)])
+
+
+def _mended(edge: int) -> clingo.Symbol:
+    return clingo.Function("mended", [clingo.Number(edge)])
 
 
 def read_moves(file: str) -> tuple[GraphMove, ...]:
