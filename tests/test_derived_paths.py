@@ -11,8 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from perception.places.passages import STEP, WIDE, doors_in, openings_in, resampled
+from perception.places.passages import (
+    STEP,
+    WIDE,
+    doors_in,
+    is_beside_furniture,
+    openings_in,
+    resampled,
+)
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.building.derive import buildings_of, with_building
 from ssh_abduction.building.directions import RouteCourse, directions_to
@@ -429,6 +437,23 @@ def test_doors_are_narrow_with_wider_space_on_both_sides() -> None:
     wide[[8, 9, 31, 32]] = 1.0
     wide[33:] = 3.0
     assert doors_in(wide) == [8, 31]
+
+
+def test_furniture_at_one_wall_of_a_corridor_makes_no_door() -> None:
+    left, right = np.full(40, 1.0), np.full(40, 1.0)
+    left[18:22] = 0.4
+    off = 0.2 * np.sin(np.arange(40) / 6)  # The course swerves slowly.
+    way = np.stack([STEP * np.arange(40), off], axis=1)
+
+    def is_furniture(one: NDArray[np.float64], other: NDArray[np.float64], k: int = 19) -> bool:
+        return is_beside_furniture(k, way, np.stack([one - off, other + off], axis=1))
+
+    assert is_furniture(left, right)
+    assert is_furniture(right, left)
+    assert not is_furniture(left, left)  # The walls of a fire door come from both sides.
+    left[22:] = 2.0  # A door in the corner of a room has a wider room behind it.
+    assert not is_furniture(left, right)
+    assert not is_furniture(right, right, 1)  # The course begins here.
 
 
 def test_openings_are_deep_parts_of_a_wall() -> None:

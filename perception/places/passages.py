@@ -29,6 +29,8 @@ WIDE, ALONG = 4.0, 0.3
 # wider by WIDER metres. A wall is known to half a cell, so two widths of one passage differ by two
 # cells at most.
 DOOR, NEAR, WIDER = 1.45, 2.0, 2.5 * CELL
+# Walls go on if GO_ON points on each side of a narrow part are on one line.
+GO_ON = 3
 # A part of a wall is an opening if there the free space reaches DEEP metres farther than beside it,
 # over a length from LEAST to MOST metres. Beside it means within BESIDE metres.
 DEEP, LEAST, MOST, BESIDE = 0.6, 0.5, 1.8, 2.5
@@ -91,7 +93,7 @@ class Passages:
         through = [
             {"at": round(k * STEP, 2), "width": round(float(walls[k].sum()), 2), "side": "through"}
             for k in (k - len(before) for k in doors_in(wide))
-            if 0 < k < len(way) - 1
+            if 0 < k < len(way) - 1 and not is_beside_furniture(k, way, walls)
         ]
         aside = [
             {"at": round(at * STEP, 2), "width": round(length, 2), "side": side}
@@ -164,6 +166,29 @@ def doors_in(wide: Array) -> list[int]:
     window = 2 * round(NEAR / STEP) + 1
     found, _ = find_peaks(-wide, height=-DOOR, prominence=WIDER, wlen=window)
     return [int(k) for k in found]
+
+
+def is_beside_furniture(k: int, way: Array, sides: Array) -> bool:
+    """Whether only furniture makes a way narrow at its point k.
+
+    Both walls go straight on before and behind it, and one of them beside it, too. `way` has the
+    points, and `sides` how far walls are on the left and right of each, both (n, 2) metres.
+    """
+    sides = ndimage.median_filter(sides, (3, 1))
+    wide, left = sides.sum(axis=1), to_the_left(way)
+    wider = np.flatnonzero(wide >= wide[k] + WIDER)
+    before, behind = wider[wider < k][-GO_ON:], wider[wider > k][:GO_ON]
+    if min(len(before), len(behind)) < GO_ON:
+        return False
+    walls = way + sides[:, [0]] * left, way - sides[:, [1]] * left
+    beside = [_is_straight(wall[before[0] : behind[-1] + 1]) for wall in walls]
+    return all(_is_straight(wall[[*before, *behind]]) for wall in walls) and sum(beside) == 1
+
+
+def _is_straight(points: Array) -> bool:
+    """Whether all points, (n, 2) metres, are within a cell of one line."""
+    off = points - points.mean(axis=0)
+    return float(np.abs(off @ np.linalg.svd(off)[2][1]).max()) <= CELL
 
 
 def openings_in(free: Array) -> Iterator[tuple[float, float]]:

@@ -265,23 +265,10 @@ def corridors_of(
 def long_parts(way: PairedWay) -> Iterator[Part]:
     """Yield the parts of a way that are corridors: between rooms that it crosses."""
     stops = sorted({p.at for p in way.passages if p.door is not None})
-    parts = list(pairwise([0, *stops, len(way.line) - 1]))
-    runs = [
-        [parts.index(part) for part in run]
-        for is_room, run in groupby(parts, key=lambda part: _is_room(way, part, SQUARE))
-        if not is_room
-    ]
-    found: list[tuple[list[int], Part]] = []
-    for run in runs:
-        if (whole := _corridor(way, [parts[k] for k in run])) is None:
-            continue
-        if found and run[0] - found[-1][0][-1] == 2:  # A crossing between two corridors.
-            joined = [*range(found[-1][0][0], run[-1] + 1)]
-            if (both := _corridor(way, [parts[k] for k in joined])) is not None:
-                found[-1] = joined, both
-                continue
-        found.append((run, whole))
-    return (part for _, part in found)
+    parts = pairwise([0, *stops, len(way.line) - 1])
+    for is_room, run in groupby(parts, key=lambda part: _is_room(way, part, SQUARE)):
+        if not is_room and (whole := _corridor(way, [*run])) is not None:
+            yield whole
 
 
 def _corridor(way: PairedWay, parts: list[Part]) -> Part | None:

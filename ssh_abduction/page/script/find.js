@@ -24,11 +24,10 @@ function showLayers() {
 function things() {
   const ssh = mapOf(0),
     { corridors = [], rooms = [], doors = [] } = data.indoors;
-  const middleOf = (line) => line[Math.floor(line.length / 2)];
   return [
     ...[...ssh.places].map(([p, at]) => ({ text: ssh.called("place", p), at, steps: ssh.ofPlace.get(p) })),
     ...[...ssh.ofPath].map(([h, steps]) => ({ text: ssh.called("path", h), at: middle(steps), steps })),
-    ...corridors.map(({ title, line }) => ({ text: title, at: middleOf(line) })),
+    ...corridors.map(({ title, line }) => ({ text: title, at: halfway(line) })),
     ...rooms
       .filter(({ places, line }) => line.length || places.length)
       .map(({ title, places, line }) => ({

@@ -142,6 +142,15 @@ function paintGround(figure, see) {
   }
 }
 
+// The point halfway along a line.
+function halfway(line) {
+  const legs = line.slice(1).map(([x, y], k) => Math.hypot(x - line[k][0], y - line[k][1]));
+  let far = legs.reduce((sum, leg) => sum + leg, 0) / 2,
+    k = 0;
+  while (k < legs.length - 1 && far > legs[k]) far -= legs[k++];
+  return line[k].map((p, i) => p + (far / legs[k]) * (line[k + 1][i] - p));
+}
+
 function nameGround(figure, see) {
   const around = [
     [0, -1],
@@ -149,14 +158,16 @@ function nameGround(figure, see) {
     [1, 0],
     [-1, 0],
   ];
-  for (const { title, line } of [...(data.indoors.corridors ?? []), ...(data.indoors.rooms ?? [])]) {
+  const { corridors = [], rooms = [] } = data.indoors;
+  for (const thing of [...corridors, ...rooms]) {
+    const { title, line } = thing;
     if (!line.length) continue;
     const xs = line.map(([x]) => x),
       ys = line.map(([, y]) => y);
     if ((Math.max(...xs) - Math.min(...xs) + Math.max(...ys) - Math.min(...ys)) * figure.k < 90)
       continue;
     const middle = [0, 1].map((k) => line.reduce((sum, p) => sum + p[k], 0) / line.length);
-    const at = title.startsWith("corridor") ? line[Math.floor(line.length / 2)] : middle;
+    const at = corridors.includes(thing) ? halfway(line) : middle;
     label(figure, title, see(at), 10, around, "inroom");
   }
 }
