@@ -72,6 +72,16 @@ def test_scale_says_how_much_longer_distances_are() -> None:
     assert [metres for _, metres in frame.residuals] == pytest.approx([1, 1])
 
 
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_mirrored_points_are_told(is_mirrored: bool) -> None:
+    points = {name: complex(x, y) for name, x, y in (("a", 0, 0), ("b", 9, 1), ("c", 4, 7))}
+    there = {
+        name: (z, 3 + 1j * (z.conjugate() if is_mirrored else z)) for name, z in points.items()
+    }
+    sentence = MapFrame.of_points(there).sentence
+    assert ("; mirrored, they fit to 0.00 m" in sentence) == is_mirrored
+
+
 def test_rooms_and_doors_move_with_the_places(house: Path) -> None:
     ssh_map = Listing.load(house / "maps.json").maps[0]
     moved = MapFrame(TURN, SHIFT).moved(ssh_map)

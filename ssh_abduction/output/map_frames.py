@@ -41,12 +41,14 @@ class MapFrame:
         shift: The origin of the map in the other frame, in metres.
         residuals: How far each point is from where it should be, in metres, by its name.
         scale: By how much distances between the points are longer in the frame than in the map.
+        mirrored: The residuals, as a root mean square, if the points of the map were mirrored.
     """
 
     turn: complex
     shift: complex
     residuals: tuple[tuple[str, float], ...] = ()
     scale: float = 1.0
+    mirrored: float = math.inf
 
     @classmethod
     def of_origin(cls, x: float, y: float, degrees: float) -> MapFrame:
@@ -70,18 +72,20 @@ class MapFrame:
                 f"frame: expected two points that are {NEAREST:g} m apart or more, got "
                 f"{len(pairs)} within less; give points that are far apart"
             )
-        turn, shift = fitted_motion([a for a, _ in pairs], [b for _, b in pairs])
-        off = {name: abs(turn * a + shift - b) for name, (a, b) in points.items()}
-        return cls(turn, shift, tuple(off.items()), _extent(pairs, 1) / _extent(pairs, 0))
+        turn, shift, off = _fitted(pairs)
+        _, _, mirrored = _fitted([(a.conjugate(), b) for a, b in pairs])
+        scale = _extent(pairs, 1) / _extent(pairs, 0)
+        return cls(turn, shift, tuple(zip(points, off, strict=True)), scale, _mean(mirrored))
 
     @property
     def sentence(self) -> str:
         """How many points the frame was fitted to, and how far they are off, in words."""
         off = [metres for _, metres in self.residuals]
-        mean = math.sqrt(sum(metres**2 for metres in off) / max(1, len(off)))
         worst, most = max(self.residuals, key=lambda point: point[1], default=("", 0.0))
-        said = f"residuals {mean:.2f} m (root mean square), at most {most:.2f} m ({worst})"
+        said = f"residuals {_mean(off):.2f} m (root mean square), at most {most:.2f} m ({worst})"
         share = f"distances there are {self.scale:.3f} times those of the map"
+        if self.mirrored < _mean(off) / 2 - 0.01:  # not if both are 0
+            share += f"; mirrored, they fit to {self.mirrored:.2f} m: is -y meant, or y,x?"
         return f"{len(off)} points; {said}; {share}"
 
     def moved(self, ssh_map: SSHMap) -> SSHMap:
@@ -118,6 +122,17 @@ class MapFrame:
             paths=tuple(replace(path, line=line(path.line)) for path in ssh_map.paths),
             building=building,
         )
+
+
+def _fitted(pairs: Sequence[tuple[complex, complex]]) -> tuple[complex, complex, list[float]]:
+    """The rotation and the shift that fit best, and how far each point is off then."""
+    turn, shift = fitted_motion([a for a, _ in pairs], [b for _, b in pairs])
+    return turn, shift, [abs(turn * a + shift - b) for a, b in pairs]
+
+
+def _mean(off: Sequence[float]) -> float:
+    """The root mean square."""
+    return math.sqrt(sum(metres**2 for metres in off) / max(1, len(off)))
 
 
 def _spread(points: Sequence[complex]) -> float:
