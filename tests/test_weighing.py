@@ -581,6 +581,15 @@ def test_rival_may_cost_far_less_than_the_best_map() -> None:
     assert "steps 0 and 2" in weighed.sentence
 
 
+@pytest.mark.parametrize(("broken", "less"), [(-math.inf, 1.0), (0.0, 1.0), (math.log(201.0), 2.0)])
+def test_cheaper_map_that_breaks_axioms_lowers_the_confidence(broken: float, less: float) -> None:
+    """One building of 200 breaks axioms, so a map of 201 times the probability halves it."""
+    rivals = Rival(10.0, (0, 1, 0), (0, 1, 0)), Rival(10.0 + math.log(999), (0, 1, 2), (0, 1, 0))
+    weighed = Weighed(10.0, 0.0, rivals, broken=broken)
+    assert weighed.confidence == pytest.approx(0.999 / less, rel=1e-2)
+    assert weighed.place_confidence == pytest.approx(1 / less, rel=1e-2)
+
+
 def test_sentence_names_the_most_probable_missed_join() -> None:
     """The best map keeps steps 1 and 3 apart, and a rival joins them."""
     best = Rival(10.0, (0, 1, 0, 2), (0, 1, 0, 2))

@@ -23,9 +23,9 @@ EQUAL = 1e-6  # costs in nats that differ by less count as equal
 # Probabilities with the same digits are equally doubtful. A file has costs with fewer digits, and
 # must say the same.
 TOLD = 4
-# The price of breaking axioms, in nats. Mention a map that breaks axioms only if it costs SAID nats
-# less than the best map.
-BROKEN, SAID = 12.0, 1.0
+# The prior probability that a building breaks axioms. Mention a map that breaks axioms only if it
+# costs SAID nats less than the best map.
+BREAKS, SAID = 0.005, 1.0
 # A join is doubtful if it is false with more than this probability. Mention that two steps may be
 # at one place, too, if that is more probable than this.
 DOUBTED = 0.05
@@ -126,8 +126,8 @@ class Weighed:
     def confidence(self) -> float | None:
         """The probability of the best map among its rivals; None if it is unknown.
 
-        It is unknown if the search did not finish, or if there is a `doubt`. A map that breaks
-        axioms is counted as a rival at a cost BROKEN nats higher.
+        It is unknown if the search did not finish, or if there is a `doubt`. If the best map that
+        breaks axioms costs less, it is a rival, with BREAKS as its prior.
         """
         return self._confidence(self.weights[0])
 
@@ -146,8 +146,8 @@ class Weighed:
         """Return the confidence in maps that have this share of the weights of all rivals."""
         if self.doubt is not None or not self.finished:
             return None
-        broken = math.exp(min((self.broken - BROKEN) / self.excess, MOST))
-        return share / (1 + self.weights[0] * broken)
+        broken = math.expm1(min(max(self.broken, 0.0) / self.excess, MOST))
+        return share / (1 + BREAKS * self.weights[0] * broken)
 
     def probability(self, first: int, second: int, of: str = "dstate") -> float:
         """Return the probability, by the known rivals, that two steps are at one dstate or place.
