@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple
 from unittest.mock import patch
@@ -22,6 +23,7 @@ from truth import partition
 
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry
+from ssh_abduction.data.groups import indices_of
 from ssh_abduction.data.map_parts import DState
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solution.weighed import Weighed
@@ -110,6 +112,19 @@ def test_all_cheap_maps_have_the_forced_joins_and_are_found(kind: str, seed: int
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ["frames", "causal", "bare"])
+def test_no_map_has_two_steps_at_one_place_that_are_apart(kind: str) -> None:
+    known = truth.random_walk(3, 12, 0, truth.Noise(Odometry(**FINE)))
+    problem = settle(known.trace, THEORIES[kind])
+    log = Log(problem.trace, problem.theory, evidence=problem.evidence)
+    visits = Visits.of(problem, log, true_map(known))
+    one = indices_of(known.dstates)
+    met = replace(visits, met=(next((at[0], at[-1]) for at in one.values() if len(at) > 1),))
+    for some, fails in ((met, False), (met.parted(met.met), True)):
+        classes = Joined(some, np.arange(len(some.place)), Misfit(problem).visit, kind == "causal")
+        assert classes.fails == fails
+
+
 def test_forced_joins_prove_a_maze_of_sixty_steps() -> None:
     known = truth.random_walk(4, 60, 3001, truth.Noise(Odometry(**FINE)))
     trace, theory, solution, weighed = solved(known.trace, Theory.topological())

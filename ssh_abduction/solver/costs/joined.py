@@ -384,7 +384,9 @@ class Joined:
                 [x for _, x in sorted({*zip(class_at, self.place.tolist(), strict=True)})]
             )
             apart = apart_classes(np.logical_and.reduce(self.apart)[None], of_class)[0]
-        self._places = _Cliques(apart)
+        self.fails = bool(apart.diagonal().any())
+        if not self.fails:
+            self._places = _Cliques(apart)
 
     def _close(self) -> None:
         """Flag two classes as apart if one action leads from them to classes that are apart."""
