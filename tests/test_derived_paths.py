@@ -31,6 +31,8 @@ from ssh_abduction.checker.buildings import faults_of_corridors, faults_of_paths
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data.building import Corridor
+from ssh_abduction.data.corrections import Corrections, Naming
+from ssh_abduction.data.drives import drives_of
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import DState, Fit, MapPath, Name, Pose, Region
 from ssh_abduction.data.parts_of_dstates import number_at
@@ -233,6 +235,30 @@ def test_each_part_of_a_building_can_be_named_and_reached() -> None:
         route(found, "p0", "p7", by="actions", avoid=[f"door{between}"])
     with pytest.raises(MapError, match="or a corridor as corridor0, or a room as room0, or a door"):
         route(found, "p0", "door9")
+
+
+def test_names_stay_when_the_robot_drives_on_and_numbers_change() -> None:
+    """It finds a longer corridor, which becomes corridor 0, and places get other numbers."""
+    names = (Naming("street", "corridor", "t:1"), Naming("closet", "room", "t:2"))
+    said = Corrections(names=(*names, Naming("gate", "door", "t:1")))
+    long = [*CROSS, *((5.0 + 8 * k, 9.0) for k in range(4))]
+    numbers, doors = set(), [(1, 4), (2, 5), (4, 6)]
+    for points, visits in ((CROSS, TOUR), (long, [*TOUR, 1, 4, 6, 7, 8, 9, 8])):
+        for shift in (0, 3):
+            order = [*range(shift, len(points)), *range(shift)]  # the old numbers
+            to = {p: k for k, p in enumerate(order)}
+            own = [(to[p], to[q]) for p, q in doors if max(p, q) < len(points)]
+            ssh_map, trace = drive([points[p] for p in order], [to[p] for p in visits], doors=own)
+            trace = replace(trace, name="t")
+            found = said.named(with_building(ssh_map, trace), drives_of(trace))
+            at = {n.text: [order[p] for p in found.things()[n.kind][n.id]] for n in found.names}
+            assert {text: sorted(places) for text, places in at.items()} == {
+                "street": [0, 1, 2, 3],
+                "closet": [4],
+                "gate": [1, 4],
+            }
+            numbers.add(tuple(n.id for n in found.names))
+    assert len(numbers) == 2
 
 
 def test_a_slim_room_has_one_way_though_the_robot_drove_from_door_to_door() -> None:

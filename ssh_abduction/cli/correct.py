@@ -491,7 +491,8 @@ class SavedMap:
             return "place", self.step(text)
         except MapError as error:
             names = self.given | {f"{kind}{n}" for kind in NAMED for n in re.findall(r"\d+$", text)}
-            hint = meant(text, names, 3) or "; or a place such as p4"
+            hint = meant(text, names, 3) or "; or a place, corridor, room or door, such as room4"
+            hint += "; a wing has no name: name its corridor" * ("wing" in text)
             raise MapError(f"{error}{hint}") from None
 
     @property
