@@ -89,10 +89,7 @@ def main() -> None:
         assert found is not None
         mapper.accept(found)
         ways = np.cumsum(
-            [
-                0.0,
-                *(math.dist(a.corrected[:2], b.corrected[:2]) for a, b in pairwise(second)),
-            ]
+            [0.0, *(math.dist(a.corrected[:2], b.corrected[:2]) for a, b in pairwise(second))]
         )
         seen = cKDTree([scan.corrected[:2] for scan in known])
         aside = seen.query([scan.corrected[:2] for scan in second])[0]

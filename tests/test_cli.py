@@ -43,9 +43,7 @@ def saved(trace: Trace, folder: Path) -> str:
     return str(path)
 
 
-def test_solve_prints_the_maps_and_their_differences(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_solve_prints_the_maps_and_their_differences(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["solve", ACES]) == 0
     out = capsys.readouterr().out
     verdict, headline = out.splitlines()[:2]
@@ -544,10 +542,7 @@ def test_machine_output_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
             ["simulate", "notched-rectangle", "--seed", "-1", "-o", "x"],
             "--seed: expected a whole number from 0 to",
         ),
-        (
-            ["cluster", "x", "-o", "y", "--seed", "1e3"],
-            "--seed: expected a whole number from 0 to",
-        ),
+        (["cluster", "x", "-o", "y", "--seed", "1e3"], "--seed: expected a whole number from 0 to"),
         (
             ["cluster", "x", "-o", "y", "--plot", "z.foo"],
             "--plot: expected a name that ends in .png, .pdf or .svg",
@@ -738,8 +733,6 @@ def test_map_keeps_the_files_of_another_program(
     assert (tmp_path / name).read_text() == "mine"
 
 
-def test_map_asks_whether_it_can_write_before_it_reads(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_map_asks_whether_it_can_write_before_it_reads(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["map", "missing.log", "-o", "/proc/there"]) == 1
     assert "expected a folder that can be written, got " in capsys.readouterr().err

@@ -200,9 +200,7 @@ def test_the_learner_is_an_estimator(run: Trace) -> None:
         BootstrapLearner().fit("run.jsonl")  # type: ignore[arg-type]
     assert (
         cross_val_score(
-            BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)),
-            [run, other],
-            cv=2,
+            BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)), [run, other], cv=2
         ).min()
         > 0.85
     )

@@ -14,12 +14,7 @@ from pathlib import Path
 import pytest
 from coarse import every_second_beam, hall
 from test_distinctive import log_of
-from test_log_checks import (
-    backwards,
-    in_degrees,
-    of_two_clocks,
-    with_poses,
-)
+from test_log_checks import backwards, in_degrees, of_two_clocks, with_poses
 
 from perception.errors import LogError
 from perception.places.importing import import_log
@@ -187,9 +182,7 @@ def test_stream_with_two_odometry_sources_is_refused(scans: tuple[Scan, ...]) ->
         next(watched(two, Teller(print)))
 
 
-def test_restarted_clock_does_not_cut_a_matching_drive(
-    scans: tuple[Scan, ...],
-) -> None:
+def test_restarted_clock_does_not_cut_a_matching_drive(scans: tuple[Scan, ...]) -> None:
     some = [
         replace(scan, time=(scan.time or 0.0) - (1e4 if i > 40 else 0))
         for i, scan in enumerate(scans[:80])

@@ -140,11 +140,7 @@ def found(*places: int, x: float = 0.0) -> FoundMap:
         # Of two places that are joined, the older number stays.
         ([found(0, 1, 1), found(5, 5, 5)], [0, 0, 0], [Event("joined", 0, 1), Event("moved", 0)]),
         # A join that is taken back: the number that rested returns.
-        (
-            [found(0, 1, 1), found(0, 0, 0), found(0, 1, 1)],
-            [0, 1, 1],
-            [Event("retracted", 1, 0)],
-        ),
+        ([found(0, 1, 1), found(0, 0, 0), found(0, 1, 1)], [0, 1, 1], [Event("retracted", 1, 0)]),
         # The visits since a join do not take the number along.
         (
             [found(0, 1), found(0, 0, 0, 0), found(0, 1, 1, 1)],

@@ -127,13 +127,7 @@ def test_closed_pipe_and_circular_link_are_errors(
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        "simulate notched-rectangle",
-        "cluster x",
-        "train x y",
-        "cluster x -o y --plot",
-    ],
+    "words", ["simulate notched-rectangle", "cluster x", "train x y", "cluster x -o y --plot"]
 )
 def test_empty_file_name_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
@@ -203,10 +197,7 @@ def imaged(tmp_path: Path) -> str:
 
 
 def test_missing_matplotlib_is_an_error_before_the_work(
-    tmp_path: Path,
-    imaged: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, imaged: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     load = builtins.__import__
 
@@ -318,11 +309,7 @@ SCRIPT = "-c import~sys;from~ssh_abduction.__main__~import~run;sys.exit(run())"
     [
         *(
             ("-m ssh_abduction", module)
-            for module in (
-                "ssh_abduction.cli",
-                "numpy.linalg",
-                "sklearn.base",
-            )
+            for module in ("ssh_abduction.cli", "numpy.linalg", "sklearn.base")
         ),
         *((SCRIPT, module) for module in ("ssh_abduction.cli", "numpy")),
     ],

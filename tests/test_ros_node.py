@@ -36,70 +36,58 @@ TESTS = Path(__file__).parent
 needs_ros = pytest.mark.skipif(find_spec("rclpy") is None, reason="ROS 2 is not installed")
 
 
-def fed(*items: tuple[str, float]) -> tuple[list[tuple[float, float]], dict[str, int]]:
-    """The times and headings of the scans that are paired, and what was lost.
+def fed(items: str) -> tuple[list[float], dict[str, int]]:
+    """The times of the scans that are paired, and what was lost.
 
-    An item is a scan "s" or a pose "p" at a time. The heading of a pose is its time.
+    An item is a scan such as "s9.5", or a pose such as "p9", at a time. The heading of a pose is
+    its time.
     """
-    one, found = StampPairing(), list[tuple[float, float]]()
-    for kind, at in items:
+    one, found = StampPairing(), list[float]()
+    for kind, at in ((item[0], float(item[1:])) for item in items.split()):
         if kind == "s":
             one.add_scan(at, None)
         else:
             one.add_pose(at, (0.0, 0.0, math.remainder(at, math.tau)))
-        found += [(when, pose[2]) for when, _, pose in one.ready()]
+        for when, _, pose in one.ready():
+            assert math.remainder(pose[2] - when, math.tau) == pytest.approx(0, abs=1e-9)
+            found.append(when)
     return found, dict(one.lost)
 
 
 @pytest.mark.parametrize(
     ("items", "found", "lost"),
     [
-        ([("p", 0), ("s", 0.5), ("p", 1)], [(0.5, 0.5)], {}),
-        ([("s", 0.5), ("p", 0.5)], [(0.5, 0.5)], {}),
-        ([("p", 0), ("s", 0.2), ("s", 0.4), ("p", 1)], [(0.2, 0.2), (0.4, 0.4)], {}),
-        ([("p", 3), ("s", 3.2), ("p", 3.4)], [(3.2, 3.2)], {}),  # the heading passes half a turn
-        ([("s", 0.5), ("p", 1), ("s", 1)], [(1, 1)], {"no odometry": 1}),
-        ([("p", 0), ("s", 1), ("s", 1), ("p", 1)], [(1, 1)], {"doubled": 1}),
-        ([("p", 0), ("s", 1), ("s", 0.5), ("p", 1)], [(1, 1)], {"out of order": 1}),
+        ("p0 s0.5 p1", [0.5], {}),
+        ("s0.5 p0.5", [0.5], {}),
+        ("p0 s0.2 s0.4 p1", [0.2, 0.4], {}),
+        ("p3 s3.2 p3.4", [3.2], {}),  # the heading passes half a turn
+        ("s0.5 p1 s1", [1], {"no odometry": 1}),
+        ("p0 s1 s1 p1", [1], {"doubled": 1}),
+        ("p0 s1 s0.5 p1", [1], {"out of order": 1}),
         # The clock starts anew.
-        ([("p", 9), ("s", 9.5), ("p", 0), ("s", 0.5), ("p", 1)], [(0.5, 0.5)], {"no odometry": 1}),
-        ([("p", 9), ("p", 0), ("s", 0.5), ("p", 1)], [(0.5, 0.5)], {}),
+        ("p9 s9.5 p0 s0.5 p1", [0.5], {"no odometry": 1}),
+        ("p9 p0 s0.5 p1", [0.5], {}),
         # A scan by the clock before comes after the first pose by the new one.
-        (
-            [("p", 9), ("s", 9), ("p", 0), ("s", 9.5), ("s", 0.5), ("p", 1)],
-            [(9, 9), (0.5, 0.5)],
-            {"no odometry": 1},
-        ),
+        ("p9 s9 p0 s9.5 s0.5 p1", [9, 0.5], {"no odometry": 1}),
         # Scans by the new clock come before its first pose, and before the last one by the old.
-        (
-            [("s", 9), ("s", 9.5), ("s", 0.5), ("p", 9), *2 * [("s", 0.7)], ("p", 0), ("p", 1)],
-            [(9, 9), (0.5, 0.5), (0.7, 0.7)],
-            {"doubled": 1, "no odometry": 1},
-        ),
+        ("s9 s9.5 s0.5 p9 s0.7 s0.7 p0 p1", [9, 0.5, 0.7], {"doubled": 1, "no odometry": 1}),
         # Late scans are no new clock, not even if several come.
-        (
-            [("p", 5), ("s", 9), ("s", 7), ("s", 8.5), ("s", 9.5), ("p", 9), ("p", 9.5)],
-            [(9, 9), (9.5, 9.5)],
-            {"out of order": 2},
-        ),
+        ("p5 s9 s7 s8.5 s9.5 p9 p9.5", [9, 9.5], {"out of order": 2}),
         # Poses are missing.
-        ([("p", 0), ("s", 0), ("s", 1), ("p", 2), ("s", 2)], [(0, 0), (2, 2)], {"no odometry": 1}),
+        ("p0 s0 s1 p2 s2", [0, 2], {"no odometry": 1}),
     ],
 )
 def test_scans_get_the_pose_of_their_time(
-    items: list[tuple[str, float]], found: list[tuple[float, float]], lost: dict[str, int]
+    items: str, found: list[float], lost: dict[str, int]
 ) -> None:
-    paired, missing = fed(*items)
-    assert [at for at, _ in paired] == [at for at, _ in found]
-    for (_, heading), (_, expected) in zip(paired, found, strict=True):
-        assert math.remainder(heading - expected, math.tau) == pytest.approx(0, abs=1e-9)
-    assert missing == lost
+    assert fed(items) == (found, lost)
 
 
 def test_queue_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stamps, "MOST_SCANS", 5)
     monkeypatch.setattr(stamps, "MOST_POSES", 10)
-    found, lost = fed(*(("s", k / 10) for k in range(8)), *(("p", k / 10) for k in range(30)))
+    numbers = [kind + str(k / 10) for kind, n in (("s", 8), ("p", 30)) for k in range(n)]
+    found, lost = fed(" ".join(numbers))
     assert (len(found), lost) == (5, {"too many": 3})
 
 

@@ -82,10 +82,7 @@ VERBS: Mapping[str, tuple[Verb, ...]] = {
         correct.run_correct,
         mcp.run_mcp,
     ),
-    "learn: recognise places from images": (
-        learn.run_train,
-        learn.run_recognise,
-    ),
+    "learn: recognise places from images": (learn.run_train, learn.run_recognise),
     "make: simulated robots and the paper's experiments": (
         simulate.run_simulate,
         simulate.run_examples,

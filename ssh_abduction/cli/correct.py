@@ -59,13 +59,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted, meant
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.rivals.listing import Listing
-from ssh_abduction.solution import (
-    Solution,
-    Status,
-    obeyed,
-    with_correction_warnings,
-    with_names,
-)
+from ssh_abduction.solution import Solution, Status, obeyed, with_correction_warnings, with_names
 from ssh_abduction.theory.theory import Theory
 
 

@@ -135,10 +135,7 @@ def answers_here(
 
 
 def answers_of_processes(
-    question: FileQuestion,
-    tasks: Sequence[Task],
-    processes: int,
-    stopped: Callable[[], bool],
+    question: FileQuestion, tasks: Sequence[Task], processes: int, stopped: Callable[[], bool]
 ) -> Iterator[Any]:
     """Yield the answers for some files from processes of this machine.
 

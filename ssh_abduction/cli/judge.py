@@ -345,10 +345,7 @@ EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
 Answer: TypeAlias = PairExplanation | TraceExplanation | PlaceExplanation
 
 
-@verb(
-    {"trace": {"type": str}, "steps": {"default": ()}},
-    theory_rows=shared.theory_rows(),
-)
+@verb({"trace": {"type": str}, "steps": {"default": ()}}, theory_rows=shared.theory_rows())
 def run_explain(options: argparse.Namespace) -> int:
     """Say why two steps are one dstate or two, or why there is no map.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 # A pause of the robot in a log is replayed for at most this many seconds.
 PAUSE = 1.0
+say = partial(print, flush=True)
 
 
 def positive(text: str) -> float:
@@ -72,7 +74,7 @@ def run_live(options: argparse.Namespace) -> int:
         except LogError as error:  # a robot that drives should not stop for this
             warn([f"{error}; the map is kept in memory, and not saved"])
             folder = None
-    session = LiveSession(mapper, folder, lambda line: print(line, flush=True), options.work_limit)
+    session = LiveSession(mapper, folder, say, options.work_limit)
     if options.page is not None:
         from ssh_abduction.robot_logs.live_page import LivePage
 
@@ -101,13 +103,7 @@ def _listen(options: argparse.Namespace, session: LiveSession) -> None:
     # The first Ctrl-C or SIGTERM ends the drive, the second one the last search.
     stop = StopFlag()
     with on_ctrl_c(stop.ask):
-        run_node(
-            session,
-            lambda: OnlineLogMapper(width, tell),
-            given,
-            lambda line: print(line, flush=True),
-            stop.is_set,
-        )
+        run_node(session, lambda: OnlineLogMapper(width, tell), given, say, stop.is_set)
         with stages("last map"):
             session.end()
 

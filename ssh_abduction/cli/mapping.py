@@ -220,12 +220,7 @@ class MapQuestion(jobs.FileQuestion):
         return answer
 
     def _answer(
-        self,
-        number: int,
-        paths: Sequence[str],
-        done: LogMap,
-        content: str | None,
-        started: float,
+        self, number: int, paths: Sequence[str], done: LogMap, content: str | None, started: float
     ) -> jobs.FileAnswer:
         """Make the answer for a log that was mapped, or for several that were mapped together.
 

@@ -72,10 +72,7 @@ def _drive(options: argparse.Namespace) -> RecordedDrive:
     from simulator.tours import record
     from simulator.world import World
 
-    for name, given in (
-        ("stars=false", not options.stars),
-        ("-o -", options.output == "-"),
-    ):
+    for name, given in (("stars=false", not options.stars), ("-o -", options.output == "-")):
         if given:
             raise AbductionError(
                 f"{name}: expected no such option with --format, as a robot's log is a file of "

@@ -15,12 +15,7 @@ from itertools import chain
 from pathlib import Path
 
 from ssh_abduction.cli import outcome, shared
-from ssh_abduction.cli.correct import (
-    Obeying,
-    corrections_of,
-    keep_corrections,
-    say_obeyed,
-)
+from ssh_abduction.cli.correct import Obeying, corrections_of, keep_corrections, say_obeyed
 from ssh_abduction.cli.outcome import Guard
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import answer_lines

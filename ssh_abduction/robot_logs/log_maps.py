@@ -40,19 +40,8 @@ from ssh_abduction.page.html import Page, view_page
 from ssh_abduction.robot_logs.log_ground import ground_of
 from ssh_abduction.robot_logs.log_report import may_misread, report
 from ssh_abduction.runtime.loggers import begin_stage, log_of
-from ssh_abduction.solution import (
-    Solution,
-    Status,
-    obeyed,
-    with_correction_warnings,
-    with_names,
-)
-from ssh_abduction.solver import (
-    Ranking,
-    Search,
-    Start,
-    find_backbone,
-)
+from ssh_abduction.solution import Solution, Status, obeyed, with_correction_warnings, with_names
+from ssh_abduction.solver import Ranking, Search, Start, find_backbone
 from ssh_abduction.theory.fields import FAULT, PATHS
 from ssh_abduction.theory.theory import Theory
 

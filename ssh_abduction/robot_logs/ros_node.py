@@ -410,15 +410,12 @@ class LiveNode:
 
         clear = Marker(action=Marker.DELETEALL)
         clear.header.frame_id = self._frames.odom
-        markers = [clear]
-        for place, (x, y) in at.items():
-            ball = marker("places", place, Marker.SPHERE, 0.6)
-            ball.pose.position.x, ball.pose.position.y = x, y
-            markers.append(ball)
-        for number, (x, y) in enumerate(found["provisional"]):
-            dot = marker("provisional", number, Marker.SPHERE, 0.3)
-            dot.pose.position.x, dot.pose.position.y = x, y
-            markers.append(dot)
+        markers, provisional = [clear], dict(enumerate(found["provisional"]))
+        for sort, middles, size in (("places", at, 0.6), ("provisional", provisional, 0.3)):
+            for number, (x, y) in middles.items():
+                ball = marker(sort, number, Marker.SPHERE, size)
+                ball.pose.position.x, ball.pose.position.y = x, y
+                markers.append(ball)
         lines = marker("edges", 0, Marker.LINE_LIST, 0.1)
         for pair in found["edges"]:
             lines.points += [Point(x=at[n][0], y=at[n][1]) for n in pair]
