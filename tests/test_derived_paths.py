@@ -204,6 +204,17 @@ def test_doors_cut_off_rooms_but_do_not_end_a_corridor() -> None:
     assert "15 m, 2.0 m wide" in text
 
 
+def test_a_closet_is_no_corridor_though_it_is_long_and_slim() -> None:
+    """Two doors lead from it to one room: the robot goes in by one, and out by the other."""
+    points = [*LINE, (0.0, 20.0), (15.0, 20.0)]
+    visits = [0, 1, 2, 3, 5, 4, 0]
+    found = with_building(*drive(points, visits, doors=[(3, 5), (4, 0)]))
+    assert not any(1 in corridor.order for corridor in found.corridors)
+    more = [*points, (7.0, -9.0)]  # A third door leads elsewhere.
+    found = with_building(*drive(more, [*visits, 1, 6], doors=[(3, 5), (4, 0), (1, 6)]))
+    assert any(1 in corridor.order for corridor in found.corridors)
+
+
 def test_rooms_beside_a_corridor_are_its_wings() -> None:
     found = with_building(*drive(CROSS, TOUR, doors=[(1, 4), (2, 5), (1, 2)]))
     assert found.building

@@ -104,7 +104,7 @@ def buildings_of(ssh_map: SSHMap, trace: Trace, most: int = 0) -> Iterator[SSHMa
     plan = straightened(plan, room, spaces)
     for ways in ways_of(plan, most):
         paths = paths_of(plan, ways)
-        corridors = corridors_of(plan, widened(ways, room, spaces), paths)
+        corridors = corridors_of(plan, widened(ways, room, spaces), paths, room, doors)
         rooms = rooms_of(plan, room, doors, corridors, outlines) if plan.measured else ()
         building = Indoors(corridors, rooms, doors, listed, notes)
         yield replace(ssh_map, building=building, paths=_theory_paths(ssh_map) or paths)

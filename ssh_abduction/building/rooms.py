@@ -207,9 +207,16 @@ def _joined(one: MapDoor, other: MapDoor) -> MapDoor:
 
 
 def corridors_of(
-    plan: FloorPlan, ways: Sequence[PairedWay], paths: Sequence[MapPath]
+    plan: FloorPlan,
+    ways: Sequence[PairedWay],
+    paths: Sequence[MapPath],
+    room: Mapping[int, int],
+    doors: Sequence[MapDoor],
 ) -> tuple[Corridor, ...]:
-    """Find the corridors: the long and slim parts of paths, without the rooms that they cross."""
+    """Find the corridors: the long and slim parts of paths, without the rooms that they cross.
+
+    A closet may be long and slim, too. But all its doors lead to one room.
+    """
     beside: dict[int, list[tuple[int, str, int, int | None]]] = {}
     for k, place, side, edge in branches(plan, list(ways)):
         door = next((p.door for p in edge.doors), None)
@@ -233,13 +240,10 @@ def corridors_of(
                 if p in order
             ]
             seen = [
-                WayOut(p.side, round(float(far[p.at] - far[begin]), 1))
+                o
                 for p in way.passages
                 if p.side != "through" and begin < p.at < end
-            ]
-            new = [
-                o
-                for o in seen
+                for o in [WayOut(p.side, round(float(far[p.at] - far[begin]), 1))]
                 if all(o.side != d.side or abs(o.metres - d.metres) > BESIDE for d in driven)
             ]
             across = {p.door for p in way.passages if p.door is not None and begin < p.at < end}
@@ -252,14 +256,23 @@ def corridors_of(
                     round(float(far[end] - far[begin]), 1),
                     round(float(np.median(way.widths[begin : end + 1])), 2),
                     tuple(sorted(across)),
-                    tuple(sorted([*driven, *new], key=lambda o: (o.metres, o.side))),
+                    tuple(sorted([*driven, *seen], key=lambda o: (o.metres, o.side))),
                     path.left,
                     path.right,
                     path.around,
                 )
                 found.append(corridor)
+    found = [c for c in found if not _is_closet(c, {room[p] for p in c.order}, doors)]
     found.sort(key=lambda c: -c.length)
     return tuple(replace(c, id=k) for k, c in enumerate(found))
+
+
+def _is_closet(corridor: Corridor, own: set[int], doors: Sequence[MapDoor]) -> bool:
+    """Whether some doors lead out of its own rooms, all to one room, and no opening is seen."""
+    beyond = [{*d.rooms} - own for d in doors if own & {*d.rooms}]
+    out = [some for some in beyond if some]
+    seen = any(opening.place is None for opening in corridor.openings)
+    return len(out) > 1 and len(set[int]().union(*out)) == 1 and not seen
 
 
 def long_parts(way: PairedWay) -> Iterator[Part]:
