@@ -520,14 +520,15 @@ class _Errors:
         if not len(self._off):
             return pose, pose
         off = off * self._off
-        aside = np.concatenate([_turned(off, heading), off[..., 2:]], axis=-1)
+        aside = np.concatenate([_turned(off, heading - off[..., 2]), off[..., 2:]], axis=-1)
         return pose, pose - aside
 
     def _parts(self, z: _Numbers) -> list[_Numbers]:
         """Split unknowns, (…, unknowns), into errors, (…, n, 3).
 
         They are those of the displacements, and of the closures, and how far the robot is off its
-        dstate at each step: metres ahead and left, and radians. The motions of aliases come last.
+        dstate at each step: metres ahead and left of the dstate, and radians. The motions of
+        aliases come last.
         """
         sizes = len(self._moved), len(self._doubt), len(self._off), self._aliases
         parts = np.split(z, 3 * np.cumsum(sizes), axis=-1)[:4]
