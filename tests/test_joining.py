@@ -343,11 +343,11 @@ def test_unknown_view_does_not_join_two_known_ones() -> None:
     assert sights.right({min(unknown): 3.0, min(b): 1.0, min(a): 2.0}) == min(a)
 
 
-@pytest.mark.parametrize(("views", "is_sure"), [("abcdefghij", True), ("a" * 40, False)])
+@pytest.mark.parametrize(("views", "is_sure"), [("abcdef", True), ("a" * 12, False)])
 def test_joint_drives_are_not_sure_where_most_steps_look_alike(views: str, is_sure: bool) -> None:
-    trace, theory = along(views, views[:6]), Theory(boundary="none")
+    trace, theory = along(views, views[:4]), Theory(boundary="none")
     free, joint = (
-        solve(trace, theory.replace(same=pairs), work_limit=2.0)
+        solve(trace, theory.replace(same=pairs), work_limit=1.0)
         for pairs in ((), ((0, len(views)),))
     )
     assert ((free.confidence or 0.0) > 0.95) == is_sure

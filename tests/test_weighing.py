@@ -315,19 +315,20 @@ DEFAULT = {**truth.NOISE, "scale": 0.05, "bend": 0.0035}
 
 @pytest.fixture(scope="module")
 def route() -> truth.Known:
-    """Most of the ACES3 route with noisy displacements. Its map with fewest dstates is false."""
+    """Half of the ACES3 route with noisy displacements. Its map with fewest dstates is false."""
     (known,) = truth.aces3([3], truth.Noise(Odometry(**DEFAULT)))
     return replace(
         known,
-        trace=known.trace.prefix(20),
-        dstates=known.dstates[:20],
-        places=known.places[:20],
+        trace=known.trace.prefix(16),
+        dstates=known.dstates[:16],
+        places=known.places[:16],
     )
 
 
 @pytest.fixture(scope="module")
 def weighed_route(route: truth.Known) -> Solution:
-    return solve(route.trace, time_limit=100)
+    with patch.object(beams, "WIDTHS", (1,)):  # the proof needs no better guess
+        return solve(route.trace, time_limit=100)
 
 
 def test_cheapest_map_is_true_and_the_smallest_is_not(
@@ -345,8 +346,8 @@ def test_cheapest_map_is_true_and_the_smallest_is_not(
 def test_probability_refuses_unknown_steps(weighed_route: Solution) -> None:
     assert weighed_route.probability(0, 12) > 0.9
     assert weighed_route.probability(0, 1) < 0.1
-    with pytest.raises(SolverError, match="second: expected a whole number from 0 to 19, got 20"):
-        weighed_route.probability(0, 20)
+    with pytest.raises(SolverError, match="second: expected a whole number from 0 to 15, got 16"):
+        weighed_route.probability(0, 16)
     with pytest.raises(SolverError, match="of: expected dstate or place, got 'path'"):
         weighed_route.probability(0, 1, of="path")
     counted = solve(Trace.from_steps("aba", ["travel", "travel"]))
@@ -441,7 +442,7 @@ def test_check_computes_the_costs_of_all_rivals_or_counts_the_others(
     rivals = data["weighed"]["rivals"]
     rivals += [dict(rivals[1]) for _ in range(3)]
     last = len(rivals) - 1
-    data["weighed"] = Weighed.from_dict(FieldReader("here"), data["weighed"], 20).to_dict()
+    data["weighed"] = Weighed.from_dict(FieldReader("here"), data["weighed"], 16).to_dict()
     rivals = data["weighed"]["rivals"]
     files = tmp_path / "maps.json", tmp_path / "trace.jsonl"
     files[0].write_text(json.dumps(data))
@@ -449,7 +450,7 @@ def test_check_computes_the_costs_of_all_rivals_or_counts_the_others(
     assert main(["check", *map(str, files)]) == 0
     assert f"costs in nats of map 1 and {last} rivals are right" in capsys.readouterr().out
     rivals[last]["nats"] += 1.0
-    data["weighed"] = Weighed.from_dict(FieldReader("here"), data["weighed"], 20).to_dict()
+    data["weighed"] = Weighed.from_dict(FieldReader("here"), data["weighed"], 16).to_dict()
     files[0].write_text(json.dumps(data))
     assert main(["check", *map(str, files)]) == 20
     assert f"weighed.rivals[{last}]: expected" in capsys.readouterr().out
@@ -540,7 +541,7 @@ def test_misfit_of_the_checker_is_exact_if_the_robot_misses_dstates() -> None:
 
 @pytest.mark.parametrize(
     ("factor", "offset", "least", "most"),
-    [(1.0, 0.01, 1.0, 1.0), (0.6, 0.01, 1.5, 2.25), (0.6, 0.0, math.inf, math.inf)],
+    [(1.0, 0.01, 1.0, 1.0), (0.7, 0.01, 1.5, 2.25), (0.7, 0.0, math.inf, math.inf)],
 )
 def test_excess_of_the_misfit_is_estimated(
     route: truth.Known,
@@ -654,7 +655,7 @@ def test_estimated_rivals_obey_the_user(kind: str, of: Literal["dstate", "place"
     """Without the user, drives that look alike may share no place."""
     drive = Trace.from_steps("aaa", ["travel"] * 2, displacements=[(10.0, 0.0, 0.0)] * 2)
     joint = together([drive, replace(drive, odometry=Odometry(along=0.1))])
-    solution = solve(joint, Theory().replace(**{kind: [(0, 3)]}))
+    solution = solve(joint, Theory().replace(**{kind: [(0, 3)]}), work_limit=1.0)
     assert solution.probability(0, 3, of=of) == pytest.approx(1.0)
 
 
@@ -689,7 +690,7 @@ def test_misread_view_is_suspected(tmp_path: Path) -> None:
         trace = Trace.from_steps(
             seen, ["travel", "left"] * 12, displacements=moved, odometry=odometry
         )
-        found.append(solve(trace, work_limit=3))
+        found.append(solve(trace, work_limit=1))
     sure, doubtful = found
     assert sure.confidence > 0.95
     assert "misread" not in sure.sureness
@@ -726,7 +727,7 @@ def test_maps_of_least_cost_are_listed_once() -> None:
 
 @pytest.mark.parametrize(
     ("views", "missing", "confirmed"),
-    [("abcdefgh" * 2 + "a", {5}, True), ("ababababa", {*range(1, 7)}, False)],
+    [("abcdefgh" * 2 + "a", {5}, True), ("ababa", {1, 2, 3}, False)],
 )
 def test_joins_across_missing_displacements_need_others(
     views: str, missing: set[int], confirmed: bool
