@@ -73,12 +73,13 @@ def test_drives_that_are_clustered_together_get_common_views(
         "alone-monday.jsonl and alone-tuesday.jsonl seem to have different views of the same names"
         in capsys.readouterr().err
     )
-    assert main(["solve", *written, "--together", "-o", "maps.json"]) == 0
+    assert main(["solve", *written, "--together", "--work-limit", "1", "-o", "maps.json"]) == 0
     assert "different views" not in capsys.readouterr().err
     (ssh_map,) = Solution.load("maps.json").maps
     assert _agree([label for part in ssh_map.labels for label in part], _true_dstates(drives))
 
 
+@pytest.mark.filterwarnings("ignore:the map of 8 dstates is the best that was found")
 def test_images_in_several_files_get_one_file(
     drives: list[Trace], refuses: Callable[[Sequence[str], str], None]
 ) -> None:
@@ -96,7 +97,8 @@ def test_images_in_several_files_get_one_file(
     )
     Path("joint").mkdir()
     joint = "joint_trace=joint/trace.jsonl"
-    assert main(["solve", *written, "--together", "--set", joint, "-o", "joint/maps.json"]) == 0
+    limited = ["--set", joint, "--work-limit", "1", "-o", "joint/maps.json"]  # any map will do
+    assert main(["solve", *written, "--together", *limited]) == 0
     trace = Trace.load("joint/trace.jsonl")
     assert images_file(trace) == Path("joint/../both/images.npz")
     np.testing.assert_array_equal(images_of(trace), table)
