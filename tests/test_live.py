@@ -202,14 +202,14 @@ def test_import_of_an_empty_pipe_is_refused() -> None:
 def test_a_log_that_grew_is_imported_as_a_whole(scans: tuple[Scan, ...]) -> None:
     """Also if the odometry jumps, and if the log is looked at while it grows."""
     far = [
-        replace(scan, odometry=(scan.odometry[0] + 30 * (i >= 70), *scan.odometry[1:]))
+        replace(scan, odometry=(scan.odometry[0] + 30 * (i >= 50), *scan.odometry[1:]))
         for i, scan in enumerate(scans)
     ]
-    for drive in (scans[:90], far[:90]):
+    for drive in (scans[:64], far[:64]):
         live, seen = LiveLog(), []
         for i, scan in enumerate(drive):
             seen += live.add(scan)[1]
-            if i == 60:
+            if i == 40:
                 live.places()
         whole = import_log(RobotLog(tuple(drive)))
         done = live.finish()
