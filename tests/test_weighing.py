@@ -582,6 +582,18 @@ def test_rival_may_cost_far_less_than_the_best_map() -> None:
     assert "steps 0 and 2" in weighed.sentence
 
 
+def test_work_of_a_proof_is_foreseen_from_that_of_lower_limits() -> None:
+    """It doubles for each ten nats."""
+    assert weighing._proof_takes([(80.0, 1.0)], 100.0) == weighing._proof_takes(
+        [(70.0, 2.0), (80.0, 1.0)], 100.0
+    )
+    assert weighing._proof_takes([(80.0, 1.0)], 100.0) == math.inf
+    assert weighing._proof_takes([(60.0, 0.5), (70.0, 0.4), (80.0, 2.0)], 100.0) == pytest.approx(
+        8.0
+    )
+    assert weighing._proof_takes([(1.0, 1e-9), (1.1, 5.0)], 100.0) > 1e300  # does not overflow
+
+
 @pytest.mark.parametrize(("broken", "less"), [(-math.inf, 1.0), (0.0, 1.0), (math.log(201.0), 2.0)])
 def test_cheaper_map_that_breaks_axioms_lowers_the_confidence(broken: float, less: float) -> None:
     """One building of 200 breaks axioms, so a map of 201 times the probability halves it."""

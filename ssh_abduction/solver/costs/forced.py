@@ -13,7 +13,8 @@ with the lowest bound is halved next, so this bound holds for all maps. A half e
 T or more, or if no two classes may be joined: this is a map. If no half is left, these are all maps
 of a cost below T. A low T is fast. So first take T to be between the first bound and the cost of
 the best map, then this cost, which proves that the map is the best one, and last a higher one, to
-find all rivals.
+find all rivals. The work for a limit grows exponentially with it. As soon as the proof seems to fit
+into the work that is left, the lower limits that remain are left out.
 
 *What a join may gain.* There are two bounds, and the greater one counts. For the first one, a join
 gains at most what a new place, or a new dstate, costs at its first step (`theory/prior.py`). The

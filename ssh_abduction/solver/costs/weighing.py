@@ -25,7 +25,7 @@ one: the size of a set of steps that are pairwise at different places.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Set
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeAlias
@@ -84,6 +84,7 @@ EXCESS = 2.25
 # Without a time limit, end Benders cuts after PATIENCE seconds plus MORE times the time of the best
 # map.
 PATIENCE, MORE = 10.0, 5.0
+LOG_LARGE = 700.0  # exp of more overflows
 # Estimating rivals may end OVERTIME seconds late. It gets at least LEAST_ESTIMATING seconds.
 OVERTIME, LEAST_ESTIMATING = 0.5, 0.1
 
@@ -212,12 +213,17 @@ class Weighing:
 
         If a limit ends this, clingo asserts the joins.
         """
-        task, most = self._task, self._most
+        task, most, watch = self._task, self._most, self._parts.watch
         forcing = Forcing(task.problem, task.log, self._misfit, self.candidates[0].map)
+        spent = list[tuple[float, float]]()  # limits, and the work that each took
         try:
             for limit in forcing.limits(self._nats + 2 * EQUAL, most):
+                if limit < self._nats and _proof_takes(spent, self._nats) < watch.left():
+                    continue
+                began = watch.elapsed()
                 for bound in forcing.bounds(limit):
                     self._raise_bound(bound)
+                spent.append((limit, watch.elapsed() - began))
                 known = {dstates_and_places(candidate.map) for candidate in self.candidates}
                 others = [one for one in forcing.found if one not in known]
                 if limit > self._nats and forcing.is_complete and all(map(self._knows, others)):
@@ -512,6 +518,18 @@ def _exactly(ssh_map: SSHMap) -> list[Equality]:
         pairs = combinations(range(len(names)), 2)
         found += [Equality(i, j, of, names[i] == names[j]) for i, j in pairs]
     return found
+
+
+def _proof_takes(spent: Sequence[tuple[float, float]], nats: float) -> float:
+    """Estimate the work for a limit of `nats`, as the work for limits grows exponentially.
+
+    `spent` has limits in rising order, and the work that each took.
+    """
+    if len(spent) < 2 or not 0 < spent[0][1] < spent[-1][1]:
+        return math.inf
+    (first, less), (last, work) = spent[0], spent[-1]
+    growth = math.log(work / less) * (nats - last) / (last - first)
+    return work * math.exp(min(growth, LOG_LARGE))
 
 
 def _pinned(theory: Theory, course: Course) -> Theory:
