@@ -240,10 +240,13 @@ def corridors_of(
                 if p in order
             ]
             seen = [
-                o
+                WayOut(p.side, round(float(far[p.at] - far[begin]), 1))
                 for p in way.passages
                 if p.side != "through" and begin < p.at < end
-                for o in [WayOut(p.side, round(float(far[p.at] - far[begin]), 1))]
+            ]
+            new = [
+                o
+                for o in seen
                 if all(o.side != d.side or abs(o.metres - d.metres) > BESIDE for d in driven)
             ]
             across = {p.door for p in way.passages if p.door is not None and begin < p.at < end}
@@ -256,7 +259,7 @@ def corridors_of(
                     round(float(far[end] - far[begin]), 1),
                     round(float(np.median(way.widths[begin : end + 1])), 2),
                     tuple(sorted(across)),
-                    tuple(sorted([*driven, *seen], key=lambda o: (o.metres, o.side))),
+                    tuple(sorted([*driven, *new], key=lambda o: (o.metres, o.side))),
                     path.left,
                     path.right,
                     path.around,

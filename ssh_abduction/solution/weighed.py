@@ -31,7 +31,7 @@ BREAKS, SAID = 0.005, 1.0
 DOUBTED = 0.05
 # A misfit is improbable if the true map has a larger one with less than this probability.
 IMPROBABLE = 0.01
-MOST = 700.0  # exp of more nats overflows
+MOST = 700.0  # exp of more overflows
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,7 +39,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solution.values import Cost, Found, Status
-from ssh_abduction.solution.weighed import EQUAL, IMPROBABLE, Rival, Weighed
+from ssh_abduction.solution.weighed import EQUAL, IMPROBABLE, MOST, Rival, Weighed
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.costs.beams import Beams
@@ -84,7 +84,6 @@ EXCESS = 2.25
 # Without a time limit, end Benders cuts after PATIENCE seconds plus MORE times the time of the best
 # map.
 PATIENCE, MORE = 10.0, 5.0
-LOG_LARGE = 700.0  # exp of more overflows
 # Estimating rivals may end OVERTIME seconds late. It gets at least LEAST_ESTIMATING seconds.
 OVERTIME, LEAST_ESTIMATING = 0.5, 0.1
 
@@ -529,7 +528,7 @@ def _proof_takes(spent: Sequence[tuple[float, float]], nats: float) -> float:
         return math.inf
     (first, less), (last, work) = spent[0], spent[-1]
     growth = math.log(work / less) * (nats - last) / (last - first)
-    return work * math.exp(min(growth, LOG_LARGE))
+    return work * math.exp(min(growth, MOST))
 
 
 def _pinned(theory: Theory, course: Course) -> Theory:
