@@ -320,9 +320,11 @@ def test_cluster_without_workers_warns_and_ends_at_the_limit(
 ) -> None:
     from distributed import Client, LocalCluster
 
-    monkeypatch.setattr(jobs, "PATIENCE", 0.1)
+    def there_was_one(*_: object, **__: object) -> None:
+        monkeypatch.setattr(jobs, "PATIENCE", 0.1)  # from here: connecting may take longer
+
     monkeypatch.setattr(jobs, "LOOK", 0.0)
-    monkeypatch.setattr(Client, "wait_for_workers", lambda *_, **__: None)  # there was one
+    monkeypatch.setattr(Client, "wait_for_workers", there_was_one)
     with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
         address = cluster.scheduler_address
         command = f"solve quick.jsonl tee.jsonl quick.jsonl --time-limit 0.3 --scheduler {address}"
