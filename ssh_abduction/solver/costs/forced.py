@@ -71,8 +71,9 @@ LONGEST = 2500
 PAIRS = 5000
 # Without the bound by poses, halving is slower than clingo. Then halve the maps this many times.
 HALVED = 20
-# Keep the poses of the last KEPT sets of classes.
-KEPT = 50
+# Keep the poses of the last KEPT sets of classes, and what is known of so many classes that they
+# have about FLAGS flags.
+KEPT, FLAGS = 50, 10**6
 
 
 class _Part(NamedTuple):
@@ -120,6 +121,7 @@ class Forcing:
         self._may_turn = False  # whether a map that was found may be several maps
         # A map is bounded again if two of its classes are apart, or by its poses.
         self._bounding = lru_cache(maxsize=KEPT)(misfit.bounding)
+        self._judged = lru_cache(maxsize=max(FLAGS // visits.apart.size, 1))(self._judge)
 
     @staticmethod
     def holds_for(problem: Problem) -> bool:
@@ -187,7 +189,7 @@ class Forcing:
         if lacking:
             pair = lacking[0]
         else:
-            classes = self._classes(visits, joins)
+            classes, _ = self._judged(visits, tuple(joins.tolist()))
             if (steps := classes.open_pair()) is None:
                 places = [0] * len(classes.place) if self._is_causal else classes.place.tolist()
                 self.found.append((tuple(numbered(classes.node.tolist())), tuple(places)))
@@ -206,6 +208,11 @@ class Forcing:
 
     def _classes(self, visits: Visits, joins: Ints) -> Joined:
         return Joined(visits, joins, self._misfit.visit, self._is_causal)
+
+    def _judge(self, visits: Visits, joins: tuple[int, ...]) -> tuple[Joined, list[list[Gains]]]:
+        """Collect what is known of classes, and bound the cost of maps that have them."""
+        classes = self._classes(visits, np.array(joins))
+        return classes, [] if classes.fails else self._ways(classes)
 
     def _ways(self, classes: Joined) -> list[list[Gains]]:
         """Bound the cost of a map that joins no classes, and what joins gain at most.
@@ -293,7 +300,7 @@ class Forcing:
         visits, joins = part.visits, part.joins
         while True:
             look_at_clock(LONG_TURN // 2)
-            classes = self._classes(visits, joins)
+            classes, ways = self._judged(visits, tuple(joins.tolist()))
             if classes.fails:
                 return _Part(visits, joins, math.inf)
             # Of each two classes that may join, try one pair of visits.
@@ -303,7 +310,6 @@ class Forcing:
                 for a, b in [joins[[*pair]].tolist()]
                 if a != b and not classes.apart[0, a, b]
             )
-            ways = self._ways(classes)
             if (low := classes.low(ways)) >= most:
                 return _Part(visits, joins, low)
             lacking = list[tuple[float, tuple[int, int]]]()

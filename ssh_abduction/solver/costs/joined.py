@@ -20,13 +20,13 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import product
+from operator import or_
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from ssh_abduction.data.groups import NodeClasses, firsts, gathered, numbered
 from ssh_abduction.data.maps import SSHMap
@@ -199,18 +199,25 @@ class _Cliques:
     def __init__(self, apart: Flags) -> None:
         """Find the cliques."""
         self.apart = apart
-        part = connected_components(csr_array(~apart), directed=False)[1]
-        random = np.random.default_rng(0)
-        members = [np.flatnonzero(part == p) for p in range(part.max() + 1)]
-        cliques = [
-            some[grown_clique(apart[np.ix_(some, some)], [], random)] if len(some) > 1 else some
-            for some in members
-        ]
-        self._part: list[int] = part.tolist()
-        self._members, self._cliques = [*map(_bits, members)], [*map(_bits, cliques)]
-        flags = np.packbits(apart, axis=1, bitorder="little")
-        self._rows = [int.from_bytes(row.tobytes(), "little") for row in flags]
-        self._may_join: list[int] = np.tril(~apart, -1).sum(axis=1).tolist()
+        flags, random = np.packbits(apart, axis=1, bitorder="little"), np.random.default_rng(0)
+        self._rows = rows = [int.from_bytes(row.tobytes(), "little") for row in flags]
+        self._part, self._members, self._cliques = [0] * len(rows), list[int](), list[int]()
+        left = (1 << len(rows)) - 1
+        while left:
+            found = new = left & -left
+            while new:
+                new = left & ~found & reduce(or_, (~rows[node] for node in _nodes(new)))
+                found |= new
+            left ^= found
+            some = [*_nodes(found)][::-1]
+            for node in some:
+                self._part[node] = len(self._members)
+            self._members.append(found)
+            if len(some) > 1:
+                clique = grown_clique(apart[np.ix_(some, some)], [], random)
+                found = sum(1 << some[k] for k in clique)
+            self._cliques.append(found)
+        self._may_join = [(~row & (1 << k) - 1).bit_count() for k, row in enumerate(rows)]
         self._size = sum(map(int.bit_count, self._cliques))
         self._lost: dict[int, tuple[Array, list[list[tuple[float, int]]], list[float]]] = {}
 
@@ -284,11 +291,6 @@ class _Cliques:
             rows[v] = others
         fixed = {v for v, number in fewer.items() if number == self._may_join[v]}
         return _MoreApart({part: some.bit_count() for part, some in best.items()}, fixed)
-
-
-def _bits(nodes: Iterable[int]) -> int:
-    """Return a set of nodes as a number."""
-    return sum(1 << int(node) for node in nodes)
 
 
 def _nodes(bits: int) -> Iterator[int]:
