@@ -331,7 +331,6 @@ class Search:
             weighing.keep_best()
         # 2. Maps of little cost, by guesses.
         yield from weighing.beams.sources(clashes)
-        yield weighing.changes()
         # 3. The least number of dstates.
         is_enough = weighing.best is not None and not self.theory.has_faults
         fewest = turn("fewest dstates, map known" if is_enough else "fewest dstates")

@@ -64,6 +64,7 @@ class Beams:
         self.broken = -math.inf
         self._ended: Beam | None = None  # the widest beam that ended
         self._first = math.inf  # the time of the first beam
+        self._has_joined = False  # whether the maps of single drives gave a map
 
     def found(self, nats: float) -> bool:
         """Whether a broad beam ended with a map of this cost, and `broken` is known.
@@ -74,11 +75,6 @@ class Beams:
         """
         is_sound = math.isfinite(self.broken) and not self._parts.task.theory.jumped
         return is_sound and self._best[0] <= nats + EQUAL
-
-    def improved(self, nats: float) -> None:
-        """Take note that local changes lead from the best map of a broad beam to a cheaper one."""
-        if (saved := self._best[0] - nats) > 0 and saved < math.inf:
-            self._best = nats, self._best[1] - saved
 
     def sources(self, clashes: Callable[[], bool]) -> list[Source]:
         """List the guesses as sources, in the order of the schedule.
@@ -101,17 +97,18 @@ class Beams:
             limited = replace(own, until=min(own.until, most))
             return Source(
                 limited,
-                lambda: self._is_time_for(width, widths[-1], limited.work(self._parts.watch)),
+                lambda: (
+                    not self._has_joined
+                    and self._is_time_for(width, widths[-1], limited.work(self._parts.watch))
+                ),
                 lambda: self._search(width, clashes),
             )
 
-        # Beams of logs seldom end, so joining drives comes first there.
-        first = [*map(beam, widths[:1]), Source(turn("joint drives"), lambda: several, self._join)]
         return [
             Source(turn("smoothing"), lambda: True, self._smooth),
             Source(turn("false closures"), self._doubts_closures, self._sort_closures),
-            *(first[::-1] if self._is_log else first),
-            *map(beam, widths[1:]),
+            Source(turn("joint drives"), lambda: several, self._join),
+            *map(beam, widths),
             Source(
                 turn("beam without axioms"),
                 lambda: self._best[1] < math.inf and math.isinf(self.broken),
@@ -130,6 +127,7 @@ class Beams:
             maps = self._parts.candidates.maps_of(joining)
             nats = min(map(self._add, maps), default=math.inf)
             self._take(nats, -math.inf, joining.broken)
+            self._has_joined = nats < math.inf
 
     def _sort_closures(self) -> None:
         """Merge places under several explanations of the closures."""

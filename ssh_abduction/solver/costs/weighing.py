@@ -43,7 +43,6 @@ from ssh_abduction.solution.weighed import EQUAL, IMPROBABLE, MOST, Rival, Weigh
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.costs.beams import Beams
-from ssh_abduction.solver.costs.changing import Changing
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
     Course,
@@ -159,27 +158,6 @@ class Weighing:
         """Raise the bound, unless it is higher. The best map costs as much as the bound or more."""
         self.bound = max(self.bound, min(nats, self._nats))
 
-    def changes(self) -> Source:
-        """Return the source of local changes of the best map."""
-        theory, task = self._task.theory, self._task
-        trusting = theory.replace(misread=0.0) if theory.star == "none" else theory
-
-        def change() -> None:
-            changing = Changing(task.problem, task.log, self._misfit, self._add_valid, WITHIN)
-            changing.improve(self.candidates[0].map)
-            self.beams.improved(self._nats)
-
-        return Source(
-            turn("local changes"),
-            lambda: bool(self.candidates) and not trusting.has_faults,
-            change,
-        )
-
-    def _add_valid(self, ssh_map: SSHMap) -> float:
-        """Return the cost of a map in nats; infinite if the evidence excludes it."""
-        accepts = self._parts.candidates.accepts
-        return self.add(ssh_map) if accepts(ssh_map) else math.inf
-
     def proofs(self) -> list[Source]:
         """List the sources that bound the cost of all maps, in the order of the schedule.
 
@@ -241,7 +219,8 @@ class Weighing:
         """Add a map with these dstates and places, if there is one. Return whether this is sure."""
         task = self._task
         found = course_completed(task.problem, self._misfit, *course)
-        if found is not None and self._add_valid(found) < math.inf:
+        if found is not None and self._parts.candidates.accepts(found):
+            self.add(found)
             return True
         if task.theory.has_faults or self.of_labels is None:
             return False

@@ -162,29 +162,6 @@ class Overlay:
         self.merge_all()
         return True
 
-    def join(self, places: tuple[int, int]) -> bool:
-        """Merge two places of the first map, and then all that coincide.
-
-        An earlier merge is undone first. Returns whether the two can be one place.
-        """
-        self._state = self._apart
-        if not self._tried([], places, most=math.inf, has_dstates=True):
-            return False
-        self.merge_all()
-        return True
-
-    def near(self, place: int | None, most: float) -> list[tuple[int, int]]:
-        """List the pairs of places that may be one, those of one place or all, the nearest first.
-
-        Half of the chi-square of their positions is less than `most` nats.
-        """
-        self._state = self._apart
-        _, squares, _ = self._differences()
-        squares[np.isinf(self._costs)] = math.inf
-        pairs = np.argwhere(squares / 2 < most).tolist()
-        own = [(p, q) for p, q in pairs if place in (None, p, q)]
-        return sorted(own, key=lambda pair: squares[pair])
-
     def merge_all(self) -> bool:
         """Merge all places that coincide. Return whether there was one."""
         first = self._state
