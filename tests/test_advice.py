@@ -31,7 +31,6 @@ SAID_BY = {
     "perception/places": ("import", "map"),
     "perception/readers": ("import", "map"),
     "simulator": ("simulate",),
-    "ssh_abduction/solver/asp/own_rules.py": WITH_THEORY,
     "ssh_abduction/data/checks.py": WITH_MAPS,
     "ssh_abduction/cli/batch.py": ("solve",),
     "ssh_abduction/cli/jobs.py": ("solve", "map"),

@@ -18,7 +18,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solution import Status
 from ssh_abduction.solver import search
-from ssh_abduction.solver.asp.own_rules import can_be_asked, keeps_own_rules
+from ssh_abduction.solver.asp.kept_rules import can_be_asked, keeps_own_rules
 from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.solver.sources.symbolic.sketch import sketch_beyond, sketches_of
 from ssh_abduction.solver.steps.log import Log

@@ -42,9 +42,9 @@ from ssh_abduction.solution import Status
 from ssh_abduction.solver import Search, check_rules, find_backbone
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
-from ssh_abduction.solver.asp.own_rules import EXAMPLE
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.theory.encodings import Rules
+from ssh_abduction.theory.own_rules import EXAMPLE
 from ssh_abduction.theory.settle import settle
 
 # Seconds after which a process that obeys its limit has ended, even on a slow and busy machine. One

@@ -17,7 +17,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import now
 from ssh_abduction.solution.values import Bound, Cost, Found, Status, Stop, cost_as_counted
-from ssh_abduction.solver.asp.own_rules import can_be_asked, keeps_own_rules
+from ssh_abduction.solver.asp.kept_rules import can_be_asked, keeps_own_rules
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory

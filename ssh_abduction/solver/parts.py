@@ -28,8 +28,8 @@ from ssh_abduction.solution.values import (
     Stop,
     cost_as_counted,
 )
+from ssh_abduction.solver.asp.kept_rules import never_true
 from ssh_abduction.solver.asp.limits import Watch, check_limit
-from ssh_abduction.solver.asp.own_rules import never_true
 from ssh_abduction.solver.board import Judging, Known
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.geometry.ranking import in_order, noise_warning, units_warning

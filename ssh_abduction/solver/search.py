@@ -38,8 +38,8 @@ from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solution.result import Solution
 from ssh_abduction.solution.sharing import Backbone
 from ssh_abduction.solution.values import Bound, Cost, Grounding, Progress, Status, Stop
+from ssh_abduction.solver.asp.kept_rules import check_rules
 from ssh_abduction.solver.asp.limits import EARLY, LimitError, StageTimeError, Watch
-from ssh_abduction.solver.asp.own_rules import check_rules
 from ssh_abduction.solver.board import projected
 from ssh_abduction.solver.candidates import has_quick_map
 from ssh_abduction.solver.counting import Counting

@@ -257,7 +257,7 @@ class Rules:
     """A file of rules.
 
     Line ends of the text are converted to line feeds, and a byte order mark is removed.
-    `ssh_abduction.solver.asp.own_rules` checks that clingo can read the text.
+    `ssh_abduction.theory.own_rules` checks that clingo can read the text.
 
     Attributes:
         name: The name of the file, for messages.
