@@ -63,6 +63,7 @@ class Beams:
         self._best = math.inf, math.inf
         self.broken = -math.inf
         self._ended: Beam | None = None  # the widest beam that ended
+        self._whole: Set[int] | None = None  # the closures of a beam that dropped nothing
         self._first = math.inf  # the time of the first beam
         self._has_joined = False  # whether the maps of single drives gave a map
 
@@ -152,18 +153,22 @@ class Beams:
     def _is_time_for(self, width: int, last: int, left: float) -> bool:
         """Whether to search with this beam. If only one of both has time, the last one goes first.
 
-        A beam of width n takes about n times as long as the first one.
+        A beam that dropped nothing has all hypotheses, so no wider one is needed. A beam of width n
+        takes about n times as long as the first one.
         """
+        if self._whole == self._believed():
+            return False
         slack = left - last * self._first
         return width == last or not 0 < slack < width * self._first
 
     def _search(self, width: int, clashes: Callable[[], bool]) -> None:
         """Search with one beam. If no beam has ended in time, extend what this one has."""
-        parts, began = self._parts, self._parts.watch.elapsed()
-        if (beam := parts.candidates.beam(width, self._believed())) is None:
+        parts, began, believed = self._parts, self._parts.watch.elapsed(), self._believed()
+        if (beam := parts.candidates.beam(width, believed)) is None:
             return
         try:
             self._finish(beam, width)
+            self._whole = believed if beam.hypotheses and not beam.drops else None
         except StageTimeError:
             if not self._ended:
                 parts.candidates.go_on(beam)
@@ -176,7 +181,7 @@ class Beams:
         """Keep the maps that a beam ends with. Raises StageTimeError if it does not end in time."""
         nats = self._maps_of(beam)
         self._ended = beam
-        if width < BROAD:
+        if width < BROAD and beam.drops:
             return
         # A beam without axioms would be the same if the checker refused nothing.
         broken = -math.inf if beam.refuses else 0.0

@@ -319,9 +319,9 @@ class Poses:
 
         The motion (x, y, turn) is that of its alias; 0 without one, (equations, 3).
         """
-        at, facing, motions, _ = np.split(unknown, [2 * self._positions, self._known, -2])
-        motions = np.concatenate([np.zeros((1, 3)), motions.reshape(-1, 3)])
-        return at.reshape(-1, 2), facing, motions[self._alias]
+        xy = 2 * self._positions
+        motions = np.append(np.zeros(3), unknown[self._known : -2]).reshape(-1, 3)
+        return unknown[:xy].reshape(-1, 2), unknown[xy : self._known], motions[self._alias]
 
     def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
         """Predict the displacements from the unknowns, in metres and radians, (n, 3).

@@ -352,6 +352,7 @@ class Beam:
     Attributes:
         hypotheses: The hypotheses of the whole trace, by cost; none before `maps` has ended.
         refuses: Whether the checker refused a hypothesis.
+        drops: Whether a wider beam may keep more hypotheses.
     """
 
     def __init__(self, problem: Problem, log: Log, width: int) -> None:
@@ -362,7 +363,7 @@ class Beam:
         self._sights, self._reckoning = ways.sights, ways.reckoning
         self._has_frames = bool(frames_of(problem.trace))
         self.hypotheses: list[Hypothesis] = []
-        self.refuses = False
+        self.refuses = self.drops = False
         self._kept: list[list[Hypothesis]] = []  # the beam after each check
 
     def maps(self, most: float = math.inf) -> Iterator[SSHMap]:
@@ -393,6 +394,7 @@ class Beam:
             kept.append(beam)
         self._kept = kept[-1:]
         self.hypotheses = kept[-1]
+        self.drops |= len(kept[-1]) > ALIKE * self._width
         for found in kept[-1][: ALIKE * self._width]:
             if (ssh_map := self._map(found, len(self._trace))) is not None:
                 yield ssh_map
@@ -449,9 +451,11 @@ class Beam:
         for option in options:
             found, joined = option.of, not option.of.pieces.is_loose
             if kept[joined] >= most or option.nats > dearest[joined]:
+                self.drops = True
                 continue
             at = found.faults, option.place, *map(found.places.__getitem__, found.labels.values())
             if count[found.pieces.joins] >= width and (several or at in known):
+                self.drops = True
                 continue
             child = self._extending.extended(option, t)
             if several and child.square > found.square + 2 * STRAINED:
