@@ -73,7 +73,7 @@ def test_asserted_pair_that_displacements_exclude_is_the_clash(
     moved = [(2.0, 0.0, 0.0)] * 69
     trace = Trace.from_steps(["hall"] * 70, ["travel"] * 69, displacements=moved)
     theory = Theory(misread=0.9, weigh="cost", star="none").replace(**{kind: (steps,)})
-    search = Search(trace, theory, work_limit=1)
+    search = Search(trace, theory, work_limit=0.3)
     assert not [*search]
     assert search.status is Status.UNSATISFIABLE
     assert search.clash == range(min(steps), max(steps) + 1)

@@ -667,7 +667,7 @@ def test_estimated_rivals_obey_the_user(kind: str, of: Literal["dstate", "place"
     """Without the user, drives that look alike may share no place."""
     drive = Trace.from_steps("aaa", ["travel"] * 2, displacements=[(10.0, 0.0, 0.0)] * 2)
     joint = together([drive, replace(drive, odometry=Odometry(along=0.1))])
-    solution = solve(joint, Theory().replace(**{kind: [(0, 3)]}), work_limit=1.0)
+    solution = solve(joint, Theory().replace(**{kind: [(0, 3)]}), work_limit=0.3)
     assert solution.probability(0, 3, of=of) == pytest.approx(1.0)
 
 
