@@ -129,6 +129,7 @@ SHARED = (
 )
 
 
+@pytest.mark.slow
 def test_backbone_from_one_map_equals_that_of_all_maps() -> None:
     every, first = aces.solution(), aces.solution(max_maps=1)
     assert every.summary == f"4 minimal maps: {SHARED}"

@@ -496,6 +496,7 @@ def test_all_logs_are_mapped_once_after_a_worker_is_killed(
     }
 
 
+@pytest.mark.slow
 def test_worker_stops_when_the_client_disconnects(traces: Path, scheduler_here: str) -> None:
     theory = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
     endless = SolveQuestion(

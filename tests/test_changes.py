@@ -202,6 +202,7 @@ def test_change_of_a_gateway_has_a_sentence_and_a_place(
         SSHMap.from_dict(data)
 
 
+@pytest.mark.slow
 def test_explain_names_a_change_and_its_cost(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -436,6 +436,7 @@ def test_control_characters_in_names_are_escaped(
             ET.fromstring(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
 def test_output_that_cannot_be_written_is_a_one_line_error(room: str) -> None:
     for target in ("> /dev/full", ">&-"):

@@ -51,6 +51,7 @@ def _agree(first: Sequence[object], other: Sequence[object]) -> bool:
     return len(pairs) == len(set(first)) == len(set(other))
 
 
+@pytest.mark.slow
 def test_drives_that_are_clustered_together_get_common_views(
     drives: list[Trace], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -613,6 +613,7 @@ def test_correct_warns_if_the_map_uses_no_stars(
         ) is warns
 
 
+@pytest.mark.slow
 def test_verbs_apply_star_corrections_to_the_recorded_trace(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -72,6 +72,7 @@ def circuit(
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=5)
 @given(st.data())
 def test_refused_returns_equal_matrices_written_out(data: st.DataObject) -> None:
@@ -352,6 +353,7 @@ def test_maps_are_sorted_by_misfit() -> None:
     assert squares == sorted(squares)
 
 
+@pytest.mark.slow
 def test_missing_displacement_cuts_dead_reckoning() -> None:
     trace = circuit(4, 5, 1.0)
     cut = replace(

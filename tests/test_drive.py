@@ -483,6 +483,7 @@ def test_driver_refuses_a_blocked_way() -> None:
 # The verb
 
 
+@pytest.mark.slow
 def test_simulate_writes_readable_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "school.xml").write_text(xml())
     assert (

@@ -264,10 +264,12 @@ def test_warning_names_the_likely_field_of_view(coarse: tuple[Scan, ...], fov: f
     assert re.search(r"\d+ m by scans, \d+ m by odometry; turns by scans are \d\.\d\d times", said)
 
 
+@pytest.mark.slow
 def test_warning_names_a_laser_that_hangs_upside_down(coarse: tuple[Scan, ...]) -> None:
     assert "--set fov=180" in doubt(tuple(LaserOptions(fov=-180).placed(scan) for scan in coarse))
 
 
+@pytest.mark.slow
 def test_warning_names_the_likely_mount(coarse: tuple[Scan, ...]) -> None:
     """The laser truly looks ahead."""
     said = doubt(tuple(LaserOptions(mount=(0, 0, 60.0)).placed(scan) for scan in coarse))
@@ -275,6 +277,7 @@ def test_warning_names_the_likely_mount(coarse: tuple[Scan, ...]) -> None:
     assert abs(looks) <= 10
 
 
+@pytest.mark.slow
 def test_no_laser_warning_if_the_odometer_explains_it(coarse: tuple[Scan, ...]) -> None:
     """Odometry in a wrong unit, or none, already explains the disagreement."""
     lost = tuple(replace(scan, odometry=(0.0, 0.0, 0.0)) for scan in coarse)

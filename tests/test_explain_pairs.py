@@ -441,6 +441,7 @@ def test_explain_refuses_wrong_steps(first: int, second: int, said: str) -> None
         explain_pair(RECTANGLE, first, second)
 
 
+@pytest.mark.slow
 def test_explain_prints_the_argument(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     impossible, rectangle = tmp_path / "impossible.jsonl", tmp_path / "rectangle.jsonl"
     IMPOSSIBLE.save(impossible)

@@ -89,6 +89,7 @@ def test_solver_refuses_two_returns_that_misfit_together() -> None:
     assert explain(trace, theory.replace(joint=1)) is None
 
 
+@pytest.mark.slow
 def test_weighed_maps_pay_for_two_returns_that_misfit_together() -> None:
     """Weighed maps pay for misfits instead, because errors of logs have heavy tails."""
     trace, theory = uneven(), BARE.replace(same_place=[(1, 9), (3, 11)])

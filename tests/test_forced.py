@@ -125,6 +125,7 @@ def test_no_map_has_two_steps_at_one_place_that_are_apart(kind: str) -> None:
         assert classes.fails == fails
 
 
+@pytest.mark.slow
 def test_forced_joins_prove_a_maze_of_sixty_steps() -> None:
     known = truth.random_walk(4, 60, 3001, truth.Noise(Odometry(**FINE)))
     trace, theory, solution, weighed = solved(known.trace, Theory.topological())
@@ -264,7 +265,7 @@ def test_forced_bound_is_off_if_faults_other_than_views_are_allowed() -> None:
     assert not Forcing.holds_for(settle(known.trace, Theory(slipped=2.0, star="none")))
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(st.data())
 def test_forced_bound_holds_if_views_may_be_misread(data: st.DataObject) -> None:
     given = traces(max_steps=3).filter(lambda trace: trace.has_displacements)

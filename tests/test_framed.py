@@ -183,6 +183,7 @@ def test_framed_maps_of_a_growing_trace_equal_the_plain_encoding(
             assert answer.count == expected.count
 
 
+@pytest.mark.slow
 def test_framed_mapper_maps_a_maze_step_by_step() -> None:
     """The trace is long enough for cores, transitivity rules of visits, and paths. The longer trace
     keeps them all."""
@@ -216,6 +217,7 @@ def test_framed_mapper_maps_a_maze_step_by_step() -> None:
     assert any(told for _, told in paths)
 
 
+@pytest.mark.slow
 def test_framed_maps_are_equal_without_each_speedup() -> None:
     """The walks are long enough for cores, transitivity rules of visits, and maps near a guess."""
     trace = maze(2, 2, steps=36, seed=0, stars=True).trace

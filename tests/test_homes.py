@@ -86,6 +86,7 @@ def test_maps_with_pinned_places_equal_those_of_the_plain_encoding(
     assert (found.cost, set(found.maps)) == (expected.cost, set(expected.maps))
 
 
+@pytest.mark.slow
 def test_long_corridor_needs_no_search_for_places() -> None:
     """The places of forty landmarks on the way there bound the number of places."""
     found = solve(corridor(40), time_limit=60)

@@ -106,6 +106,7 @@ def test_joined_map_costs_at_most_as_much_as_the_true_one(known: truth.Known, st
     assert found <= nats(truth.partition(known.dstates), truth.partition(known.places)) + 1e-6
 
 
+@pytest.mark.slow
 def test_joined_map_names_the_gateways_that_changed() -> None:
     case = changes.case(4, 60, 513, 3, 8)
     problem = settle(case.known.trace, Theory(changed=1.2, star="frame"))

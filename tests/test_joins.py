@@ -71,6 +71,7 @@ def agree(trace: Trace, theory: Theory, ssh_map: SSHMap) -> tuple[Join, ...]:
     return joins
 
 
+@pytest.mark.slow
 @settings(max_examples=6)
 @given(st.data())
 def test_named_joins_are_a_minimal_set_that_implies_all_others(data: st.DataObject) -> None:

@@ -87,6 +87,7 @@ def test_track_is_cut_where_the_odometer_restarts(
     assert "Local maps that match may connect what lies before and after" in notes
 
 
+@pytest.mark.slow
 def test_trace_has_no_displacement_across_a_cut(
     scans: tuple[Scan, ...],
 ) -> None:

@@ -177,6 +177,7 @@ def test_simulated_robot_reaches_every_dstate(
         assert sorted((float(b) + 5) % 360 for b in step.star) == pytest.approx(expected, abs=2)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_displacement_errors_fit_their_covariances() -> None:
     """Relative to fixed points, 40 steps have a chi-square near its degrees of freedom."""
     trace = simulate(FIVE, tours=2, seed=5)

@@ -206,6 +206,7 @@ def test_the_learner_is_an_estimator(run: Trace) -> None:
     )
 
 
+@pytest.mark.slow
 def test_learner_fits_several_traces_with_one_map(run: Trace) -> None:
     short = simulate(World.named("notched-rectangle"), tours=2, seed=503)
     late = replace(short, steps=short.steps[3:])  # begins at x3
@@ -278,6 +279,7 @@ def large_room() -> Trace:
     )
 
 
+@pytest.mark.slow
 def test_learner_warns_if_the_runner_up_gives_another_map(large_room: Trace) -> None:
     with pytest.warns(
         RunnerUpWarning,

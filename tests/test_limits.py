@@ -399,9 +399,9 @@ def test_limit_during_ranking_leaves_the_list_complete() -> None:
     "ask",
     [
         lambda solution: solve(solution.trace),
-        find_backbone,
+        pytest.param(find_backbone, marks=pytest.mark.slow),
         lambda solution: explain_pair(solution.trace, 0, 8),
-        lambda solution: explain_trace(solution.trace),
+        pytest.param(lambda solution: explain_trace(solution.trace), marks=pytest.mark.slow),
         lambda _: explain(CLASH),
         lambda _: check_rules(Theory.causal().replace(rules=[Rules("own.lp", EXAMPLE)])),
     ],

@@ -65,6 +65,7 @@ def test_import_of_a_pipe_prints_visits_and_equals_import_of_a_file(
     assert live.closures == done.trace.closures
 
 
+@pytest.mark.slow
 def test_import_of_a_pipe_counts_diverging_lanes_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -81,6 +82,7 @@ def test_import_of_a_pipe_counts_diverging_lanes_at_the_end(
     assert sum(math.dist(visit.middle, (12, 0.4)) < 1.0 for visit in visits) == 2
 
 
+@pytest.mark.slow
 def test_trace_on_standard_output_has_no_other_lines(
     drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -220,6 +222,7 @@ def test_a_log_that_grew_is_imported_as_a_whole(scans: tuple[Scan, ...]) -> None
         assert [visit.scan for visit in seen] == [visit.scan for visit in live.visits]
 
 
+@pytest.mark.slow
 def test_places_are_known_soon_and_stay(scans: tuple[Scan, ...]) -> None:
     live, early = LiveLog(), list[LivePlace]()
     for scan in scans[:120]:

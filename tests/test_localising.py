@@ -86,6 +86,7 @@ def test_map_of_a_prefix_locates_all_visits_or_names_missing_ones(seed: int) -> 
             assert {visit: found[visit] for visit in at} == at
 
 
+@pytest.mark.slow
 def test_long_trace_is_solved_from_some_of_its_visits() -> None:
     """It has the same minimal maps as when clingo is given all visits."""
     trace = maze(3, 3, steps=500, seed=1, stars=True).trace

@@ -233,6 +233,7 @@ def test_replay_keeps_the_folder_of_another_program(
     assert "or one that live saved to, got one that map wrote" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_replay_keeps_a_state_that_it_cannot_read(
     scans: tuple[Scan, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -318,6 +319,7 @@ def test_lifted_robot_has_no_position_until_closures_show_it(scans: tuple[Scan, 
     assert mapper.finish().track.breaks == (31,)
 
 
+@pytest.mark.slow
 def test_lifted_robot_is_located_by_what_it_sees() -> None:
     """The second drive begins elsewhere, with odometry that starts anew."""
     scans = list(scans_of(record(World.named("cluttered"), every=0.5)))[:160]

@@ -378,6 +378,7 @@ def test_default_work_limit_is_a_fortieth_of_the_drive() -> None:
         assert left == pytest.approx(5.0 / SPEED / 40)
 
 
+@pytest.mark.slow
 def test_map_on_an_unreliable_track_has_no_probability(
     hall: Path, runs: Path, imported_hall: Imported, monkeypatch: pytest.MonkeyPatch
 ) -> None:

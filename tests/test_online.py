@@ -105,6 +105,7 @@ def test_online_mapper_solves_anew_without_an_axiom(name: str) -> None:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=5)
 @given(st.data())
 def test_online_mapper_keeps_at_most_max_maps(data: st.DataObject) -> None:

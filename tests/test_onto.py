@@ -241,6 +241,7 @@ def test_onto_refuses_a_drive_that_contradicts_the_map() -> None:
     assert solve([monday, wrong], sure)[0].dstate_at == (0, 1, 2, 3, 2, 3, 4)
 
 
+@pytest.mark.slow
 def test_onto_adds_a_drive_with_displacements_by_cost() -> None:
     monday = Trace.from_steps(
         "abcd", ["travel", "around", "travel"], displacements=[(4, 0, 0), (0, 0, 3.14), (4, 0, 0)]

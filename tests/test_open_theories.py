@@ -319,6 +319,7 @@ def test_every_engine_forbids_maps_refused_by_evidence(name: str, data: st.DataO
     assert {key(ssh_map) for ssh_map in found} == expected
 
 
+@pytest.mark.slow
 def test_impossible_assertions_and_rules_are_unsatisfiable() -> None:
     trace = Trace.load(EXAMPLES / "aces3-route.jsonl")[:17]
     at_check = Rules("one.lp", "#program check(t).\n:- query(t), not same_place(5,15).")

@@ -531,6 +531,7 @@ def test_browser_shows_hostile_texts_as_text(browser: Any, tmp_path: Path) -> No
     assert page.complaints == []
 
 
+@pytest.mark.slow
 def test_assuming_and_explaining_in_the_browser(browser: Any, server: PageServer) -> None:
     page = Shown(browser, server.url)
     page.choose(0, 1)

@@ -103,6 +103,7 @@ def test_planarity_test_agrees_with_networkx_on_random_graphs() -> None:
     assert 100 < sum(answers) < 500
 
 
+@pytest.mark.slow
 def test_drawings_with_free_orders_equal_planar_graphs() -> None:
     rng = random.Random(1)
     graphs = [
@@ -396,6 +397,7 @@ def true_labels(trace: Trace) -> tuple[int, ...]:
     return tuple(number.setdefault(step.truth, len(number)) for step in trace.steps)
 
 
+@pytest.mark.slow
 def test_planarity_excludes_smaller_maps_and_finds_the_true_one(
     tour: Trace, nonplanar: Solution
 ) -> None:

@@ -61,6 +61,7 @@ def test_workers_import_no_module_of_the_current_folder(
     assert not (hostile / "mark").exists()
 
 
+@pytest.mark.slow
 def test_program_imports_no_module_of_the_current_folder(hostile: Path, room: str) -> None:
     words = "solve ROOM ROOM --jobs 2 --time-limit 50"
     done = subprocess.run(

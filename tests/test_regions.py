@@ -327,6 +327,7 @@ def test_causal_map_has_no_regions() -> None:
     assert find_regions(ssh_map, trace, Theory.causal()) == ()
 
 
+@pytest.mark.slow
 def test_time_for_regions_is_shared_among_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     trace = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
     assert all(m.regions for m in solve(trace))

@@ -270,6 +270,7 @@ class Recording(io.BytesIO):
         return b""
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_log_on_standard_input(
     interrupting: None,
     tmp_path: Path,

@@ -467,6 +467,7 @@ def test_wheel_errors_scale_distances_and_bend_the_track() -> None:
     assert robot.odometry == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_displacements_equal_motions_between_dstates(circuits: Trace, tours: Trace) -> None:
     """Displacements of wheels lead between true poses; those of a map lead between fixed points."""
     for trace in (circuits, tours):
@@ -479,6 +480,7 @@ def test_displacements_equal_motions_between_dstates(circuits: Trace, tours: Tra
         assert 0.15 < (travels**2).mean() < 1.2
 
 
+@pytest.mark.slow
 def test_trace_declares_scale_and_drift_of_the_body() -> None:
     plain = simulate(RECTANGLE, 5, seed=7)
     trace = simulate(RECTANGLE, 5, seed=7, body=Body(scale=0.1, bend=0.0035))

@@ -249,6 +249,7 @@ def test_solve_lists_at_most_max_maps() -> None:
     assert (exactly.count, exactly.complete, exactly.stopped) == (30, True, None)
 
 
+@pytest.mark.slow
 def test_first_of_millions_of_maps_comes_at_once() -> None:
     """One and a half circuits have 20,289 consistent maps without sides. Two and a half circuits
     have far too many to list."""
@@ -507,6 +508,7 @@ def test_shuffled_truth_changes_no_answer() -> None:
     assert solve(shuffled).maps == solve(bare).maps == solve(route).maps
 
 
+@pytest.mark.slow
 def test_growth_continues_after_a_limit_with_the_same_maps() -> None:
     """After a limit has stopped the growth, growing on has the same result as growing at once."""
     trace = drive(*TOURS["comb"])
@@ -534,6 +536,7 @@ def test_growth_continues_after_a_limit_with_the_same_maps() -> None:
     )
 
 
+@pytest.mark.slow
 def test_interrupt_releases_maps_that_were_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
     search = Search(drive(*TOURS["comb"]), theory, max_maps=None)
@@ -668,6 +671,7 @@ def test_renaming_and_mirroring_do_not_change_maps(case: tuple[Trace, Theory]) -
     assert {shape(m) for m in solve(mirror, theory, max_maps=None).maps} == shapes
 
 
+@pytest.mark.slow
 def test_map_of_a_prefix_is_extended_at_the_time_limit() -> None:
     """Unknown steps get new dstates. There are far fewer than if only a short prefix was mapped."""
     trace = maze(4, 4, steps=500, seed=0, loops=0.5, stars=True).trace

@@ -64,7 +64,7 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
     return Trace.from_steps(seen, [("travel", "right")[action] for action in done])
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(machines(), st.sets(st.sampled_from(NAMES)), st.data())
 def test_any_speedups_give_the_maps_of_the_plain_encoding(
     trace: Trace, off: set[str], data: st.DataObject

@@ -66,6 +66,7 @@ def test_streamed_visits_equal_those_of_the_whole_log(name: str) -> None:
     assert fields(streamed) == fields(list(find_visits(log, track)))
 
 
+@pytest.mark.slow
 def test_visit_is_final_within_the_promised_distance() -> None:
     (log, track), fed = drive("fork"), 0
 

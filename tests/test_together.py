@@ -77,6 +77,7 @@ def test_cheapest_joint_maps_equal_plain_least_squares(data: st.DataObject) -> N
     test_weighing.agree(trace, test_weighing.weighed(theory))
 
 
+@pytest.mark.slow
 @settings(max_examples=4)
 @given(st.data())
 def test_checker_rejects_joint_maps_outside_the_brute_force(
@@ -245,6 +246,7 @@ def test_drives_without_common_views_are_pieces(
         Solution.from_dict(data)
 
 
+@pytest.mark.slow
 def test_path_is_in_one_piece_of_the_map() -> None:
     """Two corridors that share no place are two paths, although one path would be fewer."""
     here, there = (
@@ -464,6 +466,7 @@ THERE = Trace.from_steps("abcd", ["travel", "around", "travel"], name="monday")
 BACK = Trace.from_steps("dcba", ["around", "travel", "around"], name="tuesday")
 
 
+@pytest.mark.slow
 def test_sentences_name_steps_by_their_drives(tmp_path: Path) -> None:
     joint, solution = together([THERE, BACK]), solve([THERE, BACK])
     said = "the dstates of steps tuesday:0 and tuesday:3 differ; the places of steps tuesday:0–3"

@@ -671,6 +671,7 @@ def test_estimated_rivals_obey_the_user(kind: str, of: Literal["dstate", "place"
     assert solution.probability(0, 3, of=of) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_estimated_rivals_of_causal_maps_are_deterministic() -> None:
     """Two circuits of a square, and then back and forth along its first side."""
     go, around = (10.0, 0.0, 0.0), (0.0, 0.0, math.pi)

@@ -181,6 +181,7 @@ def near() -> dict[str, Any]:
     return dict(json.loads(printed.getvalue()))
 
 
+@pytest.mark.slow
 def test_json_has_the_cost_of_each_near_minimal_map(near: dict[str, Any]) -> None:
     assert near["within"] == 3
     assert near["cost"] == {"dstates": 19, "places": 10, "paths": 4}
