@@ -13,6 +13,7 @@ import pytest
 from coarse import every_second_beam, hall
 
 from perception.errors import LogError
+from perception.places import closures
 from perception.places.importing import import_log
 from perception.places.saved import SCANS, STATE
 from perception.readers.scans import RobotLog, Scan
@@ -67,14 +68,25 @@ def test_saved_drive_goes_on_as_if_it_had_not_ended(scans: tuple[Scan, ...], hou
     assert done.poses.tolist() == whole.poses.tolist()
 
 
+def test_expected_visits_are_matched_once(house: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    live = OnlineLogMapper.load(house).live
+    for scan in every_second_beam(hall(every=0.5)[60:140]):
+        live.add(scan)
+    first = live.grown()
+    assert live._closures._matches
+    monkeypatch.setattr(closures, "match", None)
+    again = live.grown()
+    assert [vars(one) for one in again.closings] == [vars(one) for one in first.closings]
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
         (
-            lambda data: data.replace(b'"version": 1', b'"version": 9'),
-            ": expected a state of version 1, got 9; move it away, and start anew$",
+            lambda data: data.replace(b'"version": 2', b'"version": 9'),
+            ": expected a state of version 2, got 9; move it away, and start anew$",
         ),
-        (lambda data: b"something", ": expected a state of version 1, got another file; move it"),
+        (lambda data: b"something", ": expected a state of version 2, got another file; move it"),
         (lambda data: data[:-5], "got a damaged file"),
         (None, "No such file"),
     ],

@@ -19,7 +19,7 @@ from __future__ import annotations
 import copy
 import math
 from bisect import bisect, bisect_left
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -39,6 +39,7 @@ from perception.places.track import (
     seen_from,
 )
 from ssh_abduction.data.odometry import Pose, moved
+from ssh_abduction.runtime.threads import one_thread
 
 # A match is reliable with at least this score and share of area that both maps observed.
 SCORE, MUTUAL = 0.75, 0.5
@@ -69,12 +70,13 @@ TURN, SIGMAS = math.radians(6), 3.0
 # Each visit has at most this many closures with earlier ones: those with the best scores.
 KEPT = 2
 # Each visit is matched with at most MATCHES earlier ones. The last SCENES local maps are cached in
-# the form in which they are matched.
-MATCHES, SCENES = 32, 128
+# the form in which they are matched, and the last RESULTS results.
+MATCHES, SCENES, RESULTS = 32, 64, 512
 # Of closures that fit nearly as badly as the worst one, the one with the lowest score is dropped.
 # Nearly is this share of the chi-square of the worst one.
 NEARLY = 0.9
-# After a closure is dropped, only closures above this share of GATE are judged again.
+# After a closure is dropped, others are judged again while their last gain is above this share of
+# the largest new one, and of GATE.
 DOUBTFUL = 0.5
 # The fit ends after ROUNDS steps, or if a step lowers the chi-square by less than the share STILL.
 # A step that raises the chi-square is halved, at most HALVINGS times.
@@ -85,7 +87,7 @@ SURE = 2 / (BENDS * BEND)
 # The least variance of a motion, and a small number that makes the normal equations regular.
 LEAST, REGULAR = 1e-8, 1e-9
 # The gains of this many closures are computed at once.
-TOGETHER = 256
+TOGETHER = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +114,9 @@ class ClosureFinder:
         self._visits: list[Visit] = []
         self._placed: list[Pose] = []  # the visits by the track. Each closure corrects later ones.
         self.found: list[VisitMatch] = []  # the closures so far
-        self._scenes: dict[int, LocalScene] = {}  # of the visits that were matched last
+        # What was matched last, also by copies: visits that are expected are added again and again.
+        self._scenes: dict[int, LocalScene] = {}
+        self._matches: dict[tuple[int, int, range], Match | None] = {}
 
     def __len__(self) -> int:
         """The number of visits."""
@@ -144,7 +148,7 @@ class ClosureFinder:
             for k in nearest
         ]
         asked = [gate for gate in gates if gate.is_near]
-        here = sorted(_closings(self._scene, asked, last), key=lambda one: -one.match.score)
+        here = sorted(self._closings(asked, last), key=lambda one: -one.match.score)
         self.found += here[:KEPT]
         # 3. The best closure corrects the position.
         if here:
@@ -155,19 +159,44 @@ class ClosureFinder:
         """A copy to which visits can be added alone."""
         other = copy.copy(self)
         other._visits, other._placed = [*self._visits], [*self._placed]
-        other.found, other._scenes = [*self.found], {**self._scenes}
+        other.found = [*self.found]
         return other
+
+    def _closings(self, asked: Sequence[_Gate], last: int) -> Iterator[VisitMatch]:
+        """Match a visit with earlier ones, and yield the closures."""
+        keys = [(self._key(gate.first), self._key(last), gate.turns) for gate in asked]
+        known = {key: self._matches.pop(key) for key in keys if key in self._matches}
+        if turns := [key[2] for key in keys if key not in known]:
+            begin, end = min(some.start for some in turns), max(some.stop for some in turns)
+            # The visit is rotated once, for all the earlier visits.
+            turned = Turned.of(self._scene(last), [k * TURN for k in range(begin, end)])
+        for gate, key in zip(asked, keys, strict=True):
+            if key not in known:
+                part = turned.part(gate.turns.start - begin, gate.turns.stop - begin)
+                known[key] = match(self._scene(gate.first), part)
+            _keep(self._matches, RESULTS, key, found := known[key])
+            if found is not None and is_reliable(found) and gate.allows(found):
+                yield VisitMatch(gate.first, last, found)
+
+    def _key(self, number: int) -> int:
+        """Equal for visits with equal local maps and middles."""
+        (patch,) = patches_of(self._visits[number : number + 1])
+        return hash(patch.bits.tobytes() + self._visits[number].middle.tobytes())
 
     def _scene(self, number: int) -> LocalScene:
         """The local map of a visit, prepared for matching."""
-        if (scene := self._scenes.pop(number, None)) is None:
-            visit = self._visits[number]
-            (patch,) = patches_of([visit])
-            scene = LocalScene.of(patch, visit.middle)
-        self._scenes[number] = scene  # the last one
-        if len(self._scenes) > SCENES:
-            del self._scenes[next(iter(self._scenes))]
+        if (scene := self._scenes.pop(key := self._key(number), None)) is None:
+            (patch,) = patches_of(self._visits[number : number + 1])
+            scene = LocalScene.of(patch, self._visits[number].middle)
+        _keep(self._scenes, SCENES, key, scene)
         return scene
+
+
+def _keep(cache: dict[Any, Any], most: int, key: Any, value: Any) -> None:
+    """Add an item to a cache, and drop the oldest one if there are too many."""
+    cache[key] = value
+    if len(cache) > most:
+        del cache[next(iter(cache))]
 
 
 def find_closures(track: Track, visits: Sequence[Visit], apart: float) -> list[VisitMatch]:
@@ -176,22 +205,6 @@ def find_closures(track: Track, visits: Sequence[Visit], apart: float) -> list[V
     for visit in visits:
         closures.add(track, visit)
     return closures.found
-
-
-def _closings(
-    scene: Callable[[int], LocalScene], asked: Sequence[_Gate], last: int
-) -> Iterator[VisitMatch]:
-    """Match a visit with earlier ones, and yield the closures."""
-    if not asked:
-        return
-    begin, end = min(gate.turns.start for gate in asked), max(gate.turns.stop for gate in asked)
-    # The visit is rotated once, for all the earlier visits.
-    turned = Turned.of(scene(last), [k * TURN for k in range(begin, end)])
-    for gate in asked:
-        part = turned.part(gate.turns.start - begin, gate.turns.stop - begin)
-        found = match(scene(gate.first), part)
-        if found is not None and is_reliable(found) and gate.allows(found):
-            yield VisitMatch(gate.first, last, found)
 
 
 def is_reliable(found: Match) -> bool:
@@ -269,12 +282,20 @@ def agreeing(
     """
     graph, kept = _ClosureGraph(track, visits, found), np.ones(len(found), bool)
     scores = np.array([closure.match.score for closure in found])
-    doubtful = np.arange(len(found))  # a closure that fits well still does so without others
-    while len(doubtful) and (gains := graph.gains(kept, doubtful)).max() > GATE:
-        bad = doubtful[gains >= max(NEARLY * gains.max(), GATE)]
-        kept[bad[np.argmin(scores[bad])]] = False
-        doubtful = doubtful[(gains > DOUBTFUL * GATE) & kept[doubtful]]
-    return [closure for closure, keep in zip(found, kept, strict=True) if keep]
+    gains = np.full(len(found), np.inf)  # when each closure was judged last
+    # The matrices are small: threads of BLAS would mostly wait for each other.
+    with one_thread("blas"):
+        while True:
+            graph.fit(kept)
+            left, worst = kept.copy(), GATE  # those not judged yet, and the largest gain of others
+            while len(some := np.flatnonzero(left & (gains > DOUBTFUL * worst))):
+                some = some[np.argsort(-gains[some], kind="stable")][:TOGETHER]
+                gains[some], left[some] = graph.gains(kept, some), False
+                worst = max(worst, gains[some].max())
+            bad = np.flatnonzero(kept & ~left & (gains >= max(NEARLY * worst, GATE)))
+            if not len(bad) or worst <= GATE:
+                return [closure for closure, keep in zip(found, kept, strict=True) if keep]
+            kept[bad[np.argmin(scores[bad])]] = False
 
 
 def fitted_poses(track: Track, visits: Sequence[Visit], found: Sequence[VisitMatch]) -> Array:
@@ -285,7 +306,8 @@ def fitted_poses(track: Track, visits: Sequence[Visit], found: Sequence[VisitMat
     """
     graph = _ClosureGraph(track, visits, found)
     if found:
-        graph.fit(np.ones(len(found), bool))
+        with one_thread("blas"):
+            graph.fit(np.ones(len(found), bool))
     return graph.poses
 
 
@@ -322,32 +344,22 @@ class _ClosureGraph:
         return self._unknown[:-1].reshape(-1, 3)
 
     def gains(self, kept: NDArray[np.bool_], asked: NDArray[np.int_]) -> Array:
-        """Fit the poses to the closures kept. Return how much the chi-square falls without some.
+        """How much the chi-square of the last fit, of the closures kept, falls without some.
 
         `asked` has the closures to leave out, each by itself.
         """
-        off, jacobian, solver = self.fit(kept)
-        rows = self._moves + np.searchsorted(np.flatnonzero(kept), asked)
-        found = []
-        for begin in range(0, len(rows), TOGETHER):
-            some = rows[begin : begin + TOGETHER]
-            own = (3 * some[:, None] + np.arange(3)).ravel()
-            dense = jacobian[own].toarray()
-            moved = solver.solve(dense.T).T.reshape(len(some), 3, -1)
-            # How much of its own error each edge takes away by moving the poses.
-            taken = dense.reshape(len(some), 3, -1) @ moved.transpose(0, 2, 1)
-            left = (1 + REGULAR) * np.eye(3) - taken
-            errors = off[some]
-            rest = np.linalg.solve(left, errors[..., None])[..., 0]
-            found.append(np.einsum("ki,ki->k", errors, rest))
-        return np.concatenate(found)
+        off, jacobian, solver = self._fitted
+        some = self._moves + np.searchsorted(np.flatnonzero(kept), asked)
+        dense = jacobian[(3 * some[:, None] + np.arange(3)).ravel()].toarray()
+        moved = solver.solve(dense.T).T.reshape(len(some), 3, -1)
+        # How much of its own error each edge takes away by moving the poses.
+        taken = dense.reshape(len(some), 3, -1) @ moved.transpose(0, 2, 1)
+        left = (1 + REGULAR) * np.eye(3) - taken
+        rest = np.linalg.solve(left, off[some][..., None])[..., 0]
+        return np.asarray(np.einsum("ki,ki->k", off[some], rest))
 
-    def fit(self, kept: NDArray[np.bool_]) -> tuple[Array, Any, Any]:
-        """Fit the poses to the closures kept. The fit begins with the result of the last one.
-
-        Returns the errors of the edges in standard deviations, (k, 3), their derivative, and the
-        factors of the normal equations.
-        """
+    def fit(self, kept: NDArray[np.bool_]) -> None:
+        """Fit the poses to the closures kept. The fit begins with the result of the last one."""
         some = np.append(np.ones(self._moves, bool), kept)
         squares = self._squares(some, self._unknown)
         for _ in range(ROUNDS):
@@ -367,7 +379,9 @@ class _ClosureGraph:
             if tried[-1][0] >= squares * (1 - STILL):
                 break
             squares, self._unknown = tried[-1]
-        return off, jacobian, solver
+        # The errors of the edges in standard deviations, (k, 3), their derivative, and the factors
+        # of the normal equations.
+        self._fitted: tuple[Array, Any, Any] = off, jacobian, solver
 
     def _squares(self, some: NDArray[np.bool_], unknown: Array) -> float:
         """Compute the chi-square of some edges and of the drift."""

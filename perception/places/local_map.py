@@ -36,8 +36,8 @@ Bools = NDArray[np.bool_]
 Cells = NDArray[np.int32]
 Cell = tuple[int, int]
 
-# A cell and its eight neighbours.
-EIGHT = np.ones((3, 3), np.bool_)
+# A cell and its eight neighbours; and no cells.
+EIGHT, NO_CELLS = np.ones((3, 3), np.bool_), np.zeros(0, np.int32)
 # Side of a cell in metres.
 CELL = 0.1
 # Beams are ignored beyond this many metres, as gaps between them grow too wide.
@@ -97,6 +97,19 @@ class PackedPatch:
         return np.asarray(bits.view(np.bool_).reshape(self.shape))
 
 
+def any_beside(mask: Bools) -> Bools:
+    """Whether each cell but those at the border, or one of its neighbours, is in a mask."""
+    rows = mask[:-2] | mask[1:-1] | mask[2:]
+    return np.asarray(rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:])
+
+
+def squares_to_false(mask: Bools) -> NDArray[np.int64]:
+    """The squared distance in cells from each cell to the nearest one that is not in a mask."""
+    near = ndimage.distance_transform_edt(mask, return_distances=False, return_indices=True)
+    rows, columns = np.ogrid[: len(mask), : mask.shape[1]]
+    return np.asarray((near[0] - rows) ** 2 + (near[1] - columns) ** 2)
+
+
 def _repeated(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Each index of `counts` as often as its count says, and the numbers 0, 1, ... of each."""
     which = np.repeat(np.arange(len(counts)), counts)
@@ -134,17 +147,17 @@ class LocalMaps:
         first = np.rint(np.asarray(middle) / CELL).astype(int) - round(half / CELL)
         rows, columns = (np.arange(n, n + 2 * round(half / CELL) + 1) % self._side for n in first)
         cells = rows[:, None] * self._side + columns
-        counts = np.zeros((2, self._side**2), np.int32)
-        for i in self._recent.keyframes(begin, end):
-            for count, seen in zip(counts, self._cells_of(i), strict=True):
-                count[seen] += 1
-        passed, met = counts[:, cells]
+        seen = [(NO_CELLS, NO_CELLS), *map(self._cells_of, self._recent.keyframes(begin, end))]
+        passed, met = (
+            np.bincount(np.concatenate(some), minlength=self._side**2)[cells]
+            for some in zip(*seen, strict=True)
+        )
         occupied = (met > 0) & (met >= OCCUPIED * (met + passed))
         trail = self._trail(begin, end, first, passed.shape)
-        free = ((passed > 0) & ~occupied) | ndimage.binary_dilation(trail, EIGHT, 2)
+        free = ((passed > 0) & ~occupied) | any_beside(any_beside(np.pad(trail, 2)))
         # A cell between two beams may have been missed. So close gaps of up to two cells, but do
         # not free cells with an obstacle.
-        closed = ndimage.binary_closing(np.pad(free, 1), EIGHT)[1:-1, 1:-1]
+        closed = ~any_beside(~any_beside(np.pad(free, 2)))
         return Patch((free | closed) & ~(occupied & ~free), occupied & ~trail, trail, first * CELL)
 
     def _trail(
@@ -356,8 +369,8 @@ class LocalScene:
         axis = (np.arange(size) - size // 2) * CELL
         near = np.hypot(*np.meshgrid(axis, axis, indexing="ij")) <= REACH
         walls, free = occupied & near, patch.free & near
-        far = ndimage.distance_transform_edt(~walls) if walls.any() else np.sqrt(FAR)
-        squares = np.minimum(np.rint(np.square(far)), FAR).astype(np.uint16)
+        far = squares_to_false(~walls) if walls.any() else FAR
+        squares = np.minimum(far, FAR).astype(np.uint16)
         shift = np.asarray(middle) - (patch.corner + size // 2 * CELL)
         points = (np.argwhere(walls) - size // 2) * CELL - shift
         return LocalScene(points, 2 * squares + (free | walls), shift)

@@ -84,6 +84,8 @@ class Passages:
         way = resampled(chain, STEP)
         if len(way) < 2:
             return {}
+        # Earlier scans are not needed again, so the local maps may forget them.
+        self._recent.drop_before(self._recent.at(self._recent.way(self._near(first.scan)) - REACH))
         walls, free = self._beside(way, first.scan, last.scan)
         before = self._beyond(way[::-1], first.scan)[::-1]
         beyond = self._beyond(way, last.scan)

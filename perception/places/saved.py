@@ -33,7 +33,7 @@ from ssh_abduction.data.errors import named
 from ssh_abduction.data.files import read_file, write_file
 
 STATE, SCANS = "drive.state", "drive.scans"
-FORMAT, VERSION = "ssh-live", 1
+FORMAT, VERSION = "ssh-live", 2
 MOST = 2**30  # bytes of a state
 MODULES: tuple[ModuleType, ...] = (
     closures,
@@ -51,7 +51,7 @@ CLASSES = {
     if isinstance(kind, type) and kind.__module__.startswith("perception.")
 }
 # Attributes with what can be computed again are saved empty.
-CACHES = {("LocalMaps", "_known"), ("ClosureFinder", "_scenes")}
+CACHES = {("LocalMaps", "_known"), ("ClosureFinder", "_scenes"), ("ClosureFinder", "_matches")}
 # Numbers of a row of `drive.scans` before the ranges: the numbers of the laser and of the ranges,
 # the line, the time, two poses, whether the track is cut and broken, and a row of the track.
 HEAD = 4 + 3 + 3 + 2 + following.ROW

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from perception.places.local_map import CELL, EIGHT, Bools, Patch
+from perception.places.local_map import CELL, EIGHT, Bools, Patch, any_beside, squares_to_false
 from perception.places.track import Array
 
 # Steps to the eight neighbours of a cell, those with a common side first.
@@ -81,7 +81,7 @@ def junctions(patch: Patch, room: float) -> list[Junction]:
     """
     mask = passable(patch, room)
     # The middle of the robot is `room` away from obstacles, so the disc of a cell is larger.
-    distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1] + room / CELL
+    distance = np.sqrt(squares_to_false(np.pad(mask, 1)))[1:-1, 1:-1] + room / CELL
     far = SHORE * 2 * room / CELL
     lines, inner = thinned(mask), open_space(distance, far)
     graph = pruned(graph_of(lines, distance))
@@ -150,12 +150,13 @@ def passable(patch: Patch, room: float) -> Bools:
 
     Furniture does not count as an obstacle.
     """
-    trail = ndimage.binary_dilation(patch.trail, EIGHT)
+    trail = any_beside(np.pad(patch.trail, 1))
     fits = trail | patch.free
     if patch.occupied.any():
-        distance = ndimage.distance_transform_edt(~patch.occupied) * CELL
+        distance = np.sqrt(squares_to_false(~patch.occupied)) * CELL
         fits = trail | (patch.free & (distance >= room))
-    fits = ndimage.binary_opening(fits, EIGHT) | trail
+    narrow = any_beside(np.pad(~fits, 1, constant_values=True))
+    fits = any_beside(np.pad(~narrow, 1)) | trail
     reached = _parts_with(fits, trail)
     # Small holes within the reached space are furniture, unless they touch the border.
     holes, count = ndimage.label(~reached)
