@@ -125,12 +125,6 @@ WEIGHED = (
         until=0.6,
     ),
     SourceTurn(
-        "beam of 16",
-        "one drive on one floor",
-        "With several drives or floors, a beam of 4 keeps as many hypotheses.",
-        until=0.7,
-    ),
-    SourceTurn(
         "beams of logs",
         "logs of robots: all beams",
         "Smoothing has mostly found the best map there, and bounds need the work.",
