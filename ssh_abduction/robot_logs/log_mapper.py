@@ -472,7 +472,12 @@ class OnlineLogMapper:
             pairs += [(rival["probability"], *pair) for pair in rival["joined"]]
         pairs = [pair for pair in pairs if SURE < pair[0] < 1 - SURE]
         if not pairs:
-            return "no join is known to be doubtful"
+            is_known = self.sure.get("doubtful") is not None
+            return (
+                "no join is doubtful"
+                if is_known
+                else "it is not known yet which joins are doubtful"
+            )
         p, first, second = min(pairs, key=lambda pair: abs(pair[0] - 0.5))
         place = self._names.place_of[second]
         return (
