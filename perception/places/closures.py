@@ -286,11 +286,11 @@ def agreeing(
     # The matrices are small: threads of BLAS would mostly wait for each other.
     with one_thread("blas"):
         while True:
-            graph.fit(kept)
+            fitted = graph.fit(kept)
             left, worst = kept.copy(), GATE  # those not judged yet, and the largest gain of others
             while len(some := np.flatnonzero(left & (gains > DOUBTFUL * worst))):
                 some = some[np.argsort(-gains[some], kind="stable")][:TOGETHER]
-                gains[some], left[some] = graph.gains(kept, some), False
+                gains[some], left[some] = graph.gains(fitted, kept, some), False
                 worst = max(worst, gains[some].max())
             bad = np.flatnonzero(kept & ~left & (gains >= max(NEARLY * worst, GATE)))
             if not len(bad) or worst <= GATE:
@@ -343,12 +343,14 @@ class _ClosureGraph:
         """The poses of the visits, (n, 3), by the last fit. Without a fit, those of the track."""
         return self._unknown[:-1].reshape(-1, 3)
 
-    def gains(self, kept: NDArray[np.bool_], asked: NDArray[np.int_]) -> Array:
-        """How much the chi-square of the last fit, of the closures kept, falls without some.
+    def gains(
+        self, fitted: tuple[Array, Any, Any], kept: NDArray[np.bool_], asked: NDArray[np.int_]
+    ) -> Array:
+        """How much the chi-square of a fit to the closures kept falls without some.
 
-        `asked` has the closures to leave out, each by itself.
+        `fitted` is the result of `fit`. `asked` has the closures to leave out, each by itself.
         """
-        off, jacobian, solver = self._fitted
+        off, jacobian, solver = fitted
         some = self._moves + np.searchsorted(np.flatnonzero(kept), asked)
         dense = jacobian[(3 * some[:, None] + np.arange(3)).ravel()].toarray()
         moved = solver.solve(dense.T).T.reshape(len(some), 3, -1)
@@ -358,8 +360,12 @@ class _ClosureGraph:
         rest = np.linalg.solve(left, off[some][..., None])[..., 0]
         return np.asarray(np.einsum("ki,ki->k", off[some], rest))
 
-    def fit(self, kept: NDArray[np.bool_]) -> None:
-        """Fit the poses to the closures kept. The fit begins with the result of the last one."""
+    def fit(self, kept: NDArray[np.bool_]) -> tuple[Array, Any, Any]:
+        """Fit the poses to the closures kept. The fit begins with the result of the last one.
+
+        Returns the errors of the edges in standard deviations, (k, 3), their derivative, and the
+        factors of the normal equations.
+        """
         some = np.append(np.ones(self._moves, bool), kept)
         squares = self._squares(some, self._unknown)
         for _ in range(ROUNDS):
@@ -379,9 +385,7 @@ class _ClosureGraph:
             if tried[-1][0] >= squares * (1 - STILL):
                 break
             squares, self._unknown = tried[-1]
-        # The errors of the edges in standard deviations, (k, 3), their derivative, and the factors
-        # of the normal equations.
-        self._fitted: tuple[Array, Any, Any] = off, jacobian, solver
+        return off, jacobian, solver
 
     def _squares(self, some: NDArray[np.bool_], unknown: Array) -> float:
         """Compute the chi-square of some edges and of the drift."""
