@@ -120,7 +120,7 @@ def test_no_map_has_two_steps_at_one_place_that_are_apart(kind: str) -> None:
     visits = Visits.of(problem, log, true_map(known))
     one = indices_of(known.dstates)
     met = replace(visits, met=(next((at[0], at[-1]) for at in one.values() if len(at) > 1),))
-    for some, fails in ((met, False), (met.parted(*met.met[0]), True)):
+    for some, fails in ((met, False), (met.parted(met.met), True)):
         classes = Joined(some, np.arange(len(some.place)), Misfit(problem).visit, kind == "causal")
         assert classes.fails == fails
 

@@ -36,7 +36,6 @@ from ssh_abduction.runtime.clock import (
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solution.result import Solution
-from ssh_abduction.solution.sharing import Backbone
 from ssh_abduction.solution.values import Bound, Cost, Grounding, Progress, Status, Stop
 from ssh_abduction.solver.asp.kept_rules import check_rules
 from ssh_abduction.solver.asp.limits import EARLY, LimitError, StageTimeError, Watch
@@ -197,11 +196,6 @@ class Search:
         """The least cost in nats that is known; None if maps are counted, or none is known."""
         best = self._weighing.best if self._weighing else None
         return best.nats if best else None
-
-    @property
-    def backbone(self) -> Backbone | None:
-        """The backbone: what the minimal maps known so far share; None if none is known."""
-        return self.parts.rivals.backbone
 
     def __iter__(self) -> Iterator[SSHMap]:
         from ssh_abduction.solver.derived_regions import (

@@ -49,11 +49,6 @@ def processor_clock(
     return clock
 
 
-def _seconds() -> float:
-    """Return the seconds on the wall clock."""
-    return time.perf_counter()
-
-
 def check_limit(name: str, unit: str, limit: object) -> None:
     """Raise SolverError if a limit is neither None nor a number above 0. Name it and its unit."""
     if (
@@ -108,7 +103,8 @@ class Watch:
         """
         self._on_tick, self._around = on_tick, around
         counts = work is not None or (clock is None and counts_work())
-        self._clock = work_done if counts else clock or _seconds
+        # The function is looked up at each call, as another clock may replace it.
+        self._clock = work_done if counts else clock or (lambda: time.perf_counter())  # noqa: PLW0108
         self._next_tick = time.perf_counter() + TICK
         self._limit = limit if work is None else work
         self._cap = limit if work is not None else None

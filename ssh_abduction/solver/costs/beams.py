@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Set
 from contextlib import suppress
-from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
@@ -64,7 +63,6 @@ class Beams:
         self.broken = -math.inf
         self._ended: Beam | None = None  # the widest beam that ended
         self._whole: Set[int] | None = None  # the closures of a beam that dropped nothing
-        self._has_begun = False  # whether a beam was tried
         self._has_joined = False  # whether the maps of single drives gave a map
 
     def found(self, nats: float) -> bool:
@@ -83,17 +81,15 @@ class Beams:
         If the first beam finds no map, `clashes` returns whether a short proof shows that the trace
         has none.
         """
-        theory = self._parts.task.theory
-        most = 1.0
+        theory, beams = self._parts.task.theory, turn("beams")
         if theory.jumped:
-            most = turn("beams with wrong displacements").until
+            beams = turn("beams with wrong displacements")
         elif self._is_log:
-            most = turn("beams of logs").until
+            beams = turn("beams of logs")
 
         def beam(width: int) -> Source:
-            own = turn(f"beam of {width}")
             return Source(
-                replace(own, until=min(own.until, most)),
+                beams,
                 # A beam that dropped nothing has all hypotheses, so no wider one is needed.
                 lambda: not self._has_joined and self._whole != self._believed(),
                 lambda: self._search(width, clashes),
@@ -155,9 +151,8 @@ class Beams:
         except StageTimeError:
             if not self._ended:
                 parts.candidates.go_on(beam)
-        if not self._has_begun and self._nats() == math.inf and not parts.known.best and clashes():
+        if width < BROAD and self._nats() == math.inf and not parts.known.best and clashes():
             parts.known.status = Status.UNSATISFIABLE
-        self._has_begun = True
 
     def _finish(self, beam: Beam, width: int) -> None:
         """Keep the maps that a beam ends with. Raises StageTimeError if it does not end in time."""

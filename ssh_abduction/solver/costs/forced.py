@@ -44,7 +44,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from heapq import heappop, heappush
-from itertools import chain, count
+from itertools import chain, combinations, count
 from typing import NamedTuple
 
 import numpy as np
@@ -152,7 +152,7 @@ class Forcing:
 
         A low limit is fast, and proves a bound. The last ones are `nats` and `most`.
         """
-        least = self._grown(self._all, most).low
+        least = self._grown(self._all, most, False).low
         return [one for share in SHARES if (one := nats - share * (nats - least)) > least] + [
             nats,
             most,
@@ -163,7 +163,7 @@ class Forcing:
         self._open, self._leaves, self._most = [(-math.inf, 0, self._all)], [], most
         self._may_turn = False
         self.found, self.is_complete, number = [], False, count()
-        part = self._grown(self._all, most)
+        part = self._grown(self._all, most, False)
         self._open = [(part.low, next(number), part)] * (part.low < most)
         for _ in count() if self._is_by_poses else range(HALVED):
             if not self._open:
@@ -181,6 +181,8 @@ class Forcing:
 
     def _halves(self, part: _Part, most: float) -> list[_Part]:
         """Halve the maps, and grow both halves. Keep the map if there is only one."""
+        if not part.lacking:
+            part = self._grown(part, most, True)
         visits, joins, low, lacking = part
         if low >= most:
             return []
@@ -197,12 +199,12 @@ class Forcing:
             kind, i, j = steps
             if kind == "place":
                 met = replace(visits, met=(*visits.met, (i, j)))
-                halves = part._replace(visits=visits.parted(i, j)), part._replace(visits=met)
-                return [self._grown(half, most) for half in halves]
+                halves = part._replace(visits=visits.parted([(i, j)])), part._replace(visits=met)
+                return [self._grown(half, most, False) for half in halves]
             pair = int(visits.visit[i]), int(visits.visit[j])
         without = part._replace(visits=visits.lacking(*pair))
         halves = without, part._replace(joins=visits.joined(joins, [pair]))
-        return [self._grown(half, most) for half in halves]
+        return [self._grown(half, most, False) for half in halves]
 
     def _classes(self, visits: Visits, joins: Ints) -> Joined:
         return Joined(visits, joins, self._misfit.visit, self._is_causal)
@@ -290,8 +292,11 @@ class Forcing:
             gains[-of][k] = max(free[-of] + seen[-of][k] + nats_of, 0.0)
         return Gains(nats - float(products[0, 0]), *gains)
 
-    def _grown(self, part: _Part, most: float) -> _Part:
-        """Add joins that every map of a cost below `most` has, as far as bounds alone show them."""
+    def _grown(self, part: _Part, most: float, is_last: bool) -> _Part:
+        """Add joins that every map of a cost below `most` has, as far as bounds alone show them.
+
+        If `is_last`, also find places that are not one in these maps.
+        """
         visits, joins = part.visits, part.joins
         while True:
             look_at_clock(LONG_TURN // 2)
@@ -313,11 +318,12 @@ class Forcing:
                 lacking.append((classes.low_lacking(ways, a, b), pair))
             forced = [pair for nats, pair in lacking if nats >= most]
             met = [] if forced else self._met(classes, ways, most)
-            if not forced and not met:
+            far = [] if forced or met or not is_last else self._far(visits, joins, classes, most)
+            if not forced and not met and not far:
                 lacking.sort(reverse=True)
                 return _Part(visits, joins, low, [pair for _, pair in lacking])
             joins = visits.joined(joins, forced)
-            visits = replace(visits, met=(*visits.met, *met))
+            visits = replace(visits.parted(far), met=(*visits.met, *met))
 
     def _met(
         self, classes: Joined, ways: Sequence[Sequence[Gains]], most: float
@@ -335,4 +341,22 @@ class Forcing:
                     if classes.low_apart(ways, other, p) >= most:
                         found.append((i, t))
                         break
+        return found
+
+    def _far(
+        self, visits: Visits, joins: Ints, classes: Joined, most: float
+    ) -> list[tuple[int, int]]:
+        """Find pairs of steps that are at one place in no map of a cost below `most`.
+
+        They are at different places of the best map.
+        """
+        at = self._all.visits.at
+        first = [*firsts((p, t) for t, p in enumerate(classes.place.tolist())).items()]
+        found = []
+        for (p, i), (q, j) in combinations(first, 2):
+            if at[i] != at[j] and classes.may_meet(p, q):
+                look_at_clock(LONG_TURN // 2)
+                meeting = self._classes(replace(visits, met=(*visits.met, (i, j))), joins)
+                if meeting.low(self._ways(meeting)) >= most:
+                    found.append((i, j))
         return found

@@ -131,13 +131,15 @@ class Visits:
         apart[0, first, second] = apart[0, second, first] = True
         return replace(self, apart=apart)
 
-    def parted(self, first: int, second: int) -> Visits:
-        """Copy the visits, with a flag that two steps are at different places."""
+    def parted(self, pairs: Sequence[tuple[int, int]]) -> Visits:
+        """Copy the visits, with flags that pairs of steps are at different places."""
+        if not pairs:
+            return self
         apart, away = self.apart.copy(), None if self.away is None else self.away.copy()
-        i, j = self.visit[[first, second]]
-        apart[:, i, j] = apart[:, j, i] = True
+        i, j = np.array(pairs).T
+        apart[:, self.visit[i], self.visit[j]] = apart[:, self.visit[j], self.visit[i]] = True
         if away is not None:
-            away[first, second] = away[second, first] = True
+            away[i, j] = away[j, i] = True
         return replace(self, apart=apart, away=away)
 
     def joined(self, of: Ints, pairs: Iterable[tuple[int, int]]) -> Ints:

@@ -318,9 +318,8 @@ class HypothesisPoses:
         spreads = spreads_of(trace)
         self._is_off = bool(spreads.any())
         turns = np.array([noise[2, 2] for noise in self._noise.values()])
-        self.is_rough = self._is_off
-        if self._frames:
-            self.is_rough = not self._is_off and math.sqrt(turns.sum()) > ROUGH
+        is_long = math.sqrt(turns.sum()) > ROUGH
+        self.is_rough = not self._is_off and is_long if self._frames else self._is_off
         self._spreads = spreads + BLUR
 
     def moved(self, found: Hypothesis, t: int, believes: bool = True) -> Hypothesis:
