@@ -103,16 +103,33 @@ def test_narrow_beam_tells_dstates_at_one_place_apart() -> None:
     """The robot drives along a corridor twice, and stops halfway at the second time only.
 
     Both times it begins at one place, and nothing but the next displacement shows that it begins at
-    another dstate there. A beam of one hypothesis finds this by going back.
+    another dstate there. A beam of one hypothesis finds this without going back.
     """
     actions = ["travel", "around", "travel", "around", "travel", "travel"]
     metres = [10.0, 0.0, 10.0, 0.0, 5.0, 5.0]
     moves = [(far, 0.0, 0.0 if far else math.pi) for far in metres]
     noise = Odometry(offset=0.2, facing=0.1)
     trace = Trace.from_steps([0] * 7, actions, displacements=moves, odometry=noise)
-    best = maps_of(trace, Theory.topological().replace(star="none", without=PATHS), 1)[0]
+    with patch.object(Beam, "_checked", side_effect=AssertionError):
+        best = maps_of(trace, Theory.topological().replace(star="none", without=PATHS), 1)[0]
     places = [best.dstates[d].place for d in best.dstate_at]
     assert places == [0, 1, 1, 0, 0, 2, 1]
+
+
+def test_beam_keeps_hypotheses_with_other_places() -> None:
+    """Beside the cheapest hypotheses there are others, which differ in places from all these."""
+    (known,) = truth.mazes(3, 40, [700], DRIFTING)
+    problem, width, others = settle(known.trace, Theory(star="none")), 8, 0
+    beam = Beam(problem, Log(known.trace, problem.theory, problem.pairs), width)
+    kept = [beam._extending.first()]
+    for t in range(1, len(known.trace)):
+        options = beam._extending.options_of(kept, t, joins=True)
+        kept = list(beam._best(options, t, width))
+        assert [found.nats for found in kept[:width]] == [o.nats for o in options[:width]]
+        at = [[found.places[s] for s in found.labels.values()] for found in kept]
+        assert all(at[k] not in at[:k] for k in range(width, len(at)))
+        others += len(at) > width
+    assert others
 
 
 @pytest.mark.slow

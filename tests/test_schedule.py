@@ -12,6 +12,7 @@ from turns import turn_with
 
 import ssh_abduction.solver
 from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.costs.beams import WIDTHS
 from ssh_abduction.solver.schedule import TABLE, TURNS, turn
 
 SOLVER = Path(ssh_abduction.solver.__file__).parent
@@ -24,8 +25,9 @@ def test_page_shows_the_schedule() -> None:
 def test_each_turn_is_used_by_the_solver() -> None:
     code = "".join(p.read_text() for p in SOLVER.rglob("*.py") if p.name != "schedule.py")
     used = set(re.findall(r'["\']([a-zA-Z ,]+)["\']', code))
+    beams = {f"beam of {width}" for width in WIDTHS}
     untimed = {"greedy merging", "mending", "exact search", "reserve"}  # they take what is left
-    assert set(TURNS) <= used | untimed
+    assert set(TURNS) <= used | beams | untimed
     assert len(TURNS) == sum(map(len, TABLE.values()))
 
 

@@ -113,10 +113,22 @@ WEIGHED = (
         until=0.5,
     ),
     SourceTurn(
-        "beams",
-        "up to 2,000 steps, unless single drives were joined: a beam of 1, then one of 4",
-        "The first finds most true maps. The second nearly always ends with the best map.",
+        "beam of 1",
+        "up to 2,000 steps, unless single drives were joined",
+        "It finds most true maps.",
+        until=0.7,
+    ),
+    SourceTurn(
+        "beam of 4",
+        "the same",
+        "A map that a broad beam ends with is nearly always the best one.",
         until=0.6,
+    ),
+    SourceTurn(
+        "beam of 16",
+        "one drive on one floor",
+        "With several drives or floors, a beam of 4 keeps as many hypotheses.",
+        until=0.7,
     ),
     SourceTurn(
         "beams of logs",

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Set
 from contextlib import suppress
+from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
@@ -26,12 +27,12 @@ from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.theory.prior import spreads_of
 
-# A beam of this width nearly always ends with the map of least cost.
-BROAD = 4
 # The numbers of hypotheses of the beams, in their order.
-WIDTHS = (1, BROAD)
+WIDTHS = (1, 4, 16)
 # A map costs at most TRIED nats more than the best one, if its closures may be explained better.
 TRIED = 20.0
+# A beam of this width or more nearly always ends with the map of least cost.
+BROAD = 4
 
 
 class Beams:
@@ -63,6 +64,7 @@ class Beams:
         self.broken = -math.inf
         self._ended: Beam | None = None  # the widest beam that ended
         self._whole: Set[int] | None = None  # the closures of a beam that dropped nothing
+        self._first = math.inf  # the time of the first beam
         self._has_joined = False  # whether the maps of single drives gave a map
 
     def found(self, nats: float) -> bool:
@@ -81,25 +83,33 @@ class Beams:
         If the first beam finds no map, `clashes` returns whether a short proof shows that the trace
         has none.
         """
-        theory, beams = self._parts.task.theory, turn("beams")
+        theory = self._parts.task.theory
+        most = 1.0
         if theory.jumped:
-            beams = turn("beams with wrong displacements")
+            most = turn("beams with wrong displacements").until
         elif self._is_log:
-            beams = turn("beams of logs")
+            most = turn("beams of logs").until
+        # With several drives or floors, a broad beam keeps as many hypotheses as a wider one.
+        several = bool(theory.several_drives or theory.lifts)
+        widths = [width for width in WIDTHS if width <= BROAD or not several]
 
         def beam(width: int) -> Source:
+            own = turn(f"beam of {width}")
+            limited = replace(own, until=min(own.until, most))
             return Source(
-                beams,
-                # A beam that dropped nothing has all hypotheses, so no wider one is needed.
-                lambda: not self._has_joined and self._whole != self._believed(),
+                limited,
+                lambda: (
+                    not self._has_joined
+                    and self._is_time_for(width, widths[-1], limited.work(self._parts.watch))
+                ),
                 lambda: self._search(width, clashes),
             )
 
         return [
             Source(turn("smoothing"), lambda: True, self._smooth),
             Source(turn("false closures"), self._doubts_closures, self._sort_closures),
-            Source(turn("joint drives"), lambda: bool(theory.several_drives), self._join),
-            *map(beam, WIDTHS),
+            Source(turn("joint drives"), lambda: several, self._join),
+            *map(beam, widths),
             Source(
                 turn("beam without axioms"),
                 lambda: self._best[1] < math.inf and math.isinf(self.broken),
@@ -140,9 +150,20 @@ class Beams:
         trusts = self._is_log and len(self._believed()) == len(closures)
         return bool(closures) and not trusts
 
+    def _is_time_for(self, width: int, last: int, left: float) -> bool:
+        """Whether to search with this beam. If only one of both has time, the last one goes first.
+
+        A beam that dropped nothing has all hypotheses, so no wider one is needed. A beam of width n
+        takes about n times as long as the first one.
+        """
+        if self._whole == self._believed():
+            return False
+        slack = left - last * self._first
+        return width == last or not 0 < slack < width * self._first
+
     def _search(self, width: int, clashes: Callable[[], bool]) -> None:
         """Search with one beam. If no beam has ended in time, extend what this one has."""
-        parts, believed = self._parts, self._believed()
+        parts, began, believed = self._parts, self._parts.watch.elapsed(), self._believed()
         if (beam := parts.candidates.beam(width, believed)) is None:
             return
         try:
@@ -151,8 +172,10 @@ class Beams:
         except StageTimeError:
             if not self._ended:
                 parts.candidates.go_on(beam)
-        if width < BROAD and self._nats() == math.inf and not parts.known.best and clashes():
-            parts.known.status = Status.UNSATISFIABLE
+        if self._first == math.inf:
+            if self._nats() == math.inf and not parts.known.best and clashes():
+                parts.known.status = Status.UNSATISFIABLE
+            self._first = parts.watch.elapsed() - began
 
     def _finish(self, beam: Beam, width: int) -> None:
         """Keep the maps that a beam ends with. Raises StageTimeError if it does not end in time."""

@@ -175,6 +175,14 @@ def apart_matrix(pairs: Earlier, steps: int) -> Matrix:
     return flags
 
 
+def large_clique(apart: Matrix) -> list[int]:
+    """Grow a clique greedily from each node of a small graph, and return the largest, sorted."""
+    random = np.random.default_rng(0)
+    found = [grown_clique(apart, [node], random) for node in range(len(apart))]
+    largest: list[int] = max(found, key=len, default=[])
+    return sorted(largest)
+
+
 def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
     """Find a large clique: a list of segments, places or steps that are pairwise distinct.
 
@@ -185,10 +193,7 @@ def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) 
     rivals = np.zeros((len(members), len(members)), dtype=bool)
     for g, h in pairs:
         rivals[number[g], number[h]] = rivals[number[h], number[g]] = g != h
-    random = np.random.default_rng(0)
-    found = [grown_clique(rivals, [node], random) for node in range(len(rivals))]
-    largest: list[int] = max(found, key=len, default=[])
-    return [members[i] for i in sorted(largest)]
+    return [members[i] for i in large_clique(rivals)]
 
 
 def grown_clique(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:

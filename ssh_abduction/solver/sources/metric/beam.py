@@ -15,7 +15,7 @@ the cost.
 Each step extends each hypothesis in all ways that cost little: the robot is at a known dstate, at a
 new dstate of a known place, or at a new place. If faults are allowed, the action may have slipped,
 the displacement may be wrong, and the view may be misread, each at its price. The *beam* is the
-hypotheses of least cost. The checker checks them every few steps. So a
+hypotheses of least cost, and some with other places. The checker checks them every few steps. So a
 hypothesis that breaks an axiom does not crowd out others for long.
 
 Reference:
@@ -56,6 +56,10 @@ from ssh_abduction.theory.settle import Problem
 CHECKED_EVERY = 8
 # If no hypothesis is left, search again with a beam that is this many times as wide.
 WIDER = 2
+# Most hypotheses of a beam differ only in dstates at the same places. So a beam wider than NARROW
+# also keeps the cheapest ones with other places, as many as the share OTHERS of its width. These
+# may crowd out others later, so each kind of beam finds maps that the other one drops.
+OTHERS, NARROW = 0.25, 4
 # With several drives or floors, it is open how they are joined. So keep up to LOST * ALIKE
 # hypotheses. At most ALIKE of them join the drives or floors in the same way. Check the beam at
 # once if it has more than CROWDED times its width, so that false joins do not crowd out true ones.
@@ -250,7 +254,7 @@ class Extending:
         for option in sorted(options, key=lambda option: option.nats):
             if kept and option.nats > kept[0].nats + self.sights.dearest:
                 break
-            if self._is_allowed(option, t):
+            if self._is_allowed(option, t) and self._may_go_on(option, t):
                 kept.append(option)
         return kept
 
@@ -279,6 +283,13 @@ class Extending:
             return self._log.pairs.allow(t, [*labels, option.dstate], places)
         place = len(option.of.position) if option.place is None else option.place
         return self._log.pairs.allow(t, [*labels, len(places)], [*places, place])
+
+    def _may_go_on(self, option: Extension, t: int) -> bool:
+        """Whether the next displacements agree with the links of the dstate of an option."""
+        if option.dstate is None or "slipped" in self.fault or "jumped" in self.fault:
+            return True
+        actions = self._log.actions
+        return self.reckoning.square_ahead(option.of, t, option.dstate, actions) <= 2 * DEAREST
 
     def _misread(self, found: Hypothesis, dstate: int, t: int) -> float:
         """Return by how many nats the cost of misread views grows if step t is at a dstate."""
@@ -422,7 +433,7 @@ class Beam:
     def _best(
         self, options: Sequence[Extension], t: int, width: int, checked: bool = False
     ) -> Iterator[Hypothesis]:
-        """Yield the hypotheses to keep: the `width` cheapest.
+        """Yield the hypotheses to keep: the `width` cheapest, then some with other places.
 
         With several drives or floors, keep at most ALIKE hypotheses that connect the drives or
         floors in the same way, and at most LOST * ALIKE in all. Drop those that cost at least
@@ -431,18 +442,19 @@ class Beam:
         `options` are ways to extend the beam by step t, sorted by cost. If `checked`, drop what the
         checker refuses.
         """
-        most, several = width, self._has_frames
+        most, several = width + int(OTHERS * width * (width > NARROW)), self._has_frames
         if several:
             width, most = min(width, ALIKE), LOST * min(width, ALIKE)
         count: Counter[tuple[object, ...]] = Counter()
+        known: set[tuple[object, ...]] = set()  # faults, and the place of each step
         kept, dearest = [0, 0], [math.inf, math.inf]  # by whether the present piece is joined
         for option in options:
             found, joined = option.of, not option.of.pieces.is_loose
-            if (
-                kept[joined] >= most
-                or option.nats > dearest[joined]
-                or count[found.pieces.joins] >= width
-            ):
+            if kept[joined] >= most or option.nats > dearest[joined]:
+                self.drops = True
+                continue
+            at = found.faults, option.place, *map(found.places.__getitem__, found.labels.values())
+            if count[found.pieces.joins] >= width and (several or at in known):
                 self.drops = True
                 continue
             child = self._extending.extended(option, t)
@@ -450,6 +462,7 @@ class Beam:
                 child = self._settled([child])[0]
             if checked and self._map(child, t) is None:
                 continue
+            known.add(at)
             count[found.pieces.joins] += 1
             kept[joined] += 1
             if several and kept[joined] == 1:

@@ -51,6 +51,8 @@ UNKNOWN = (1e3, 1e3, 3.0)
 # If the standard deviation of the sum of all turns exceeds this, in radians, linear equations are
 # too rough: if the robot drives on for 10 m, they miss its position by about 0.5 m.
 ROUGH = 0.3
+# Displacements of at most this many next steps are compared with the links of a hypothesis.
+AHEAD = 16
 # The indices of the first entries of the means of a drive: the errors of the scale and of the drift
 # of the odometry, in standard deviations.
 SCALE, BEND = 0, 1
@@ -318,8 +320,9 @@ class HypothesisPoses:
         spreads = spreads_of(trace)
         self._is_off = bool(spreads.any())
         turns = np.array([noise[2, 2] for noise in self._noise.values()])
-        is_long = math.sqrt(turns.sum()) > ROUGH
-        self.is_rough = not self._is_off and is_long if self._frames else self._is_off
+        self.is_rough = self._is_off
+        if self._frames:
+            self.is_rough = not self._is_off and math.sqrt(turns.sum()) > ROUGH
         self._spreads = spreads + BLUR
 
     def moved(self, found: Hypothesis, t: int, believes: bool = True) -> Hypothesis:
@@ -358,6 +361,8 @@ class HypothesisPoses:
             pieces=replace(found.pieces, here=piece),
         )
         for closure in self._closures.get(t, ()):
+            if closure.first >= len(moved.labels):  # only in `square_ahead`
+                continue
             turned = closed(moved, moved.labels[closure.first], closure.displacement[2])
             moved = self._closed(turned, closure)
         return moved
@@ -440,6 +445,23 @@ class HypothesisPoses:
         squares: Array = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[..., None])[..., 0])
         most = self._prior.predicted(t, len(last))
         return squares, squares / 2 + most - self._prior.gain(spread)
+
+    def square_ahead(self, moved: Hypothesis, t: int, dstate: int, actions: Sequence[int]) -> float:
+        """Compute the largest chi-square of the next steps if step t is at a known dstate.
+
+        An action at a dstate always leads to the same dstate. So links say where the next steps
+        are, until a link is not known. `moved` is a hypothesis after the move to step t.
+        `actions` has a number for each action of the trace.
+        """
+        largest = 0.0
+        for k in range(t + 1, min(t + 1 + AHEAD, len(self._trace))):
+            there = moved.links.get((dstate, actions[k - 1]))
+            if there is None or self._trace.steps[k].displacement is None:
+                break
+            moved, dstate = self.moved(moved, k), there
+            squares, _ = self.squares(moved, k, [moved.places[dstate]])
+            largest = max(largest, float(squares[0]))
+        return largest
 
     def met(
         self, moved: Hypothesis, t: int, position: int | None, heading: int | None
