@@ -31,11 +31,10 @@ from table import OURS, WITHOUT
 
 from ssh_abduction import Solution, Theory, Trace
 from ssh_abduction.checker.checker import check
-from ssh_abduction.runtime import clock
+from ssh_abduction.runtime import clock, limits
+from ssh_abduction.runtime.limits import peak_memory
 from ssh_abduction.solution import Status
 from ssh_abduction.solver import Search
-from ssh_abduction.solver.asp import limits
-from ssh_abduction.solver.asp.limits import peak_memory
 from ssh_abduction.theory import Speedups
 
 AROUND = 300  # seconds for what the clock does not count, before and after

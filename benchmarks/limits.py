@@ -38,8 +38,8 @@ from instances import maze, moore, rectangle
 
 from ssh_abduction import Trace, solve
 from ssh_abduction.robot_logs.log_maps import BARE, MAPS
+from ssh_abduction.runtime import limits
 from ssh_abduction.solver import search
-from ssh_abduction.solver.asp import limits
 
 TIME, MEMORY = (
     (1.2, 1.0),

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ssh_abduction.runtime import workers
-from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.runtime.limits import Watch
 
 
 def modules_from(folder: str) -> list[str]:

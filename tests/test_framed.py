@@ -19,12 +19,12 @@ from ssh_abduction.checker.claims import check_bound
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.step import QUARTERS, Action
 from ssh_abduction.online.keeper import MapKeeper
+from ssh_abduction.runtime.limits import LimitError, Watch
 from ssh_abduction.solution import Status
 from ssh_abduction.solver import Search, Start
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.facts import number_symbols
-from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.sources.exact import choosing, engine, fitting, labels_first
 from ssh_abduction.solver.sources.exact import visit_labels as same
 from ssh_abduction.solver.sources.exact.fitting import Fitting

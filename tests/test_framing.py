@@ -12,9 +12,8 @@ from strategies import theories, traces
 from turns import stepwise
 
 from ssh_abduction import Theory, check, solve
+from ssh_abduction.runtime.limits import StageTimeError, Watch
 from ssh_abduction.solution import Status
-from ssh_abduction.solver import Watch
-from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.sources.exact import choosing
 from ssh_abduction.solver.sources.exact.labels_first import maps_with_frames
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes

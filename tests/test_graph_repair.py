@@ -20,7 +20,7 @@ from ssh_abduction.explain.graph_repair import (
     read_moves,
     repair,
 )
-from ssh_abduction.solver import Watch
+from ssh_abduction.runtime.limits import Watch
 
 OPPOSITE = {"north": "south", "east": "west", "up": "down", "southwest": "northeast"}
 OPPOSITE |= {b: a for a, b in OPPOSITE.items()}

@@ -38,10 +38,10 @@ from ssh_abduction.explain import explain_pair, explain_trace
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.runtime import workers
+from ssh_abduction.runtime.limits import LimitError, Watch, peak_memory
 from ssh_abduction.solution import Status
 from ssh_abduction.solver import Search, check_rules, find_backbone
 from ssh_abduction.solver.asp.control import Control
-from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.theory.encodings import Rules
 from ssh_abduction.theory.own_rules import EXAMPLE

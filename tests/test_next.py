@@ -17,7 +17,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import DState, MapError, MapPath, Odometry, SolverError
 from ssh_abduction.rivals.explore import Experiment, ExperimentPlan
 from ssh_abduction.rivals.machines import Consequences, Seen, leads_of
-from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.runtime.limits import Watch
 
 ROOT = Path(__file__).parent.parent
 ACES = str(ROOT / "examples" / "aces3-route.jsonl")

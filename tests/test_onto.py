@@ -24,10 +24,10 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Action, Corrections, Odometry, load_corrections
 from ssh_abduction.data.drives import starts_of, together
 from ssh_abduction.data.errors import SolverError, TraceError
+from ssh_abduction.runtime.limits import Watch
 from ssh_abduction.solution import Status
 from ssh_abduction.solution.values import Cost
 from ssh_abduction.solver import onto as added_drives
-from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.onto import Digest
 from ssh_abduction.solver.sources.exact import choosing
 from ssh_abduction.theory import Speedups

@@ -35,8 +35,8 @@ from ssh_abduction.page.content import ALPHABET, DRAWN, LOST, beams_of, content_
 from ssh_abduction.page.html import Page
 from ssh_abduction.page.server import PageServer
 from ssh_abduction.rivals import Listing
+from ssh_abduction.runtime.limits import Watch
 from ssh_abduction.runtime.workers import _under_way
-from ssh_abduction.solver import Watch
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ROUTE = EXAMPLES / "aces3-route.jsonl"

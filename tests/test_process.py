@@ -14,8 +14,7 @@ from unittest.mock import patch
 import pytest
 
 from ssh_abduction.runtime.clock import POLL
-from ssh_abduction.solver import in_process
-from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
+from ssh_abduction.runtime.limits import LimitError, Watch, in_process, peak_memory
 
 
 def double_and_tell_where(values: list[int], watch: Watch) -> tuple[list[int], int]:
@@ -131,8 +130,8 @@ def test_process_ends_with_its_parent(tmp_path: Path) -> None:
     path = tmp_path / "written"
     program = f"""
 from pathlib import Path
-from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver import in_process
+from ssh_abduction.runtime.limits import Watch
+from ssh_abduction.runtime.limits import in_process
 from test_process import write_again_and_again
 in_process(write_again_and_again, Path({str(path)!r}), watch=Watch())
 """

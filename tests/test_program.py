@@ -22,8 +22,7 @@ from ssh_abduction import Solution
 from ssh_abduction.cli import main
 from ssh_abduction.robot_logs.log_maps import LogMapping
 from ssh_abduction.runtime import program, workers
-from ssh_abduction.solver import in_process
-from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.runtime.limits import Watch, in_process
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="sends signals, which Windows has none of")
 SOON = 60  # seconds, enough on a slow and busy machine

@@ -11,7 +11,7 @@ from schedule_table import PAGE, page
 from turns import turn_with
 
 import ssh_abduction.solver
-from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.runtime.limits import Watch
 from ssh_abduction.solver.costs.beams import WIDTHS
 from ssh_abduction.solver.schedule import TABLE, TURNS, turn
 

@@ -33,11 +33,11 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.learning.learner import BootstrapLearner
+from ssh_abduction.runtime.limits import LimitError, Watch
 from ssh_abduction.solution import Progress, Status
 from ssh_abduction.solution.values import Found
 from ssh_abduction.solver import Search
 from ssh_abduction.solver import search as search_module
-from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.sources.exact import labels_first, prefixes, readable
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.labels_first import LabelsFirst

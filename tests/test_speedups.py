@@ -24,10 +24,10 @@ from turns import stepwise
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import SolverError
+from ssh_abduction.runtime.limits import LimitError
 from ssh_abduction.solution import Status
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.sources.exact import choosing, labels_first, names
 from ssh_abduction.solver.sources.exact import names as named
 from ssh_abduction.solver.sources.symbolic.merging import merged

@@ -15,8 +15,8 @@ from turns import STEPWISE, stepwise
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.runtime.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.solver import search
-from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.solver.sources.exact import choosing, prefixes
 from ssh_abduction.solver.sources.exact.engine import Task
 from ssh_abduction.solver.sources.exact.prefixes import Prefixes

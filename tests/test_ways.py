@@ -18,10 +18,10 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.claims import check_bound
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.limits import LimitError, Watch
 from ssh_abduction.solution import Status
 from ssh_abduction.solver import Search, Start
 from ssh_abduction.solver.asp.facts import most_paths
-from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.sources.exact import choosing, names
 from ssh_abduction.solver.sources.exact.engine import Task

@@ -28,11 +28,11 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Closure, MapError, Odometry, SolverError, TheoryError, together
 from ssh_abduction.data.drives import Drive
 from ssh_abduction.data.schema import FieldReader
+from ssh_abduction.runtime.limits import LimitError
 from ssh_abduction.solution import Status
 from ssh_abduction.solution.values import Found
 from ssh_abduction.solution.weighed import Rival, Weighed
 from ssh_abduction.solver import Search
-from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.costs import beams, weighing
 from ssh_abduction.solver.costs.estimating import estimated, rivals_of
 from ssh_abduction.solver.costs.misfit import Misfit

@@ -17,8 +17,8 @@ from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.runtime.clock import CONFLICT, counting, look_at_clock, now, work_done
+from ssh_abduction.runtime.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.solver.asp.control import Asker
-from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
 
 ROUTE = Path(__file__).parent.parent / "examples" / "aces3-route.jsonl"
 COSTS = Theory.topological().replace(weigh="cost")

@@ -11,6 +11,7 @@ from ssh_abduction.cli import shared
 from ssh_abduction.cli.outcome import EXIT_UNPROVEN, Guard, on_ctrl_c, warn
 from ssh_abduction.cli.parsing import maps_path, verb
 from ssh_abduction.cli.text import compared, counted, depending, table
+from ssh_abduction.data.checks import check_limit
 from ssh_abduction.data.errors import MapError, brief, named, printable, said_of
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_parts import read_json
@@ -18,9 +19,9 @@ from ssh_abduction.data.schema import attributes_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.rivals.listing import DrivePair, Listing, joins_of_drives
+from ssh_abduction.runtime.limits import Watch
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solution import stretches
-from ssh_abduction.solver import Watch, check_limit
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

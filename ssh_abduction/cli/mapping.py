@@ -30,6 +30,7 @@ from ssh_abduction.cli.outcome import (
 )
 from ssh_abduction.cli.parsing import verb
 from ssh_abduction.cli.text import counted
+from ssh_abduction.data.checks import check_limit
 from ssh_abduction.data.corrections import (
     ASSERTIONS,
     Corrections,
@@ -45,7 +46,6 @@ from ssh_abduction.runtime import workers
 from ssh_abduction.runtime.loggers import begin_stage, stages
 from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solution import Solution, Stop
-from ssh_abduction.solver import check_limit
 from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:

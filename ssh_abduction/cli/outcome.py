@@ -36,11 +36,12 @@ from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.learning.runner_up import second_map
 from ssh_abduction.runtime import program
 from ssh_abduction.runtime.clock import POLL, STARVED, counting
+from ssh_abduction.runtime.limits import WAITING, Watch, processor_clock, resident_memory
 from ssh_abduction.runtime.loggers import PACKAGE, PROGRESS
 from ssh_abduction.runtime.workers import end_all
 from ssh_abduction.solution import Cost, Solution, Status, Stop
 from ssh_abduction.solution import ending as written_ending
-from ssh_abduction.solver import WAITING, Search, Watch, processor_clock, resident_memory
+from ssh_abduction.solver import Search
 
 Given: TypeAlias = tuple[SSHMap, Cost | None]
 

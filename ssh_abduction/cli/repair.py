@@ -28,8 +28,9 @@ def run_repair(options: argparse.Namespace) -> int:
 
     Exit codes: 0 done; 10 with --strict, if a limit ended the search.
     """
+    from ssh_abduction.data.checks import check_limit
     from ssh_abduction.explain.graph_repair import Repairs, read_moves, repair  # loads clingo
-    from ssh_abduction.solver import Watch, check_limit
+    from ssh_abduction.runtime.limits import Watch
 
     if options.most < 1:
         raise MapError(f"most: expected 1 or more, got {options.most}; leave it out for 20")

@@ -28,6 +28,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from ssh_abduction.data.errors import (
     AbductionError,
+    SolverError,
     TraceError,
     brief,
     is_finite,
@@ -142,6 +143,19 @@ def a_text(name: str, value: object, error: Kind, *, mend: str = "give a text") 
     if isinstance(value, str):
         return value
     raise error(f"{name}: expected a text, got {brief(value)}; {mend}")
+
+
+def check_limit(name: str, unit: str, limit: object) -> None:
+    """Raise SolverError if a limit is neither None nor a number above 0. Name it and its unit."""
+    if (
+        limit is not None
+        and not (is_finite(limit) and limit > 0)
+        and not (isinstance(limit, float) and limit == math.inf)
+    ):
+        raise SolverError(
+            f"{name}: expected a number of {unit} above 0, got {brief(limit)}; "
+            "leave it out for no limit"
+        )
 
 
 def one_of(

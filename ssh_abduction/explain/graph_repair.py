@@ -27,8 +27,9 @@ from ssh_abduction.data.groups import minimal_part
 from ssh_abduction.data.map_parts import read_json
 from ssh_abduction.data.words import meant
 from ssh_abduction.runtime.clock import counting
+from ssh_abduction.runtime.limits import LimitError, Watch
 from ssh_abduction.solution import Stop
-from ssh_abduction.solver import Asker, Control, LimitError, Watch
+from ssh_abduction.solver import Asker, Control
 from ssh_abduction.theory import encodings
 
 ENCODING = "repair"

@@ -22,7 +22,7 @@ from itertools import chain, count, groupby
 from operator import itemgetter
 from typing import Any, Generic, TypedDict, TypeVar
 
-from ssh_abduction.data.checks import a_whole_number
+from ssh_abduction.data.checks import a_whole_number, check_limit
 from ssh_abduction.data.corrections import ASSERTIONS
 from ssh_abduction.data.drives import drives_of, named_steps
 from ssh_abduction.data.errors import AbductionError, TheoryError, TraceError
@@ -32,8 +32,9 @@ from ssh_abduction.data.schema import PlainData, attributes_of
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace
 from ssh_abduction.data.words import noun_of
 from ssh_abduction.explain.axioms import Axioms, Interrupted, Piece
+from ssh_abduction.runtime.limits import LimitError, Watch
 from ssh_abduction.solution import Progress, Status, Stop
-from ssh_abduction.solver import LimitError, Search, Start, Watch, check_limit, check_rules
+from ssh_abduction.solver import Search, Start, check_rules
 from ssh_abduction.theory.settle import displacement_of, settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 

@@ -44,7 +44,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeAlias
 
-from ssh_abduction.data.checks import a_function, a_whole_number
+from ssh_abduction.data.checks import a_function, a_whole_number, check_limit
 from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.groups import firsts
 from ssh_abduction.data.maps import SSHMap
@@ -57,7 +57,7 @@ from ssh_abduction.rivals.explore import next_experiment
 from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.rivals.tour import next_tour
 from ssh_abduction.solution import Solution, Status
-from ssh_abduction.solver import check_limit, find_backbone, solve
+from ssh_abduction.solver import find_backbone, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # If nothing is left to do but the map is not proven minimal, solve the trace with a time limit that

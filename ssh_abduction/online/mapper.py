@@ -68,13 +68,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from ssh_abduction.data.checks import check_limit
 from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
 from ssh_abduction.data.words import counted
 from ssh_abduction.online.keeper import MapKeeper, StepOptions
 from ssh_abduction.solution import Solution
-from ssh_abduction.solver import check_limit, preload_engine
+from ssh_abduction.solver import preload_engine
 from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.theory.fields import choice
 from ssh_abduction.theory.settle import Problem, count_returns, settle

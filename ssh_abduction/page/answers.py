@@ -11,8 +11,9 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.pair_reasons import explain_pair
 from ssh_abduction.explain.verdict import PairExplanation
+from ssh_abduction.runtime.limits import Watch
 from ssh_abduction.solution import Solution
-from ssh_abduction.solver import Search, Start, Watch
+from ssh_abduction.solver import Search, Start
 from ssh_abduction.theory.theory import Theory
 
 Pair = tuple[int, int]

@@ -33,7 +33,7 @@ from ssh_abduction.page import answers
 from ssh_abduction.page.content import Called, Ground, Run, content_of
 from ssh_abduction.page.html import html_of
 from ssh_abduction.rivals.listing import Listing, Maps, PairInMap
-from ssh_abduction.solver import LimitError, Watch, in_process
+from ssh_abduction.runtime.limits import LimitError, Watch, in_process
 from ssh_abduction.theory.theory import Theory
 
 LARGEST = 100_000  # bytes of a question

@@ -53,7 +53,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.data.checks import a_flag, a_function, a_list, an_instance
+from ssh_abduction.data.checks import a_flag, a_function, a_list, an_instance, check_limit
 from ssh_abduction.data.errors import MapError, printable
 from ssh_abduction.data.groups import gathered, indices_of
 from ssh_abduction.data.maps import SSHMap, check_of_trace
@@ -76,8 +76,8 @@ from ssh_abduction.rivals.machines import (
     machine_of,
     with_ends,
 )
+from ssh_abduction.runtime.limits import LimitError, Watch
 from ssh_abduction.solution import Solution, Stop
-from ssh_abduction.solver import LimitError, Watch, check_limit
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 

@@ -39,7 +39,8 @@ from ssh_abduction.data.star import Star, star_to_json
 from ssh_abduction.data.step import QUARTERS
 from ssh_abduction.data.trace import Action, Trace, View
 from ssh_abduction.data.words import counted
-from ssh_abduction.solver import Watch, observation
+from ssh_abduction.runtime.limits import Watch
+from ssh_abduction.solver import observation
 from ssh_abduction.theory.evidence.of_steps import are_alike
 from ssh_abduction.theory.fields import IN_TOLERANCE
 from ssh_abduction.theory.settle import settle

@@ -41,8 +41,8 @@ from ssh_abduction.data.groups import first_index_of, indices_of
 from ssh_abduction.data.odometry import Pose, displacement_between, moved
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.data.words import counted
+from ssh_abduction.runtime.limits import LimitError, Watch, in_process
 from ssh_abduction.solution import Solution
-from ssh_abduction.solver import LimitError, Watch, in_process
 
 NAMES = "drive.names"
 FORMAT, VERSION, MOST = "ssh-live-names", 2, 2**26

@@ -10,6 +10,7 @@ from ssh_abduction.runtime.lazy import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
+    from ssh_abduction.runtime.limits import Stop as Stop
     from ssh_abduction.solution.certificate import RESTS_ON as RESTS_ON
     from ssh_abduction.solution.certificate import Certificate as Certificate
     from ssh_abduction.solution.corrected import obeyed as obeyed
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solution.values import Progress as Progress
     from ssh_abduction.solution.values import Seconds as Seconds
     from ssh_abduction.solution.values import Status as Status
-    from ssh_abduction.solution.values import Stop as Stop
     from ssh_abduction.solution.values import cost_as_counted as cost_as_counted
     from ssh_abduction.solution.weighed import EQUAL as EQUAL
     from ssh_abduction.solution.weighed import Weighed as Weighed

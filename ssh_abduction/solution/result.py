@@ -34,6 +34,7 @@ from ssh_abduction.data.schema import FieldReader, plain
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.output import cards
+from ssh_abduction.runtime.limits import Stop
 from ssh_abduction.solution.certificate import Certificate
 from ssh_abduction.solution.recorded import (
     Support,
@@ -52,7 +53,6 @@ from ssh_abduction.solution.values import (
     Level,
     Seconds,
     Status,
-    Stop,
     cost_as_counted,
 )
 from ssh_abduction.solution.weighed import Weighed

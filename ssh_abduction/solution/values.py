@@ -5,16 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.words import counted, shortly
 from ssh_abduction.theory.theory import Theory, checked_theory
-
-# Why a search ended before it had done all that it could.
-Stop: TypeAlias = Literal[
-    "work limit", "time limit", "memory limit", "interrupted", "maps limit", "no proof"
-]
 
 
 class Status(Enum):

@@ -15,13 +15,6 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.asp.control import Control as Control
     from ssh_abduction.solver.asp.control import new_control as new_control
     from ssh_abduction.solver.asp.kept_rules import check_rules as check_rules
-    from ssh_abduction.solver.asp.limits import WAITING as WAITING
-    from ssh_abduction.solver.asp.limits import LimitError as LimitError
-    from ssh_abduction.solver.asp.limits import Watch as Watch
-    from ssh_abduction.solver.asp.limits import check_limit as check_limit
-    from ssh_abduction.solver.asp.limits import in_process as in_process
-    from ssh_abduction.solver.asp.limits import processor_clock as processor_clock
-    from ssh_abduction.solver.asp.limits import resident_memory as resident_memory
     from ssh_abduction.solver.board import InternalError as InternalError
     from ssh_abduction.solver.board import Judging as Judging
     from ssh_abduction.solver.costs.estimating import maps_apart as maps_apart

@@ -16,7 +16,8 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import now
-from ssh_abduction.solution.values import Bound, Cost, Found, Status, Stop, cost_as_counted
+from ssh_abduction.runtime.limits import Stop
+from ssh_abduction.solution.values import Bound, Cost, Found, Status, cost_as_counted
 from ssh_abduction.solver.asp.kept_rules import can_be_asked, keeps_own_rules
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem

@@ -17,10 +17,10 @@ from ssh_abduction.checker.checker import violations
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import STARVED, heeding
+from ssh_abduction.runtime.limits import LimitError, Watch, processor_clock
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solution.values import Found
 from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.limits import LimitError, Watch, processor_clock
 from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.schedule import turn
 from ssh_abduction.solver.sources.exact.engine import Task

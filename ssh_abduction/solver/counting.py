@@ -11,9 +11,9 @@ from collections.abc import Generator, Iterator
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import each_looking
+from ssh_abduction.runtime.limits import LimitError, StageTimeError
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solution.values import Found, Status
-from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.parts import Parts, Priced
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.sources.exact import prefixes

@@ -19,12 +19,12 @@ from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import SSHMap, check_of_trace
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.clock import counting
+from ssh_abduction.runtime.limits import Watch
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solution.corrected import obeyed, with_correction_warnings, with_names
 from ssh_abduction.solution.result import Solution
 from ssh_abduction.solution.sharing import Backbone
 from ssh_abduction.solution.values import Progress
-from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.onto import Solving, joint_with, solve_onto
 from ssh_abduction.solver.parts import Limits, Start
 from ssh_abduction.solver.search import Search

@@ -39,11 +39,11 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.step import Action, Step
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding
+from ssh_abduction.runtime.limits import EARLY, LimitError, Stop, Watch
 from ssh_abduction.solution.recorded import Support
 from ssh_abduction.solution.result import Solution
-from ssh_abduction.solution.values import Bound, Cost, Effort, Level, Seconds, Status, Stop
+from ssh_abduction.solution.values import Bound, Cost, Effort, Level, Seconds, Status
 from ssh_abduction.solution.weighed import IMPROBABLE, Rival, Weighed
-from ssh_abduction.solver.asp.limits import EARLY, LimitError, Watch
 from ssh_abduction.solver.board import Judging
 from ssh_abduction.solver.costs.estimating import may_join_more, rival_of, rivals_of
 from ssh_abduction.solver.derived_regions import Deriving

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
-from ssh_abduction.data.checks import a_count_of_maps, a_flag
+from ssh_abduction.data.checks import a_count_of_maps, a_flag, check_limit
 from ssh_abduction.data.errors import SolverError, brief, is_whole
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
+from ssh_abduction.runtime.limits import Stop, Watch
 from ssh_abduction.runtime.loggers import PROGRESS, log_progress
 from ssh_abduction.solution.recorded import Support
 from ssh_abduction.solution.result import Solution
@@ -25,11 +26,9 @@ from ssh_abduction.solution.values import (
     Progress,
     Seconds,
     Status,
-    Stop,
     cost_as_counted,
 )
 from ssh_abduction.solver.asp.kept_rules import never_true
-from ssh_abduction.solver.asp.limits import Watch, check_limit
 from ssh_abduction.solver.board import Judging, Known
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.geometry.ranking import in_order, noise_warning, units_warning

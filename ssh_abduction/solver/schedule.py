@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ssh_abduction.solver.asp.limits import RESERVE, Watch
+from ssh_abduction.runtime.limits import RESERVE, Watch
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,12 +33,12 @@ from ssh_abduction.runtime.clock import (
     heeding,
     now,
 )
+from ssh_abduction.runtime.limits import EARLY, LimitError, StageTimeError, Stop, Watch
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.runtime.threads import one_thread
 from ssh_abduction.solution.result import Solution
-from ssh_abduction.solution.values import Bound, Cost, Grounding, Progress, Status, Stop
+from ssh_abduction.solution.values import Bound, Cost, Grounding, Progress, Status
 from ssh_abduction.solver.asp.kept_rules import check_rules
-from ssh_abduction.solver.asp.limits import EARLY, LimitError, StageTimeError, Watch
 from ssh_abduction.solver.board import projected
 from ssh_abduction.solver.candidates import has_quick_map
 from ssh_abduction.solver.counting import Counting

@@ -25,9 +25,9 @@ from ssh_abduction.runtime.clock import (
     counts_work,
     now,
 )
+from ssh_abduction.runtime.limits import LimitError, Watch, peak_memory
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solution.values import Grounding
-from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.theory import encodings
 
 # After grounding, clasp prepares the program and cannot be stopped. This takes about these

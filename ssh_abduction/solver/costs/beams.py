@@ -17,9 +17,9 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.limits import StageTimeError
 from ssh_abduction.solution.values import Status
 from ssh_abduction.solution.weighed import EQUAL
-from ssh_abduction.solver.asp.limits import StageTimeError
 from ssh_abduction.solver.costs.estimating import dstates_and_places
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.parts import Parts

@@ -19,9 +19,9 @@ from ssh_abduction.data.drives import Drive, drive_of_steps, drives_of
 from ssh_abduction.data.groups import NodeClasses, gathered, indices_of, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import heeding, look_at_clock
+from ssh_abduction.runtime.limits import LimitError, Watch
 from ssh_abduction.solution.values import Cost
 from ssh_abduction.solution.weighed import Rival
-from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.sources.metric.completing import completed
 from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.theory.evidence.displacement import jumped

@@ -37,10 +37,10 @@ from ssh_abduction.data.groups import first_index_of, firsts
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.limits import LimitError
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solution.values import Cost, Found, Status
 from ssh_abduction.solution.weighed import EQUAL, IMPROBABLE, MOST, Rival, Weighed
-from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.board import Judging, Known, projected
 from ssh_abduction.solver.costs.beams import Beams
 from ssh_abduction.solver.costs.estimating import (

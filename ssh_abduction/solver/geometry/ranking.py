@@ -15,7 +15,7 @@ from typing import TypeAlias
 from ssh_abduction.data.maps import Fit, SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import heeding, look_at_clock
-from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.runtime.limits import LimitError, Watch
 from ssh_abduction.solver.steps.faults import with_compass
 from ssh_abduction.theory.evidence.displacement import jumped
 

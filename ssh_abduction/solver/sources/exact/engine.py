@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.limits import Watch
 from ssh_abduction.solution.values import Found
 from ssh_abduction.solver.asp.control import Asker
-from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem

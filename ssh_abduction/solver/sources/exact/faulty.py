@@ -52,11 +52,11 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.runtime.limits import Watch
 from ssh_abduction.solution.values import Found
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import number_symbols, read_atom
-from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.sources.exact.engine import Task, in_fixed_order
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.theory.evidence import Equality

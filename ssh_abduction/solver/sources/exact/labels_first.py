@@ -41,10 +41,10 @@ from itertools import chain, islice
 
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.limits import Watch
 from ssh_abduction.solution.values import Found
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
-from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Task, in_fixed_order
 from ssh_abduction.solver.sources.exact.fitting import Fitting
 from ssh_abduction.solver.sources.exact.names import NamedLabels

@@ -45,10 +45,10 @@ from clingo import Function, Model, Symbol
 
 from ssh_abduction.data.groups import numbered
 from ssh_abduction.runtime.clock import now
+from ssh_abduction.runtime.limits import LimitError
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, new_control
 from ssh_abduction.solver.asp.facts import number_symbols
-from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.sources.exact.engine import AT_ONCE, Task
 from ssh_abduction.solver.sources.exact.fitting import Member
 from ssh_abduction.solver.sources.symbolic.merging import merged

@@ -52,11 +52,11 @@ from dataclasses import replace
 
 from ssh_abduction.data.gateways import with_allowed_headings
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.limits import LimitError, StageTimeError
 from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solution.sharing import Backbone, Sharing
 from ssh_abduction.solution.values import Found, Status
 from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.board import Judging, Known
 from ssh_abduction.solver.sources.exact.engine import Engine, Task
 from ssh_abduction.solver.sources.exact.readable import StepEngine, paths_needed

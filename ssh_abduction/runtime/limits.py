@@ -8,11 +8,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TypeVar
+from typing import Literal, TypeAlias, TypeVar
 
-from ssh_abduction.data.errors import SolverError, brief, is_finite
 from ssh_abduction.runtime.clock import counting, counts_work, now, work_done
-from ssh_abduction.solution.values import Stop
 
 # A search that has found no map of the whole trace ends when this share of the time limit is left.
 # The rest of the time is for making a map without a search.
@@ -26,6 +24,10 @@ WAITING = 4.0
 MOST_CONFLICTS = 2**31 - 1
 
 Result = TypeVar("Result")
+# Why a search ended before it had done all that it could.
+Stop: TypeAlias = Literal[
+    "work limit", "time limit", "memory limit", "interrupted", "maps limit", "no proof"
+]
 # Reasons that end a search before it has done what it could. More of the same may give more.
 EARLY: tuple[Stop, ...] = ("work limit", "time limit", "interrupted")
 
@@ -47,19 +49,6 @@ def processor_clock(
         return max(processor() - used, (now() - began) / waiting)
 
     return clock
-
-
-def check_limit(name: str, unit: str, limit: object) -> None:
-    """Raise SolverError if a limit is neither None nor a number above 0. Name it and its unit."""
-    if (
-        limit is not None
-        and not (is_finite(limit) and limit > 0)
-        and not (isinstance(limit, float) and limit == math.inf)
-    ):
-        raise SolverError(
-            f"{name}: expected a number of {unit} above 0, got {brief(limit)}; "
-            "leave it out for no limit"
-        )
 
 
 class LimitError(Exception):
