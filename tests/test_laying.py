@@ -112,12 +112,12 @@ def test_laid_drive_is_joined_beyond_a_place_that_a_person_denies(kind: str) -> 
 def test_person_joins_the_pieces_of_the_existing_map(places: int) -> None:
     middle = places // 2
     begin, end = along(0, middle, "begin"), along(middle - 1, places, "end")
-    first = solve(begin, work_limit=0.3)
+    first = solve(begin, work_limit=1)
     apart = first.theory.replace(returns=0, different=[(middle - 1, middle)])
-    pieces = solve(end, apart, onto=first, work_limit=0.3)
+    pieces = solve(end, apart, onto=first, work_limit=1)
     assert len(pieces[0].pieces) == 2
     said = pieces.theory.replace(returns=0, different=(), same=[(middle - 1, middle)])
-    solution = solve(along(middle, places, "all"), said, onto=pieces, work_limit=0.3)
+    solution = solve(along(middle, places, "all"), said, onto=pieces, work_limit=1)
     assert (len(solution[0].dstates), len(solution[0].pieces)) == (places, 1)
 
 

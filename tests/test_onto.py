@@ -288,10 +288,10 @@ def test_onto_corrects_misread_views_of_the_map() -> None:
         [*"abcdefgh", *"abXdefgh", "a"], ["travel", "left"] * 8, displacements=moved, name="monday"
     )
     bare = Theory(star="none", boundary="none")
-    standing = solve(rounds, bare.replace(misread=0.9), work_limit=0.3)
+    standing = solve(rounds, bare.replace(misread=0.9), work_limit=1)
     assert [(fault.kind, fault.step) for fault in standing[0].faults] == [("misread", 10)]
     tuesday = Trace.from_steps("cde", ["travel", "left"], displacements=moved[:2], name="tuesday")
-    joint = solve(tuesday, onto=standing, work_limit=0.3)
+    joint = solve(tuesday, onto=standing, work_limit=1)
     assert joint.trace is not None
     assert joint.trace.steps[10].view == "c"
     assert joint[0].faults == ()

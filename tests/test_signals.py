@@ -28,9 +28,9 @@ from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c
 from ssh_abduction.robot_logs import log_maps
 from ssh_abduction.robot_logs.log_maps import LogMapping
-from ssh_abduction.runtime import program, workers
+from ssh_abduction.runtime import limits, program, workers
 from ssh_abduction.solver import Search
-from ssh_abduction.solver.asp import control, limits
+from ssh_abduction.solver.asp import control
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 SOON = 60  # seconds, enough on a slow and busy machine
