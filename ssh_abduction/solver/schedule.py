@@ -114,7 +114,7 @@ WEIGHED = (
     ),
     SourceTurn(
         "beam of 1",
-        "up to 2,000 steps, unless single drives were joined",
+        "up to 2,000 steps, unless joining drives gave one piece",
         "It finds most true maps.",
         until=0.7,
     ),

@@ -65,7 +65,7 @@ class Beams:
         self._ended: Beam | None = None  # the widest beam that ended
         self._whole: Set[int] | None = None  # the closures of a beam that dropped nothing
         self._first = math.inf  # the time of the first beam
-        self._has_joined = False  # whether the maps of single drives gave a map
+        self._has_joined = False  # whether the maps of single drives gave a map of one piece
 
     def found(self, nats: float) -> bool:
         """Whether a broad beam ended with a map of this cost, and `broken` is known.
@@ -125,10 +125,10 @@ class Beams:
     def _join(self) -> None:
         """Join the maps of single drives."""
         if (joining := self._parts.candidates.joining()) is not None:
-            maps = self._parts.candidates.maps_of(joining)
-            nats = min(map(self._add, maps), default=math.inf)
+            maps = {self._add(one): one for one in self._parts.candidates.maps_of(joining)}
+            nats = min(maps, default=math.inf)
             self._take(nats, -math.inf, joining.broken)
-            self._has_joined = nats < math.inf
+            self._has_joined = bool(maps) and len(maps[nats].pieces) == 1
 
     def _sort_closures(self) -> None:
         """Merge places under several explanations of the closures."""
