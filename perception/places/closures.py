@@ -164,7 +164,8 @@ class ClosureFinder:
 
     def _closings(self, asked: Sequence[_Gate], last: int) -> Iterator[VisitMatch]:
         """Match a visit with earlier ones, and yield the closures."""
-        keys = [(self._key(gate.first), self._key(last), gate.turns) for gate in asked]
+        own = self._key(last)
+        keys = [(self._key(gate.first), own, gate.turns) for gate in asked]
         known = {key: self._matches.pop(key) for key in keys if key in self._matches}
         if turns := [key[2] for key in keys if key not in known]:
             begin, end = min(some.start for some in turns), max(some.stop for some in turns)

@@ -36,8 +36,7 @@ Bools = NDArray[np.bool_]
 Cells = NDArray[np.int32]
 Cell = tuple[int, int]
 
-# A cell and its eight neighbours; and no cells.
-EIGHT, NO_CELLS = np.ones((3, 3), np.bool_), np.zeros(0, np.int32)
+NO_CELLS = np.zeros(0, np.int32)
 # Side of a cell in metres.
 CELL = 0.1
 # Beams are ignored beyond this many metres, as gaps between them grow too wide.

@@ -36,9 +36,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from perception.places.local_map import CELL, EIGHT, Bools, Patch, any_beside, squares_to_false
+from perception.places.local_map import CELL, Bools, Patch, any_beside, squares_to_false
 from perception.places.track import Array
 
+# A cell and its eight neighbours.
+EIGHT = np.ones((3, 3), np.bool_)
 # Steps to the eight neighbours of a cell, those with a common side first.
 _STEPS = sorted(
     set(product((-1, 0, 1), repeat=2)) - {(0, 0)},

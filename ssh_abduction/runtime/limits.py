@@ -51,6 +51,11 @@ def processor_clock(
     return clock
 
 
+def _seconds() -> float:
+    """Return the seconds on the wall clock."""
+    return time.perf_counter()
+
+
 class LimitError(Exception):
     """A search reached a limit or was interrupted. Its best map so far is the answer."""
 
@@ -92,8 +97,7 @@ class Watch:
         """
         self._on_tick, self._around = on_tick, around
         counts = work is not None or (clock is None and counts_work())
-        # The function is looked up at each call, as another clock may replace it.
-        self._clock = work_done if counts else clock or (lambda: time.perf_counter())  # noqa: PLW0108
+        self._clock = work_done if counts else clock or _seconds
         self._next_tick = time.perf_counter() + TICK
         self._limit = limit if work is None else work
         self._cap = limit if work is not None else None

@@ -162,9 +162,8 @@ class Overlay:
         self.merge_all()
         return True
 
-    def merge_all(self) -> bool:
-        """Merge all places that coincide. Return whether there was one."""
-        first = self._state
+    def merge_all(self) -> None:
+        """Merge all places that coincide."""
         merged = True
         while merged:  # what was refused may fit now
             merged, self._changes = False, self._costs.copy()
@@ -176,7 +175,6 @@ class Overlay:
                 else:
                     self._changes[pair] = math.inf
         self._merge_coinciding(set(self._state.place))
-        return self._state is not first
 
     def part(self) -> Hypothesis:
         """Return the part that all merges so far make of the two parts."""
