@@ -165,15 +165,28 @@ def _indoors(first: SSHMap) -> dict[str, Any]:
     found = layout(first)
     return {
         "corridors": [
-            {"title": first.called("corridor", c.id), "path": c.path, "line": c.line}
+            {**_named(first, "corridor", c.id), "path": c.path, "line": c.line}
             for c in first.corridors
         ],
         "rooms": [
-            {"title": first.called("room", room.id), "line": room.outline, "places": room.places}
+            {
+                **_named(first, "room", room.id),
+                "line": room.outline,
+                "places": room.places,
+                "bears": bool(room.corridors),
+            }
             for room in first.rooms
         ],
         "doors": [{"title": first.called("door", d.id), "at": d.at} for d in first.doors],
         "ellipses": _ellipses(found, first, 1.0),
+    }
+
+
+def _named(first: SSHMap, kind: str, number: int) -> dict[str, Any]:
+    """The title of a room or corridor, and whether a person has named it."""
+    return {
+        "title": first.called(kind, number),
+        "named": first.name_of(kind, number) is not None,
     }
 
 

@@ -27,7 +27,7 @@ function things() {
   return [
     ...[...ssh.places].map(([p, at]) => ({ text: ssh.called("place", p), at, steps: ssh.ofPlace.get(p) })),
     ...[...ssh.ofPath].map(([h, steps]) => ({ text: ssh.called("path", h), at: middle(steps), steps })),
-    ...corridors.map(({ title, line }) => ({ text: title, at: halfway(line) })),
+    ...corridors.map(({ title, line }) => ({ text: title, at: along(line, 0.5) })),
     ...rooms
       .filter(({ places, line }) => line.length || places.length)
       .map(({ title, places, line }) => ({

@@ -142,10 +142,10 @@ function paintGround(figure, see) {
   }
 }
 
-// The point halfway along a line.
-function halfway(line) {
+// The point of a line behind a share of its length.
+function along(line, share) {
   const legs = line.slice(1).map(([x, y], k) => Math.hypot(x - line[k][0], y - line[k][1]));
-  let far = legs.reduce((sum, leg) => sum + leg, 0) / 2,
+  let far = legs.reduce((sum, leg) => sum + leg, 0) * share,
     k = 0;
   while (k < legs.length - 1 && far > legs[k]) far -= legs[k++];
   return line[k].map((p, i) => p + (far / legs[k]) * (line[k + 1][i] - p));
@@ -160,15 +160,22 @@ function nameGround(figure, see) {
   ];
   const { corridors = [], rooms = [] } = data.indoors;
   for (const thing of [...corridors, ...rooms]) {
-    const { title, line } = thing;
-    if (!line.length) continue;
+    const { title, line, named, bears } = thing;
+    // The name of a corridor is enough for its room, unless a person has named that, too.
+    if (!line.length || (bears && !named)) continue;
     const xs = line.map(([x]) => x),
       ys = line.map(([, y]) => y);
     if ((Math.max(...xs) - Math.min(...xs) + Math.max(...ys) - Math.min(...ys)) * figure.k < 90)
       continue;
     const middle = [0, 1].map((k) => line.reduce((sum, p) => sum + p[k], 0) / line.length);
-    const at = corridors.includes(thing) ? halfway(line) : middle;
-    label(figure, title, see(at), 10, around, "inroom");
+    const spots = corridors.includes(thing)
+      ? [0.5, 0.35, 0.65, 0.2, 0.8].map((share) => along(line, share))
+      : [middle];
+    const placed = [10, 24].some((far) =>
+      spots.some((at) => label(figure, title, see(at), far, around, "inroom")),
+    );
+    // Names that a person gave are drawn always.
+    if (named && !placed) label(figure, title, see(spots[0]), 10, around, "inroom", true);
   }
 }
 
