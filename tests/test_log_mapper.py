@@ -115,6 +115,10 @@ def test_search_gives_a_map_and_a_belief(scans: tuple[Scan, ...]) -> None:
     assert made is not None
     lines = made.files["trace.jsonl"].decode().splitlines()
     assert lines == [*mapper.finish("live").trace.to_lines()]  # with its widths and doors
+    # The way of the robot, in the frame of the places, passes each of them.
+    way = [moved(made.ground["frame"], (x, y, 0.0))[:2] for x, y in made.ground["way"]]
+    for place in made.poses[:, :2].tolist():
+        assert min(math.dist(place, point) for point in way) < 1.0
     events = mapper.accept(made)
     assert [event.kind for event in events] == ["new"] * len(events)
     assert {place["place"] for place in mapper.to_dict()["places"]} == set(range(len(events)))
@@ -278,7 +282,7 @@ def test_replayed_log_is_mapped_and_goes_on(
 def test_page_shows_the_robot_to_this_computer_only(scans: tuple[Scan, ...]) -> None:
     session = LiveSession(OnlineLogMapper(), None, print)
     session.mapper.accept(found(0, 1, 2))
-    page = LivePage(0, session.state, lambda: None)
+    page = LivePage(0, session)
     port = page.server_address[1]
 
     def answer(path: str, host: str) -> tuple[int, bytes]:
@@ -294,11 +298,20 @@ def test_page_shows_the_robot_to_this_computer_only(scans: tuple[Scan, ...]) -> 
     assert session.tick()
     state = json.loads(answer("/state", here)[1])
     assert state["robot"] == [0.0, 0.0, 0.0]
+    assert state["trail"] == [[0.0, 0.0]]
+    # What the laser saw, at most 15 m away.
+    seen = scans[0].ends((0.0, 0.0, 0.0), 15.0)
+    assert 0 < len(state["laser"]) <= len(seen)
+    assert all(np.min(np.hypot(*(seen - point).T)) < 0.01 for point in state["laser"])
+    assert json.loads(answer("/ground", here)[1]) == {}
     assert state["edges"] == [[0, 1], [1, 2]]
     assert answer("/page.html", here)[0] == 404
     assert answer("/state", "example.org")[0] == 404
+    session.mapper.lift()
+    session.take(scans[10])  # now the robot may be anywhere on the map
+    assert json.loads(answer("/state", here)[1])["robot"] is None
     with pytest.raises(MapError, match="expected a free port"):
-        LivePage(port, session.state, lambda: None)
+        LivePage(port, session)
     page.shutdown()
     page.server_close()
 

@@ -281,6 +281,8 @@ def agreeing(
     A closure agrees if the chi-square of the best fit is at most GATE lower without it. The
     covariances of the track are multiplied by INFLATED, and the heading may drift steadily.
     """
+    if not found:
+        return []
     graph, kept = _ClosureGraph(track, visits, found), np.ones(len(found), bool)
     scores = np.array([closure.match.score for closure in found])
     gains = np.full(len(found), np.inf)  # when each closure was judged last

@@ -26,7 +26,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.data.odometry import Pose
+from ssh_abduction.data.odometry import Pose, moved
 from ssh_abduction.data.words import counted
 
 Array = NDArray[np.float64]
@@ -109,6 +109,16 @@ class Scan:
     def __deepcopy__(self, memo: object) -> Scan:
         """Return the scan itself, as it never changes."""
         return self
+
+    def ends(self, pose: Pose, far: float) -> NDArray[np.float64]:
+        """The points, (n, 2) metres, where beams ended at most `far` metres from the laser.
+
+        The robot is at `pose`: x, y in metres and heading in radians.
+        """
+        x, y, heading = moved(pose, self.laser.mount)
+        near = np.isfinite(self.ranges) & (self.ranges < min(far, self.laser.reach))
+        ranges, angles = self.ranges[near], heading + self.laser.bearings[near]
+        return np.stack([x + ranges * np.cos(angles), y + ranges * np.sin(angles)], axis=1)
 
 
 class Damaged(Exception):  # noqa: N818 - becomes a Damage

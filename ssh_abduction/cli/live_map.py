@@ -78,9 +78,7 @@ def run_live(options: argparse.Namespace) -> int:
     if options.page is not None:
         from ssh_abduction.robot_logs.live_page import LivePage
 
-        print(
-            f"page: {LivePage(options.page, session.state, lambda: session.page).url}", flush=True
-        )
+        print(f"page: {LivePage(options.page, session).url}", flush=True)
     if options.replay is None:
         _listen(options, session)
     else:

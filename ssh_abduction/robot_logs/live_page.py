@@ -12,12 +12,18 @@ from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from ssh_abduction.data.checks import free_port
 from ssh_abduction.data.errors import MapError
 
+if TYPE_CHECKING:
+    from ssh_abduction.robot_logs.log_mapper import LiveSession
+
 PAGE = Path(__file__).with_name("live_page.html")
+SEEN, BEAMS = 15.0, 180  # how far in metres the laser is drawn, and at most how many beams
 
 
 class LivePage(ThreadingHTTPServer):
@@ -25,8 +31,7 @@ class LivePage(ThreadingHTTPServer):
 
     Args:
         port: The port to listen on; 0 for any free one.
-        state: A function that returns the map and the robot as plain data.
-        whole: A function that returns the page of the last map; None without a map.
+        session: The drive that is shown.
 
     Raises:
         MapError: The port is in use, or may not be used.
@@ -34,10 +39,14 @@ class LivePage(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(
-        self, port: int, state: Callable[[], dict[str, Any]], whole: Callable[[], bytes | None]
-    ) -> None:
-        self.state, self.whole = state, whole
+    def __init__(self, port: int, session: LiveSession) -> None:
+        # What each path returns: a page, or plain data; None if there is nothing yet.
+        self.answers: dict[str, Callable[[], Any]] = {
+            "/": PAGE.read_bytes,
+            "/state": lambda: _state(session),
+            "/ground": lambda: session.ground,
+            "/page.html": lambda: session.page,
+        }
         with free_port("--page", port, MapError):
             super().__init__(("127.0.0.1", port), _PageHandler)
         threading.Thread(target=self.serve_forever, daemon=True).start()
@@ -48,20 +57,38 @@ class LivePage(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_address[1]}/"
 
 
+def _state(session: LiveSession) -> dict[str, Any]:
+    """The map, the robot and what was said, as plain data. The drive goes on in another thread."""
+    seen, scan, told = session.seen, session.scan, session.told
+    robot, trail = seen.pose if seen else None, [pose for _, pose in session.trail]
+    if seen and told["places"]:  # there is a map, and the robot may be anywhere on it
+        robot = seen.on_map
+        trail = [at for pose in trail if (at := session.mapper.on_map(pose))]
+    every = 1 + scan.laser.beams // BEAMS if scan else 1
+    laser = scan.ends(robot, SEEN)[::every] if scan and robot else np.zeros((0, 2))
+    return {
+        **told,
+        "robot": robot,
+        "trail": [[round(x, 2), round(y, 2)] for x, y, _ in trail],
+        "laser": np.round(laser, 2).tolist(),
+        "belief": seen.belief if seen else {},
+        "events": session.events,
+        "maps": session.maps,
+    }
+
+
 class _PageHandler(BaseHTTPRequestHandler):
     server: LivePage
     timeout = 60
 
     def do_GET(self) -> None:
-        """Send the page, the state, or the page of the last map."""
+        """Send the page, or an answer."""
         hosts = [f"{name}:{self.server.server_address[1]}" for name in ("127.0.0.1", "localhost")]
-        known: dict[str, tuple[str, Callable[[], bytes | None]]] = {
-            "/": ("text/html; charset=utf-8", PAGE.read_bytes),
-            "/state": ("application/json", lambda: json.dumps(self.server.state()).encode()),
-            "/page.html": ("text/html; charset=utf-8", self.server.whole),
-        }
-        kind, make = known.get(self.path, ("text/plain", lambda: None))
-        body = make() if self.headers.get("Host") in hosts else None
+        make = self.server.answers.get(self.path)
+        body = make() if make and self.headers.get("Host") in hosts else None
+        kind = "text/html; charset=utf-8"
+        if not isinstance(body, bytes | None):
+            body, kind = json.dumps(body).encode(), "application/json"
         self.send_response(HTTPStatus.NOT_FOUND if body is None else HTTPStatus.OK)
         self.send_header("Content-Type", kind)
         self.send_header("Cache-Control", "no-store")

@@ -92,7 +92,7 @@ def _scans(scans: Sequence[Scan]) -> dict[str, Any] | None:
     """Encode how far the walls are in each direction of the robot, for as many scans as fit."""
     ranges = np.full((len(scans), SECTORS), np.inf)
     for row, scan in zip(ranges, scans, strict=True):
-        x, y = _ends(scan, (0.0, 0.0, 0.0)).T
+        x, y = scan.ends((0.0, 0.0, 0.0), DRAWN).T
         sectors = np.floor(np.arctan2(y, x) / math.tau * SECTORS).astype(int) + SECTORS // 2
         np.minimum.at(row, sectors % SECTORS, np.hypot(x, y))
     used = np.flatnonzero(np.isfinite(ranges).any(axis=0))
@@ -136,8 +136,8 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
     # The ends of all beams of a long log would need much memory.
     for begin in range(0, len(log), AT_ONCE):
         some = slice(begin, begin + AT_ONCE)
-        ends = map(_ends, log.scans[some], poses[some])
-        cells = np.rint(np.concatenate(list(ends)) / GRAIN).astype(int)
+        ends = [scan.ends(at, DRAWN) for scan, at in zip(log.scans[some], poses[some], strict=True)]
+        cells = np.rint(np.concatenate(ends) / GRAIN).astype(int)
         every, weights = np.concatenate([squares, cells]), np.append(counts, np.ones(len(cells)))
         squares, numbers = np.unique(every, axis=0, return_inverse=True)
         counts = np.bincount(numbers.ravel(), weights).astype(float)
@@ -153,14 +153,6 @@ def _patched(imported: Imported, poses: Sequence[Pose]) -> Iterator[Array]:
             cos, sin = math.cos(turn), math.sin(turn)
             points = np.argwhere(visit.patch.occupied) * CELL + visit.patch.corner
             yield from points @ np.array([(cos, sin), (-sin, cos)]) + (x, y)
-
-
-def _ends(scan: Scan, pose: Pose) -> Array:
-    """The points, in metres, at which the beams of a scan ended: (n, 2)."""
-    x, y, heading = moved(pose, scan.laser.mount)
-    near = np.isfinite(scan.ranges) & (scan.ranges < min(DRAWN, scan.laser.reach))
-    far, angles = scan.ranges[near], heading + scan.laser.bearings[near]
-    return np.stack([x + far * np.cos(angles), y + far * np.sin(angles)], axis=1)
 
 
 def laid_over(imported: Imported, ssh_map: SSHMap | None) -> list[Pose]:
@@ -183,6 +175,24 @@ def laid_over(imported: Imported, ssh_map: SSHMap | None) -> list[Pose]:
         right, lowest = part[:, 0].max(), part[:, 1].min()
         parts.append(part)
     return [(x, y, heading) for x, y, heading in np.concatenate(parts).tolist()]
+
+
+def frame_among_visits(imported: Imported, ssh_map: SSHMap) -> Pose:
+    """The pose of the frame of a map in that of the fitted visits, by least squares."""
+    laid, track = laid_over(imported, ssh_map), imported.track.poses.tolist()
+    pairs = []
+    for visit, pose in zip(imported.visits, imported.poses.tolist(), strict=True):
+        on_track = displacement_between((*visit.middle, 0.0), track[visit.scan])
+        pairs.append((laid[visit.scan], moved(pose, on_track)))
+    # A point a metre ahead of each scan brings in the headings.
+    here, there = (
+        np.concatenate([at, at + np.exp(1j * poses[:, 2])])
+        for poses in np.array(pairs).swapaxes(0, 1)
+        for at in [poses[:, 0] + 1j * poses[:, 1]]
+    )
+    turn = np.angle(there @ (here - here.mean()).conj())
+    shift = there.mean() - here.mean() * np.exp(1j * turn)
+    return float(shift.real), float(shift.imag), float(turn)
 
 
 def _carried(

@@ -61,6 +61,7 @@ EVERY = 1.0  # seconds from saving to saving
 POLL = 0.2  # seconds to wait for a search
 # Units of work of a search, each about a second of a quiet core.
 WORK = 5.0
+TRAIL = 0.3  # metres between points of the way, for pages
 RIVALS = 5  # rivals that are told
 SURE = 0.005  # a join of less probability is not doubtful
 # What a person says of two visits, as in corrections: a place is the same, or another one.
@@ -142,6 +143,9 @@ class FoundMap:
     said: str
     files: Mapping[str, bytes]
     located: bool = True
+    # For pages: the walls and the way of the robot, as `log_ground.ground_of` makes them, and the
+    # `frame` that they are in.
+    ground: Mapping[str, Any] = field(default_factory=dict)
     sure: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -154,7 +158,7 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
     # The process of the search needs them. A robot that starts again should not wait for them.
     from ssh_abduction.page.content import Ground
     from ssh_abduction.page.html import view_page
-    from ssh_abduction.robot_logs.log_ground import ground_of
+    from ssh_abduction.robot_logs.log_ground import frame_among_visits, ground_of
     from ssh_abduction.robot_logs.log_maps import BARE
     from ssh_abduction.solver import solve
 
@@ -176,11 +180,11 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
         raise LogError(f"live: expected {what}, got none; give more work, or take one back")
     ssh_map = solution.maps[0]
     places = (ssh_map.dstates[ssh_map.dstate_at[t]].place for t in steps)
-    ground = Ground(ground_of(task.log, done, ssh_map))
+    seen = ground_of(task.log, done, ssh_map)
     files = {
         "trace.jsonl": "".join(f"{line}\n" for line in done.trace.to_lines()).encode(),
         "maps.json": f"{json_line(solution.to_dict())}\n".encode(),
-        "page.html": view_page(solution, done.trace, ground=ground).html.encode(),
+        "page.html": view_page(solution, done.trace, ground=Ground(seen)).html.encode(),
     }
     return FoundMap(
         tuple(scans),
@@ -190,6 +194,10 @@ def solved(task: MapTask, watch: Watch | None = None) -> FoundMap | None:
         solution.verdict,
         files,
         _is_located(done),
+        {
+            **{key: seen[key] for key in ("walls", "box", "way")},
+            "frame": frame_among_visits(done, ssh_map),
+        },
         _sureness(solution, done.trace, scans),
     )
 
@@ -340,7 +348,7 @@ class OnlineLogMapper:
             self._names.anchor = self._relocation = None
         if self._names.anchor is None and self._names.middles:
             self._relocate(far)
-        on_map = self._on_map(one.pose)
+        on_map = self.on_map(one.pose)
         return RobotSeen(one.pose, on_map, self._belief(on_map), tuple(visits))
 
     def lift(self) -> None:
@@ -365,7 +373,8 @@ class OnlineLogMapper:
         if self._names.anchor is not None:
             self._relocation, self._way = None, self._station + BEHIND
 
-    def _on_map(self, pose: Pose) -> Pose | None:
+    def on_map(self, pose: Pose) -> Pose | None:
+        """A pose on the track, moved to the last map; None if it is unknown where the map is."""
         if self._names.anchor is None:
             return None
         on_track, on_map = self._names.anchor
@@ -461,7 +470,7 @@ class OnlineLogMapper:
         visits = [one for one in (*self.live.visits, *self._expected) if one.scan > last]
         middles = (one.middle.tolist() for one in visits)
         if self._names.place_of:  # there is a map, and it may not be known where the robot is on it
-            here = (self._on_map((x, y, 0.0)) for x, y in middles)
+            here = (self.on_map((x, y, 0.0)) for x, y in middles)
             middles = (list(at[:2]) for at in here if at)
         return [[round(x, 2), round(y, 2)] for x, y in middles]
 
@@ -614,12 +623,18 @@ class LiveSession:
         self.maps = 0  # the number of maps so far
         self.events: list[str] = []  # what was said of the maps
         self.page: bytes | None = None  # of the last map
+        self.ground: Mapping[str, Any] = {}  # the walls and the way of the last map
         self.told = mapper.to_dict()  # the map as plain data, at most a second old
         self._say, self._search, self._saved, self._failed = say, MapSearch(), 0.0, False
+        self.scan: Scan | None = None  # the last one
+        self.trail: list[tuple[int, Pose]] = []  # scans since the last map, and poses on the track
 
     def take(self, scan: Scan) -> RobotSeen:
         """Add the next scan. Say when it becomes known where the robot is on the map."""
-        before, self.seen = self.seen, self.mapper.observe(scan)
+        before, self.seen, self.scan = self.seen, self.mapper.observe(scan), scan
+        pose = self.seen.pose
+        if not self.trail or math.dist(self.trail[-1][1][:2], pose[:2]) > TRAIL:
+            self.trail.append((len(self.mapper) - 1, pose))
         was_on_map = before is not None and before.on_map is not None
         if self.seen.on_map is not None and not was_on_map:
             x, y, _ = self.seen.on_map
@@ -636,7 +651,8 @@ class LiveSession:
             for event in self.mapper.accept(found):
                 self.happened(event)
             self.maps += 1
-            self.page = found.files.get("page.html")
+            self.page, self.ground = found.files.get("page.html"), found.ground
+            self.trail = [one for one in self.trail if one[0] >= found.scans[-1]]
             self._keep(found.files)
         if self.mapper.is_due and not self._search.is_busy:
             self._search.begin(self.mapper.task(self.work))
@@ -654,24 +670,11 @@ class LiveSession:
         self.events.append(text)
         self._say(text)
 
-    def state(self) -> dict[str, Any]:
-        """The map, the robot and what was said, as plain data for a page.
-
-        A page may ask from another thread.
-        """
-        seen = self.seen
-        robot = (seen.on_map or seen.pose) if seen else None
-        return {
-            **self.told,
-            "robot": robot,
-            "belief": seen.belief if seen else {},
-            "events": self.events,
-        }
-
     def restart(self, mapper: OnlineLogMapper) -> None:
         """Begin a new drive. The search ends, and the next save replaces the old state."""
         self._search.end()
         self.mapper, self.seen, self.told = mapper, None, mapper.to_dict()
+        self.scan, self.trail, self.ground, self.maps = None, [], {}, 0
 
     def save(self) -> None:
         """Save the state. If the folder cannot be written, say so once."""
