@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -203,10 +204,28 @@ def test_names_are_those_of_one_place() -> None:
     assert [place["name"] for place in mapper.to_dict()["places"]] == ["hall", None]
 
 
+def test_scans_without_ranges_or_odometry_are_refused(scans: tuple[Scan, ...]) -> None:
+    mapper = OnlineLogMapper()
+    mapper.observe(scans[0])
+    bad: list[Any] = [
+        replace(scans[1], ranges=np.zeros(0)),
+        replace(scans[1], ranges=scans[1].ranges[:7]),
+        replace(scans[1], odometry=(math.nan, 0.0, 0.0)),
+        3,
+    ]
+    for one in bad:
+        with pytest.raises(LogError, match=r"scan: expected .*, got .*; "):
+            mapper.observe(one)
+    mapper.observe(scans[1])  # nothing is lost
+    assert len(mapper) == 2
+
+
 def test_corrections_of_other_scans_are_refused() -> None:
     mapper = OnlineLogMapper()
     mapper.accept(found(0, 1, 2))
-    for kind, first, second in (("alike", 0, 10), ("elsewhere", 0, 11), ("elsewhere", 0, 0)):
+    pairs = ("elsewhere", 0, 11), ("elsewhere", 0, 0), ("same_place", "a", 0)
+    bad: list[Any] = [("alike", 0, 10), *pairs]
+    for kind, first, second in bad:
         with pytest.raises(LogError, match="expected"):
             mapper.correct(kind, first, second)
     assert not mapper.is_due

@@ -44,6 +44,7 @@ from perception.places.track import Array
 from perception.readers.scans import Damage, RobotLog, Scan, ScanTable
 from ssh_abduction.data.checks import a_function, a_number
 from ssh_abduction.data.errors import brief, named
+from ssh_abduction.data.words import counted
 
 # The number of first scans over which the track is compared with the odometry.
 COMPARED = 400
@@ -163,7 +164,13 @@ class LiveLog:
 
         Returns the scan with its pose on the track, and the visits that are final now. A visit is
         final when the robot is at most 125 m of trajectory beyond its end; usually after 30 to 40.
+        Raises LogError if the scan has not a range for each beam, or no finite odometry.
         """
+        if scan.ranges.shape != (scan.laser.beams,) or not np.isfinite(scan.odometry).all():
+            raise LogError(
+                f"scan: expected {counted(scan.laser.beams, 'ranges')} and a finite odometry, got "
+                f"{scan.ranges.shape} and {scan.odometry}; leave this scan out"
+            )
         self._scans.append(scan)
         one = self._follower.add(self._scans[-1])
         self._done.add(one)

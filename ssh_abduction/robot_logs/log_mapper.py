@@ -338,7 +338,7 @@ class OnlineLogMapper:
     def observe(self, scan: Scan) -> RobotSeen:
         """Add the next scan, with odometry in metres and radians, in bounded time.
 
-        Raises LogError if it is no Scan.
+        Raises LogError if it is no Scan, or lacks ranges or a finite odometry.
         """
         an_instance("scan", scan, Scan, LogError, mend="give a Scan of perception.readers.scans")
         one, visits = self.live.add(scan)
@@ -420,6 +420,7 @@ class OnlineLogMapper:
         """Take the result of `solved`, and return what changed."""
         if found is None:
             return []
+        an_instance("found", found, FoundMap, LogError, mend="give what `solved` returned")
         events = self._names.update(found)
         if found.located and found.scans[-1] >= self.live.begun:
             (ahead, left), (x, y, turn) = found.middles[-1].tolist(), found.poses[-1].tolist()
@@ -435,13 +436,14 @@ class OnlineLogMapper:
         visits before. The next search obeys. Raises LogError for another kind or scan.
         """
         one_of("kind", kind, SAID, LogError)
-        scans, pair = self._names.place_of, (min(first, second), max(first, second))
-        if first == second or not scans.keys() >= {*pair}:
+        scans = self._names.place_of
+        if first == second or not scans.keys() >= {first, second}:
             known = ", ".join(map(str, sorted(scans))) or "no map yet"
             raise LogError(
                 f"scans: expected two different ones of {known}, got {first} and {second}; take "
                 "scans of the map"
             )
+        pair = min(first, second), max(first, second)
         self._names.said = [one for one in self._names.said if tuple(one[1:]) != pair]
         self._names.said.append((kind, *pair))
         self._asked = -1
