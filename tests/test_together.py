@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import theories, traces
 from test_property import checker_rejects_foreign_maps, solver_agrees
-from together import of_mazes, of_worlds, report_of_guesses
+from together import cut, of_mazes, of_worlds, report_of_guesses
 
 from ssh_abduction import (
     Localiser,
@@ -429,6 +429,13 @@ def test_misfit_of_joint_maps_equals_that_of_the_checker(known: truth.Known) -> 
     where = dict(zip(names, places, strict=True))
     poses = Poses(known.trace, names, [where[name] for name in range(len(where))])
     assert misfit(known.trace, names, places) == pytest.approx(poses.misfit(), rel=1e-5)
+
+
+def test_places_of_joined_drives_are_merged_further() -> None:
+    """Joining leaves two places of a building twice, which its best map has once."""
+    known = cut(next(truth.aces3([97501], truth.noise_of(Odometry(), 97501))), 3, 4)
+    found = solve(known.trace, Theory.topological().replace(star="none"), work_limit=4.0)
+    assert truth.is_true(found.maps[0], known)
 
 
 @pytest.mark.filterwarnings("ignore:views. trace")

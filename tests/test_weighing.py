@@ -34,10 +34,10 @@ from ssh_abduction.solution.values import Found
 from ssh_abduction.solution.weighed import Rival, Weighed
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.costs import beams, weighing
-from ssh_abduction.solver.costs.estimating import estimated, rivals_of
+from ssh_abduction.solver.costs.estimating import crowded, estimated, rivals_of
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import fit
-from ssh_abduction.solver.geometry.poses import Poses
+from ssh_abduction.solver.geometry.poses import Poses, framed
 from ssh_abduction.theory import prior as prior_module
 from ssh_abduction.theory.prior import AIM, UNKNOWN
 from ssh_abduction.theory.prior import _area as area
@@ -571,6 +571,56 @@ def test_excess_of_the_misfit_lowers_confidence() -> None:
     assert Weighed.from_dict(read, less.to_dict(), 3).excess == 2.0
     with pytest.raises(MapError, match=r"weighed.excess: expected a number of at least 1, got 0.5"):
         Weighed.from_dict(read, {**less.to_dict(), "excess": 0.5}, 3)
+
+
+def test_crowded_rivals_are_less_probable_in_each_answer_and_file() -> None:
+    rivals = Rival(10.0, (0, 1, 0), (0, 1, 0)), Rival(13.0, (0, 1, 2), (0, 1, 2), crowded=1.0)
+    weighed = Weighed(0.0, 0.0, rivals, True, 0.0)
+    assert weighed.weights == pytest.approx([1 / (1 + math.exp(-4)), 1 / (1 + math.exp(4))])
+    assert Weighed.from_dict(FieldReader("here"), weighed.to_dict(), 3) == weighed
+
+
+def test_nearness_is_that_of_each_two_places_and_dstates_of_a_place() -> None:
+    known = next(truth.mazes(3, 24, [5], truth.noise_of(Odometry(), 5)))
+    problem = settle(known.trace, Theory.topological())
+    misfit, near = Misfit(problem), problem.prior.near
+    dstates, places = truth.partition(known.dstates), truth.partition(known.places)
+    poses, _ = framed(misfit.poses(dstates, places))
+    place = dict(zip(dstates, places, strict=True))
+    first = {place[s]: s for s in reversed(range(len(poses)))}
+    (of_places, most), (of_dstates, most_at) = misfit.nearness(dstates, places)
+    far = [math.dist(poses[a, :2], poses[b, :2]) for a, b in combinations(first.values(), 2)]
+    assert sorted(of_places) == pytest.approx(sorted(math.exp(-((d / near) ** 2) / 2) for d in far))
+    turned = [
+        math.remainder(poses[s, 2] - poses[x, 2], math.tau)
+        for s, x in combinations(range(len(poses)), 2)
+        if place[s] == place[x]
+    ]
+    nearness = sorted(math.exp(-((t / AIM) ** 2) / 2) for t in turned)
+    assert sorted(of_dstates) == pytest.approx(nearness)
+    # n places of four times near² each: the integral of the Gaussian over their area, per pair.
+    share = math.tau * near**2 / (len(first) * 4 * near**2)
+    assert (most, most_at) == pytest.approx((len(far) * share, len(turned) * UNKNOWN[1]))
+
+
+def test_second_place_at_one_spot_is_less_probable_where_places_keep_apart() -> None:
+    """In a maze no two places are near each other, but a rival has a place twice."""
+    known = next(truth.mazes(4, 30, [97016], truth.noise_of(Odometry(), 97016)))
+    views = Theory.topological().replace(star="none")
+    found = solve(known.trace, views, work_limit=1.0).weighed
+    assert found
+    best, *others = found.rivals
+    doubled = [rival for rival in others if len({*rival.places}) > len({*best.places})]
+    assert best.crowded == 0.0
+    assert min(rival.crowded for rival in doubled) > 0.5
+    evenly = replace(found, rivals=tuple(replace(rival, crowded=0.0) for rival in found.rivals))
+    assert found.confidence > evenly.confidence
+    # On two floors, or in a log, places may be near each other.
+    flat = settle(known.trace, views)
+    assert crowded(flat, Misfit(flat), [*evenly.rivals]) == found.rivals
+    spread = replace(known.trace.odometry or Odometry(), offset=0.3)
+    log = settle(replace(known.trace, odometry=spread), views)
+    assert crowded(log, Misfit(log), [*evenly.rivals]) == evenly.rivals
 
 
 def test_rival_may_cost_far_less_than_the_best_map() -> None:

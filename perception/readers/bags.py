@@ -31,20 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
+from perception.readers import bag_frames
 from perception.readers.bag_files import Bag
-from perception.readers.bag_frames import (
-    Frames,
-    RecordedTrack,
-    ancestors,
-    describe_unmounted,
-    flat_pose,
-    frame_name,
-    mount_of,
-    parent_of,
-    same_frame,
-    stamp_of,
-    transforms_of,
-)
 from perception.readers.bag_geometry import Mount, angles_of, believed, ranges_of
 from perception.readers.echoes import LaserOptions
 from perception.readers.scans import (
@@ -85,7 +73,7 @@ class TimedPoses:
     poses: Array
 
     @classmethod
-    def of(cls, track: RecordedTrack, by_stamp: bool) -> TimedPoses:
+    def of(cls, track: bag_frames.RecordedTrack, by_stamp: bool) -> TimedPoses:
         """Sort the poses of a track: by the stamps in headers, or by the times of recording."""
         table = track.table()
         times = table[:, 0 if by_stamp else 1]
@@ -270,7 +258,7 @@ def read(
     survey = _survey(bag, scans, told, notes)
     times, seen = survey.times, survey.frames
     damaged: list[Damage] = []
-    frames = transforms_of(bag, set(seen), damaged)
+    frames = bag_frames.transforms_of(bag, set(seen), damaged)
     frame = seen.most_common(1)[0][0]
 
     # 1. Odometry: from its topic or, if there is none, from transforms.
@@ -285,7 +273,7 @@ def read(
     # 2. Where each frame of scans is on the robot. Frames without a transform are left out, if
     # others have one.
     assumed = {"fov": text} if (text := survey.doubt) else {}
-    found = {frame: mount_of(frames, odom, base, frame, notes) for frame in seen}
+    found = {frame: bag_frames.mount_of(frames, odom, base, frame, notes) for frame in seen}
     unknown = [frame for frame, mount in found.items() if mount is None]
     listed = first_few(unknown, 3)
     if unknown and len(unknown) < len(seen) and told.mount is None:
@@ -296,7 +284,7 @@ def read(
         )
         found = {frame: found[frame] for frame in seen if frame not in unknown}
     elif unknown:
-        assumed["mount"] = describe_unmounted(base, listed)
+        assumed["mount"] = bag_frames.describe_unmounted(base, listed)
     is_told = told.mount is not None
     mounts = {
         frame: believed(mount or Mount(), survey.some[frame], frame, bag.source, is_told, notes)
@@ -304,7 +292,9 @@ def read(
     }
 
     # 3. Corrected poses: from the transforms above the frame of the odometry.
-    tracks = (parent_of(frames, child).track for child in ancestors(frames, odom))
+    tracks = (
+        bag_frames.parent_of(frames, child).track for child in bag_frames.ancestors(frames, odom)
+    )
     above = [track for track in tracks if track is not None]
 
     # 4. Times: by the stamps of messages, or by their recording.
@@ -409,7 +399,10 @@ def _survey(bag: Bag, topics: Sequence[str], told: LaserOptions, notes: list[str
     for connection, number, recorded, message in bag.messages(set(topics)):
         if isinstance(message, Damage):
             continue
-        frame, stamp = frame_name(message.header.frame_id), stamp_of(message.header)
+        frame, stamp = (
+            bag_frames.frame_name(message.header.frame_id),
+            bag_frames.stamp_of(message.header),
+        )
         ranges = hash(ranges_of(message).tobytes())
         # The second message of two may have a time of its own.
         before, same = last.get(frame, (-math.inf, 0))
@@ -455,27 +448,27 @@ def _survey(bag: Bag, topics: Sequence[str], told: LaserOptions, notes: list[str
 
 def _odometer(
     bag: Bag, topic: str, damaged: list[Damage], notes: list[str]
-) -> tuple[RecordedTrack, str, str]:
+) -> tuple[bag_frames.RecordedTrack, str, str]:
     """Read the poses of the odometer, the name of their frame, and the name of the robot's frame.
 
     `damaged` receives the messages that cannot be read, `notes` a note if several programs publish
     the topic. Raises LogError if no message can be read.
     """
-    tracks: dict[tuple[str, str, str], RecordedTrack] = {}
+    tracks: dict[tuple[str, str, str], bag_frames.RecordedTrack] = {}
     for connection, number, recorded, message in bag.messages({topic}):
         if isinstance(message, Damage):
             damaged.append(message)
             continue
         pose = message.pose.pose
         try:
-            flat = flat_pose(pose.position, pose.orientation)
+            flat = bag_frames.flat_pose(pose.position, pose.orientation)
         except Damaged as damage:
             damaged.append(Damage(number, f"{topic}: {damage}"))
             continue
-        frame, child = map(frame_name, (message.header.frame_id, message.child_frame_id))
+        frame, child = map(bag_frames.frame_name, (message.header.frame_id, message.child_frame_id))
         source = frame, child, getattr(connection.ext, "callerid", "") or ""
-        track = tracks.setdefault(source, RecordedTrack())
-        track.add(stamp_of(message.header), recorded, flat, pose.orientation)
+        track = tracks.setdefault(source, bag_frames.RecordedTrack())
+        track.add(bag_frames.stamp_of(message.header), recorded, flat, pose.orientation)
     if not tracks:
         raise LogError(
             f"{bag.source}: expected odometry in {topic}, got none that can be read"
@@ -497,11 +490,11 @@ def _odometer(
 
 
 def _odometer_of_transforms(
-    bag: Bag, frames: Frames, frame: str, notes: list[str]
-) -> tuple[RecordedTrack, str, str]:
+    bag: Bag, frames: bag_frames.Frames, frame: str, notes: list[str]
+) -> tuple[bag_frames.RecordedTrack, str, str]:
     """Read what `_odometer` returns, but from transforms from `odom` to the robot."""
-    names = ancestors(frames, same_frame(frames, frame))
-    chain = [(child, parent_of(frames, child)) for child in names]
+    names = bag_frames.ancestors(frames, bag_frames.same_frame(frames, frame))
+    chain = [(child, bag_frames.parent_of(frames, child)) for child in names]
     moving = [(child, one) for child, one in chain if one.track is not None]
     found = next(
         ((child, one) for child, one in moving if "odom" in one.parent.rpartition("/")[2]), None
@@ -510,8 +503,8 @@ def _odometer_of_transforms(
     for child in (
         [name for name in frames if "odom" in name.rpartition("/")[2]] if not found else ()
     ):
-        if (track := parent_of(frames, child).track) is not None:
-            parent = parent_of(frames, child).parent
+        if (track := bag_frames.parent_of(frames, child).track) is not None:
+            parent = bag_frames.parent_of(frames, child).parent
             del frames[child]
             return track.righted(parent, child, notes)
     if found is None:
@@ -524,14 +517,18 @@ def _odometer_of_transforms(
     return edge.track, edge.parent, base
 
 
-def _of_one_source(track: RecordedTrack, called: str, notes: list[str]) -> RecordedTrack:
+def _of_one_source(
+    track: bag_frames.RecordedTrack, called: str, notes: list[str]
+) -> bag_frames.RecordedTrack:
     """If the poses of several sources alternate, keep those of the largest one, and note it."""
     table = track.table()
     sources = sources_of(table[:, 2:])
     if len(sources) == 1:
         return track
     # For the note, measure how far the poses of the two largest sources differ.
-    first, second = (RecordedTrack(array("d", table[some].ravel())) for some in sources[:2])
+    first, second = (
+        bag_frames.RecordedTrack(array("d", table[some].ravel())) for some in sources[:2]
+    )
     here, there = TimedPoses.of(first, False), TimedPoses.of(second, False)
     apart = max(math.dist(here.at(time)[:2], there.at(time)[:2]) for time in there.times)
     notes.append(
@@ -558,7 +555,7 @@ class _ScanPoses:
 
     def scan(self, message: Any, recorded: float, number: int) -> Scan:
         """Make the scan of a message. Raises Damaged."""
-        time = stamp_of(message.header) if self.by_stamp else recorded
+        time = bag_frames.stamp_of(message.header) if self.by_stamp else recorded
         if not self.odometry.covers(time):
             begin, end = self.odometry.times[[0, -1]]
             raise Damaged(
@@ -568,7 +565,7 @@ class _ScanPoses:
         pose = corrected = self.odometry.at(time)
         for correction in self.corrections:
             corrected = moved(correction.at(time), corrected)
-        mount = self.mounts[frame_name(message.header.frame_id)]
+        mount = self.mounts[bag_frames.frame_name(message.header.frame_id)]
         ranges, laser = measured(message, mount, self.fov)
         return Scan(ranges, laser, pose, corrected if self.corrections else None, time, number)
 
@@ -586,7 +583,7 @@ def _scans(
         if (connection.topic, number) in repeated:
             continue
         is_damaged = isinstance(message, Damage)
-        if not is_damaged and frame_name(message.header.frame_id) not in where.mounts:
+        if not is_damaged and bag_frames.frame_name(message.header.frame_id) not in where.mounts:
             continue
         try:
             yield message if is_damaged else where.scan(message, recorded, number)

@@ -29,18 +29,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ssh_abduction.data import groups
-from ssh_abduction.data.checks import (
-    a_flag,
-    a_list,
-    a_number,
-    a_path,
-    a_text,
-    all_instances,
-    an_instance,
-    an_object,
-    one_of,
-)
+from ssh_abduction.data import checks, groups
 from ssh_abduction.data.drives import Drive, drives_of, fingerprints_of, step_name, step_of
 from ssh_abduction.data.errors import MapError, TraceError, brief, is_writable, named, said_of
 from ssh_abduction.data.files import json_line, parse_yaml, read_file, save_file
@@ -89,7 +78,7 @@ class Naming:
     note: str | None = None
 
     def __post_init__(self) -> None:
-        one_of("kind", self.kind, NAMED, MapError)
+        checks.one_of("kind", self.kind, NAMED, MapError)
         object.__setattr__(self, "name", _a_line("name", self.name).strip())
         object.__setattr__(self, "step", _a_step(self.step))
         _a_note(self.note)
@@ -114,7 +103,7 @@ class Said:
     note: str | None = None
 
     def __post_init__(self) -> None:
-        one_of("kind", self.kind, ASSERTIONS, MapError)
+        checks.one_of("kind", self.kind, ASSERTIONS, MapError)
         if not isinstance(self.steps, tuple | list) or len(self.steps) != 2:
             raise MapError(
                 f"expected two steps, such as [monday:12, tuesday:3], got {brief(self.steps)}; "
@@ -145,15 +134,15 @@ class Passage:
     note: str | None = None
 
     def __post_init__(self) -> None:
-        a_flag("is_open", self.is_open, MapError)
+        checks.a_flag("is_open", self.is_open, MapError)
         ways = []
-        for i, at in enumerate(a_list("seen", self.seen, MapError)):
+        for i, at in enumerate(checks.a_list("seen", self.seen, MapError)):
             if not isinstance(at, tuple) or len(at) != 2:
                 raise MapError(
                     f"seen[{i}]: expected a step and degrees, such as ('monday:12', 90.0), got "
                     f"{brief(at)}; give both"
                 )
-            ways.append((_a_step(at[0]), a_number(f"seen[{i}]", at[1], MapError) % 360))
+            ways.append((_a_step(at[0]), checks.a_number(f"seen[{i}]", at[1], MapError) % 360))
         object.__setattr__(self, "seen", tuple(ways))
         _a_note(self.note)
 
@@ -265,7 +254,7 @@ class Corrections:
         Raises:
             MapError: An argument is wrong.
         """
-        passage = Passage(is_open, tuple(a_list("seen", seen, MapError)))
+        passage = Passage(is_open, tuple(checks.a_list("seen", seen, MapError)))
         kept = [said for said in self.gateways if not set(said.seen) & set(passage.seen)]
         return replace(self, gateways=(*kept, passage))
 
@@ -278,7 +267,7 @@ class Corrections:
         Raises:
             MapError: No drive is known, or a drive of a known name has other steps.
         """
-        an_object("known", known, MapError)
+        checks.an_object("known", known, MapError)
         where = self.source or "corrections"
         other = [d for d, mark in known.items() if self.drives.get(d, mark) not in (mark, None)]
         other = [d for d in other if known[d] is not None]
@@ -416,7 +405,7 @@ class Corrections:
         where = self.source or "corrections"
         for part, kind in (("names", Naming), ("pairs", Said), ("gateways", Passage)):
             mend = f"make it with {kind.__name__}"
-            checked = all_instances(part, getattr(self, part), kind, MapError, mend=mend)
+            checked = checks.all_instances(part, getattr(self, part), kind, MapError, mend=mend)
             object.__setattr__(self, part, checked)
         if clash := _contradiction(self.pairs):
             raise MapError(
@@ -487,18 +476,18 @@ def direction_in_words(way: float) -> str:
 def _drives(value: object) -> tuple[Drive, ...]:
     """Return drives in a tuple, or raise MapError for other values."""
     mend = "take drives_of(trace), or those of a solution"
-    return all_instances("drives", value, Drive, MapError, mend=mend)
+    return checks.all_instances("drives", value, Drive, MapError, mend=mend)
 
 
 def checked_corrections(value: object) -> Corrections:
     """Return a value if it is Corrections, or raise MapError."""
     mend = "read them with load_corrections, or make them with Corrections.for_drives"
-    return an_instance("corrections", value, Corrections, MapError, mend=mend)
+    return checks.an_instance("corrections", value, Corrections, MapError, mend=mend)
 
 
 def _a_step(step: object) -> str:
     """Return the name of a step, such as "monday:12". Raise MapError for another text."""
-    text = a_text("step", step, MapError, mend="name a step, such as monday:12")
+    text = checks.a_text("step", step, MapError, mend="name a step, such as monday:12")
     drive, _, number = text.rpartition(":")
     if not (drive and number.isascii() and number.isdecimal() and is_writable(text)):
         raise MapError(
@@ -510,7 +499,7 @@ def _a_step(step: object) -> str:
 
 def _a_line(field: str, value: object) -> str:
     """Return a text on one line. Raise MapError for other values, or if the text is empty."""
-    text = a_text(field, value, MapError)
+    text = checks.a_text(field, value, MapError)
     if not text.strip() or not text.isprintable():
         raise MapError(f"{field}: expected a text on one line, got {brief(text)}; give one")
     return text
@@ -562,7 +551,7 @@ def save_corrections(corrections: Corrections, path: str | os.PathLike[str]) -> 
 
 def file_in(path: str | os.PathLike[str]) -> Path:
     """Return the file of corrections that a path names: itself, or the one in a folder."""
-    file = Path(a_path("path", path, MapError) or FILE)
+    file = Path(checks.a_path("path", path, MapError) or FILE)
     return file / FILE if file.is_dir() else file
 
 
@@ -573,7 +562,7 @@ def beside(maps: str | os.PathLike[str] | None) -> Path | None:
     """
     if maps is None or str(maps) == "-":
         return None
-    file = Path(a_path("maps", maps, MapError)).parent / FILE
+    file = Path(checks.a_path("maps", maps, MapError)).parent / FILE
     if file.is_dir():
         raise MapError(
             f"{named(file)}: expected a file of corrections, got a folder; give it another name"

@@ -9,19 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
-from ssh_abduction.data.checks import (
-    View,
-    a_text,
-    a_whole_number,
-    an_instance,
-    an_object,
-    checked_image,
-    checked_probability,
-    checked_view,
-    one_of,
-    plain_number,
-    plain_text,
-)
+from ssh_abduction.data import checks
 from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole, is_writable, said_of
 from ssh_abduction.data.odometry import (
     Covariance,
@@ -85,15 +73,17 @@ class Action:
         if not isinstance(name, str) or not name or "\0" in name or not is_writable(name):
             raise TraceError(f"action.name: expected a text, got {brief(name)}; name the action")
         if kind is not None:
-            one_of("action.kind", kind, _KINDS, TraceError, mend="leave it out for other actions")
+            checks.one_of(
+                "action.kind", kind, _KINDS, TraceError, mend="leave it out for other actions"
+            )
         if turn is not None:
-            one_of("action.turn", turn, _TURNS, TraceError, mend="choose the nearest")
+            checks.one_of("action.turn", turn, _TURNS, TraceError, mend="choose the nearest")
         if turn is not None and kind != "turn":
             raise TraceError(
                 f'action.kind: expected "turn", as the action has a turn, got {brief(kind)}; '
                 f"set the kind or drop the turn"
             )
-        an_object("action.extra", self.extra, TraceError)
+        checks.an_object("action.extra", self.extra, TraceError)
         if self.bearing is not None:  # says which way the turn goes
             turn = self._turn_of_bearing()
             object.__setattr__(self, "turn", turn)
@@ -112,7 +102,11 @@ class Action:
         # Replace texts and numbers of numpy by Python's own.
         for name in _FIELDS:
             if (value := getattr(self, name)) is not None:
-                plain = plain_text(value) if isinstance(value, str) else plain_number(value)
+                plain = (
+                    checks.plain_text(value)
+                    if isinstance(value, str)
+                    else checks.plain_number(value)
+                )
                 object.__setattr__(self, name, plain)
 
     def _turn_of_bearing(self) -> TurnDirection:
@@ -143,7 +137,7 @@ class Action:
             step: The step where the action was done. Its number is in the name of the new action,
                 so that the new actions of two steps differ.
         """
-        number = a_whole_number("step", step, TraceError)
+        number = checks.a_whole_number("step", step, TraceError)
         return Action(f"slipped at step {number}", extra={"slipped": True})
 
     @property
@@ -272,7 +266,7 @@ class Step:
             are allowed, it scales the cost of ignoring them.
     """
 
-    view: View | None = None
+    view: checks.View | None = None
     action: Action | None = None
     star: tuple[Entry, ...] | None = None
     displacement: Displacement | None = None
@@ -286,15 +280,15 @@ class Step:
     def __post_init__(self) -> None:
         set_checked(
             self,
-            view=checked_view,
+            view=checks.checked_view,
             action=_an_action,
-            image=checked_image,
-            confidence=checked_probability,
+            image=checks.checked_image,
+            confidence=checks.checked_probability,
             star=parse_star,
             displacement=lambda displacement, _: checked_displacement(displacement),
             covariance=lambda covariance, _: checked_covariance(covariance),
         )
-        an_object("extra", self.extra, TraceError)
+        checks.an_object("extra", self.extra, TraceError)
         object.__setattr__(self, "gateways", None if self.star is None else Star.of(self.star))
         if self.covariance is not None and self.displacement is None:
             raise TraceError(
@@ -319,7 +313,7 @@ class Step:
 
     @staticmethod
     def of(
-        view: View | None,
+        view: checks.View | None,
         star: Sequence[Any] | None = None,
         where: str = "step",
         action: Action | None = None,
@@ -339,7 +333,7 @@ class Step:
         Raises:
             TraceError: If a field is wrong.
         """
-        a_text("where", where, TraceError)
+        checks.a_text("where", where, TraceError)
         with said_of(where):
             return Step(view, action, star, displacement, covariance)  # type: ignore[arg-type]
 
@@ -383,7 +377,9 @@ class Step:
 
 
 def _an_action(value: object, name: str) -> Action:
-    return an_instance(name, value, Action, TraceError, mend='make one with Action.of("travel")')
+    return checks.an_instance(
+        name, value, Action, TraceError, mend='make one with Action.of("travel")'
+    )
 
 
 def one_each(values: Iterable[Any] | None, name: str, count: int, each: str = "step") -> list[Any]:

@@ -23,18 +23,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, overload
 
-from ssh_abduction.data.checks import (
-    View,
-    a_list,
-    a_path,
-    a_text,
-    a_whole_number,
-    an_instance,
-    an_object,
-    checked_probability,
-    checked_view,
-    plain_text,
-)
+from ssh_abduction.data import checks
+from ssh_abduction.data.checks import View
 from ssh_abduction.data.errors import RangeError, TraceError, brief, checked_index, named, said_of
 from ssh_abduction.data.files import (
     LINE_OF_A_LOG,
@@ -127,8 +117,8 @@ class Trace:
         set_checked(self, name=_text, images=_text, source=_text, drive=_text)
         if self.odometry is not None:
             mend = "make one with Odometry.of, or leave it out"
-            an_instance("odometry", self.odometry, Odometry, TraceError, mend=mend)
-        an_object("extra", self.extra, TraceError)
+            checks.an_instance("odometry", self.odometry, Odometry, TraceError, mend=mend)
+        checks.an_object("extra", self.extra, TraceError)
         closures = checked_closures(self.closures, len(self.steps), self.source)
         object.__setattr__(self, "closures", closures)
         self._check_actions()
@@ -277,14 +267,14 @@ class Trace:
         Raises:
             RangeError: If there is no such step.
         """
-        here = self.steps[a_whole_number("step", step, RangeError, 0, len(self) - 1)]
+        here = self.steps[checks.a_whole_number("step", step, RangeError, 0, len(self) - 1)]
         if here.displacement is None or here.covariance is not None:
             return here.covariance
         return (self.odometry or _USUAL).covariance(here.displacement)
 
     def at(self, step: int) -> str:
         """Return the name of a step in messages: file and line, or the number of the step."""
-        a_whole_number("step", step, TraceError)
+        checks.a_whole_number("step", step, TraceError)
         if self.source:
             return f"{named(self.source)}:{step + 2}"
         if not self._starts:
@@ -360,8 +350,8 @@ class Trace:
     def without_displacements_at(self, steps: Collection[int]) -> Trace:
         """Return the same trace without the displacements that lead to these steps."""
         unknown = {
-            a_whole_number(f"steps[{i}]", step, TraceError)
-            for i, step in enumerate(a_list("steps", steps, TraceError))
+            checks.a_whole_number(f"steps[{i}]", step, TraceError)
+            for i, step in enumerate(checks.a_list("steps", steps, TraceError))
         }
         if not unknown:
             return self
@@ -387,14 +377,14 @@ class Trace:
         sure = one_each(confidences, "confidences", len(self))
         steps = []
         for i, (step, v, c) in enumerate(zip(self.steps, seen, sure, strict=True)):
-            view = None if v is None else checked_view(v, f"views[{i}]")
-            share = None if c is None else checked_probability(c, f"confidences[{i}]")
+            view = None if v is None else checks.checked_view(v, f"views[{i}]")
+            share = None if c is None else checks.checked_probability(c, f"confidences[{i}]")
             steps.append(replace(step, view=view, confidence=share))
         return replace(self, steps=tuple(steps))
 
     def prefix(self, steps: int) -> Trace:
         """Return the trace of the first `steps` steps, or the whole trace if it has fewer."""
-        head = self.steps[: a_whole_number("steps", steps, TraceError, 1)]
+        head = self.steps[: checks.a_whole_number("steps", steps, TraceError, 1)]
         if head:
             head = (*head[:-1], replace(head[-1], action=None))
         return replace(self, steps=head, closures=closures_among(self.closures, range(len(head))))
@@ -407,7 +397,7 @@ class Trace:
             TraceError: If the file cannot be read or is not a trace. The error names the file, the
                 line and the field.
         """
-        path = a_path("path", path, TraceError)
+        path = checks.a_path("path", path, TraceError)
         with opened_file(path, "a readable trace file", TraceError) as file:
             read = read_trace(file, source_of(path))
         return cls(**read, source="standard input" if path == "-" else path)
@@ -418,7 +408,7 @@ class Trace:
         Raises:
             TraceError: If the file cannot be written, or a value of the trace has no form in JSON.
         """
-        path = a_path("path", path, TraceError)
+        path = checks.a_path("path", path, TraceError)
         lines = "".join(line + "\n" for line in self.to_lines())
         try:
             data, _ = lines.encode("utf-8"), os.fsencode(path)
@@ -450,7 +440,9 @@ class Trace:
 
 
 def _text(value: object, name: str) -> str:
-    return plain_text(a_text(name, value, TraceError, mend="give a text, or leave it out"))
+    return checks.plain_text(
+        checks.a_text(name, value, TraceError, mend="give a text, or leave it out")
+    )
 
 
 def _check_start(trace: Trace, i: int, name: str, known: Collection[str]) -> None:
@@ -475,7 +467,7 @@ def _check_frame(trace: Trace, i: int, action: Action) -> None:
 def checked_trace(value: object) -> Trace:
     """Return a value if it is a trace, or raise TraceError."""
     mend = "make one with Trace.load or Trace.from_steps"
-    return an_instance("trace", value, Trace, TraceError, mend=mend)
+    return checks.an_instance("trace", value, Trace, TraceError, mend=mend)
 
 
 def _dump(value: Mapping[str, Any]) -> str:
@@ -596,7 +588,7 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
     with said_of(where):
         for key in ("name", "images", "drive"):
             if record.get(key) is not None:
-                a_text(key, record[key], TraceError, mend="quote it or leave it out")
+                checks.a_text(key, record[key], TraceError, mend="quote it or leave it out")
         return {
             **record,
             "odometry": None if odometry is None else Odometry.of(odometry),

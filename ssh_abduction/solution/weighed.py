@@ -46,6 +46,8 @@ class Rival:
         aliases: For each closure of the trace, 0 if it is true, else the number of the alias that
             it is of; negative if the alias moves the first step of the closure, not the last one.
             Empty if all closures are true.
+        crowded: The nats by which the map is less probable than its cost says, beside the best
+            map, as more of its places are near each other.
     """
 
     nats: float
@@ -54,6 +56,7 @@ class Rival:
     estimated: bool = False
     faults: tuple[tuple[str, int], ...] = ()
     aliases: tuple[int, ...] = ()
+    crowded: float = 0.0
 
     @property
     def at(self) -> tuple[int, ...]:
@@ -66,6 +69,7 @@ class Rival:
         written |= {"places": list(self.places)} if self.places else {}
         written |= {"faults": [list(fault) for fault in self.faults]} if self.faults else {}
         written |= {"aliases": list(self.aliases)} if self.aliases else {}
+        written |= {"crowded": round(self.crowded, 6)} if abs(self.crowded) >= EQUAL else {}
         return written | ({"estimated": True} if self.estimated else {})
 
 
@@ -108,7 +112,7 @@ class Weighed:
     @cached_property
     def weights(self) -> tuple[float, ...]:
         """The probability of each rival, assuming that there are no other maps."""
-        less = [self.nats - rival.nats for rival in self.rivals]
+        less = [self.nats - rival.nats - rival.crowded for rival in self.rivals]
         likely = [math.exp(min(nats / self.excess, MOST)) for nats in less]
         return tuple(weight / sum(likely) for weight in likely)
 
@@ -375,6 +379,7 @@ def _rival(read: FieldReader, steps: int, value: Any, name: str) -> Rival:
         dstates=read.integers,
         places=read.integers,
         nats=read.number,
+        crowded=read.number,
         faults=faults,
         aliases=read.integers,
         estimated=lambda value, _: bool(value),

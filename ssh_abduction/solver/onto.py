@@ -45,7 +45,7 @@ from ssh_abduction.solution.result import Solution
 from ssh_abduction.solution.values import Bound, Cost, Effort, Level, Seconds, Status
 from ssh_abduction.solution.weighed import IMPROBABLE, Rival, Weighed
 from ssh_abduction.solver.board import Judging
-from ssh_abduction.solver.costs.estimating import may_join_more, rival_of, rivals_of
+from ssh_abduction.solver.costs.estimating import crowded, may_join_more, rival_of, rivals_of
 from ssh_abduction.solver.derived_regions import Deriving
 from ssh_abduction.solver.geometry.ranking import Ranking, noise_warning, units_warning
 from ssh_abduction.solver.schedule import turn
@@ -362,13 +362,14 @@ def laid(
     assert kept is not None
     assert best.fit is not None
     known = [rival_of(m, nats) for nats, m in found]
+    others = [replace(rival, estimated=True) for rival in known[1:]]
     moved = rivals_of(problem, misfit, best, turn("estimated rivals").most, len(old))
     at_least = problem.prior.at_least
     weighed = Weighed(
         bound=max(at_least({"dstates": c.dstates, "places": c.places}) for c in _costs(ssh_map))
         + kept.chi2 / 2,
         within=0.0,
-        rivals=(known[0], *(replace(rival, estimated=True) for rival in known[1:]), *moved),
+        rivals=crowded(problem, misfit, [known[0], *others, *moved]),
         searched=best.fit.p >= IMPROBABLE and not may_join_more(problem, known),
         broken=existing.broken,
         drives=drives_of(joint),

@@ -25,6 +25,7 @@ from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.sources.metric.beam import Beam
+from ssh_abduction.solver.sources.metric.joint_drives import Joining
 from ssh_abduction.theory.prior import spreads_of
 
 # The numbers of hypotheses of the beams, in their order.
@@ -125,7 +126,7 @@ class Beams:
     def _join(self) -> None:
         """Join the maps of single drives."""
         if (joining := self._parts.candidates.joining()) is not None:
-            maps = {self._add(one): one for one in self._parts.candidates.maps_of(joining)}
+            maps = self._maps_of(joining, None)
             nats = min(maps, default=math.inf)
             self._take(nats, -math.inf, joining.broken)
             self._has_joined = bool(maps) and len(maps[nats].pieces) == 1
@@ -179,7 +180,7 @@ class Beams:
 
     def _finish(self, beam: Beam, width: int) -> None:
         """Keep the maps that a beam ends with. Raises StageTimeError if it does not end in time."""
-        nats = self._maps_of(beam)
+        nats = min(self._maps_of(beam, 1), default=math.inf)
         self._ended = beam
         if width < BROAD and beam.drops:
             return
@@ -188,18 +189,19 @@ class Beams:
         estimate = beam.hypotheses[0].nats if beam.hypotheses else math.inf
         self._take(nats, estimate, broken)
 
-    def _maps_of(self, beam: Beam) -> float:
-        """Keep the maps that a beam ends with, and merge the places of the best one.
+    def _maps_of(self, guess: Beam | Joining, most: int | None) -> dict[float, SSHMap]:
+        """Keep the maps of a guess, and merge the places of its best `most`. Return all by cost.
 
-        Return the least cost. Raises StageTimeError if the beam does not end in time.
+        Raises StageTimeError if the guess does not end in time.
         """
         candidates = self._parts.candidates
-        found = {self._add(one): one for one in candidates.maps_of(beam)}
+        found = {self._add(one): one for one in candidates.maps_of(guess)}
         with suppress(StageTimeError):
-            best = found[min(found)] if found else None
-            if best and (merged := candidates.smoothed(self._misfit.beginning(best))) is not None:
-                found[self._add(merged)] = merged
-        return min(found, default=math.inf)
+            for nats in sorted(found)[:most]:
+                merged = candidates.smoothed(self._misfit.beginning(found[nats]))
+                if merged is not None:
+                    found[self._add(merged)] = merged
+        return found
 
     def _break_axioms(self) -> None:
         """Find `broken` with the widest beam that ended."""

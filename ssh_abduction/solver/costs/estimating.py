@@ -12,8 +12,11 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
 
 from ssh_abduction.data.drives import Drive, drive_of_steps, drives_of
 from ssh_abduction.data.groups import NodeClasses, gathered, indices_of, numbered
@@ -27,6 +30,7 @@ from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.fields import FAULT, MISREAD, ONE_WAY
 from ssh_abduction.theory.pairs import pairs_in
+from ssh_abduction.theory.prior import spreads_of
 from ssh_abduction.theory.settle import Problem
 
 if TYPE_CHECKING:
@@ -121,6 +125,22 @@ def rivals_with_misread_views(
     return found
 
 
+def crowded(problem: Problem, misfit: Misfit, rivals: Sequence[Rival]) -> tuple[Rival, ...]:
+    """Make rivals less probable that have more near places, or dstates of a place, than the best.
+
+    The cost takes poses to be independent, but the places of most buildings keep apart. How well
+    they do is learnt from the best map: the sum of its nearness as a share of the sum to expect.
+    The places of a log have a size, and floors lie above each other. There, nothing is changed.
+    """
+    theory, best = problem.theory, rivals[0]
+    if not best.places or theory.lifts or theory.jumped or spreads_of(problem.trace).any():
+        return tuple(rivals)
+    near = [misfit.nearness(rival.dstates, rival.places) for rival in rivals]
+    less = [(some.sum() + 1) / (expected + 1) - 1 for some, expected in near[0]]
+    nats = [-sum(np.log1p(k * x).sum() for (k, _), x in zip(of, less, strict=True)) for of in near]
+    return tuple(replace(r, crowded=float(x - nats[0])) for r, x in zip(rivals, nats, strict=True))
+
+
 def _joined(ssh_map: SSHMap, pairs: Iterable[tuple[int, int]]) -> tuple[int, ...]:
     """Join pairs of dstates, and what one action leads to from both. Return that of each step."""
     merged = NodeClasses[int]()
@@ -155,16 +175,10 @@ def maps_apart(
     They are estimated rivals, so they may break axioms. `seconds` is the time that estimating them
     may take.
     """
-    at = [best.dstates[label] for label in best.dstate_at]
     rivals = rivals_of(problem, misfit, best, seconds)
     apart = [rival for rival in rivals if len({rival.dstates[step] for step in pair}) > 1]
     for rival in sorted(apart, key=lambda rival: rival.nats):
-        like = dict(zip(rival.dstates, at, strict=True))
-        place = dict(zip(rival.dstates, rival.places or rival.dstates, strict=True))
-        places = [place[label] for label in range(len(place))]
-        facing = [-math.pi / 2 * (like[label].heading or 0) for label in range(len(like))]
-        found = completed(problem.trace, problem.theory, rival.dstates, places, facing)
-        if found is not None:
+        if (found := course_completed(problem, misfit, rival.dstates, rival.at)) is not None:
             yield found
 
 

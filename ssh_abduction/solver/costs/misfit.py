@@ -23,10 +23,13 @@ or one at least is of an alias, and then the misfit is at least that without clo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Hashable, Iterable, Iterator, Sequence
 from typing import TypeAlias
 
-from ssh_abduction.data.groups import NodeClasses, minimal_part, numbered
+import numpy as np
+
+from ssh_abduction.data.groups import NodeClasses, first_index_of, minimal_part, numbered
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solution.values import Cost
 from ssh_abduction.solver.geometry.equations import Aliases, Equations, visits_by_turns
@@ -35,6 +38,7 @@ from ssh_abduction.solver.geometry.poses import Poses, framed
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.fields import FAULT
+from ssh_abduction.theory.prior import AIM, UNKNOWN, Array
 from ssh_abduction.theory.settle import Problem
 
 # The heading of each step and the position of each step, numbered in the order of first steps, such
@@ -140,6 +144,25 @@ class Misfit:
     ) -> Aliases:
         """Return the alias of each closure in the best explanation; 0 if it is true."""
         return self._explained(dstates, places, wrong)[2]
+
+    def nearness(
+        self, dstates: Sequence[int], places: Sequence[int]
+    ) -> tuple[tuple[Array, float], tuple[Array, float]]:
+        """Tell how near each two places are, and each two dstates of a place, from 0 to 1.
+
+        That is the Gaussian of `Prior.chosen`. With it comes the sum over all pairs to expect if
+        poses were independent, and the square of a usual travel belonged to each place.
+        """
+        of = np.array(_of_headings(numbered(dstates), numbered(places)))
+        first = np.isin(range(len(of)), [*first_index_of(of.tolist()).values()])
+        poses, frame = framed(self.poses(dstates, places))
+        i, j = np.nonzero(np.triu(np.equal.outer(frame, frame), 1))
+        off, both, same = poses[i] - poses[j], first[i] & first[j], of[i] == of[j]
+        turn = (off[same, 2] + math.pi) % math.tau - math.pi
+        far = (off[both, :2] ** 2).sum(axis=1) / self._prior.near**2
+        of_places, of_dstates = np.exp(-far / 2), np.exp(-(turn**2) / AIM**2 / 2)
+        expected = len(far) * math.pi / 2 / first.sum(), len(turn) * float(UNKNOWN[1])
+        return (of_places, expected[0]), (of_dstates, expected[1])
 
     def beginning(self, ssh_map: SSHMap) -> tuple[list[int], list[int], Poses]:
         """Return the dstates and places of a map for `smoothed`, and their equations."""

@@ -47,6 +47,7 @@ from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
     Course,
     course_completed,
+    crowded,
     dstates_and_places,
     least_places,
     may_join_more,
@@ -401,10 +402,8 @@ class Weighing:
         """Collect what is known about the costs of maps; None if no map is known."""
         if not self.candidates:
             return None
-        rivals: dict[Course, Rival] = {}
-        for candidate in self.candidates:
-            rival = rival_of(candidate.map, candidate.nats)
-            rivals.setdefault((rival.dstates, rival.places), rival)
+        known = (rival_of(candidate.map, candidate.nats) for candidate in self.candidates)
+        rivals = firsts(((rival.dstates, rival.places), rival) for rival in known)
         found, excess, doubt = list(rivals.values()), self._excess(), None
         problem = self._task.problem
         is_likely = excess < math.inf and not may_join_more(problem, found)
@@ -418,7 +417,7 @@ class Weighing:
         return Weighed(
             bound=self.bound,
             within=min(self._listed, self._within),
-            rivals=tuple(map(self._with_aliases, every)),
+            rivals=crowded(problem, self._misfit, [*map(self._with_aliases, every)]),
             searched=is_likely and self.beams.found(self._nats),
             broken=self.beams.broken,
             excess=excess if excess < math.inf else 1.0,
