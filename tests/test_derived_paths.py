@@ -17,7 +17,7 @@ from perception.places.passages import (
     STEP,
     WIDE,
     doors_in,
-    is_beside_furniture,
+    has_straight_walls,
     openings_in,
     resampled,
 )
@@ -468,12 +468,21 @@ def test_doors_are_narrow_with_wider_space_on_both_sides() -> None:
     wide[18:20] = 0.9
     assert doors_in(wide) == [18]
     assert doors_in(np.full(40, 1.2)) == []  # a narrow corridor is no door
+    wide[12:24] = 0.9  # but a short one between two rooms is
+    assert doors_in(wide) == [17]
+    wide[:8], wide[26:] = 1.0, 1.0  # and a part of a corridor between two openings is none
+    assert doors_in(wide) == []
+    wide[:18], wide[18:20] = 3.0, 0.9
     wide[20:] = 0.9  # nor is one end of a narrow corridor
     assert doors_in(wide) == []
     wide[8:33] = 1.3  # but both ends can be doors
     wide[[8, 9, 31, 32]] = 1.0
     wide[33:] = 3.0
     assert doors_in(wide) == [8, 31]
+    wide[:34], wide[34:] = 3.0, 1.0  # A closet has a door, but a narrow corridor may go on.
+    assert doors_in(wide, (True, True)) == [34]
+    assert doors_in(wide[::-1], (True, False)) == [5]
+    assert doors_in(wide) == []
 
 
 def test_furniture_at_one_wall_of_a_corridor_makes_no_door() -> None:
@@ -483,7 +492,7 @@ def test_furniture_at_one_wall_of_a_corridor_makes_no_door() -> None:
     way = np.stack([STEP * np.arange(40), off], axis=1)
 
     def is_furniture(one: NDArray[np.float64], other: NDArray[np.float64], k: int = 19) -> bool:
-        return is_beside_furniture(k, way, np.stack([one - off, other + off], axis=1))
+        return has_straight_walls(k, way, np.stack([one - off, other + off], axis=1))
 
     assert is_furniture(left, right)
     assert is_furniture(right, left)
@@ -491,6 +500,16 @@ def test_furniture_at_one_wall_of_a_corridor_makes_no_door() -> None:
     left[22:] = 2.0  # A door in the corner of a room has a wider room behind it.
     assert not is_furniture(left, right)
     assert not is_furniture(right, right, 1)  # The course begins here.
+
+
+def test_openings_on_both_sides_of_a_corridor_make_no_door() -> None:
+    way = np.stack([STEP * np.arange(40), np.zeros(40)], axis=1)
+    sides = np.full((40, 2), 0.6)
+    sides[10:16, 0], sides[20:26, 1] = 3.0, 3.0
+    assert has_straight_walls(18, way, sides)
+    assert has_straight_walls(18, way, sides[:, ::-1])
+    sides[16:20] = 0.3  # but jambs stand out of the walls
+    assert not has_straight_walls(18, way, sides)
 
 
 def test_openings_are_deep_parts_of_a_wall() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from perception.places.distinctive import Visit, Way, find_visits
 from perception.places.local_map import CELL, LocalMaps, Patch, Recent
+from perception.places.passages import Passages
 from perception.places.skeleton import junctions
 from perception.places.track import Track
 from perception.readers.scans import LaserScanner, RobotLog, Scan
@@ -194,6 +195,19 @@ FORK: Segments = [
     (11, 1, 11, 10),
     (9, 10, 11, 10),
 ]
+
+
+def test_openings_on_two_sides_stay_apart_beyond_the_start_of_a_course() -> None:
+    """Each shows at one point of its side, like clutter. On one side, they would be wide space."""
+    walls: Segments = [(-6, 0.6, -0.65, 0.6), (0.15, 0.6, 8, 0.6), (-6, -0.6, -0.4, -0.6)]
+    walls += [(0.4, -0.6, 1.5, -0.6), (1.5, -0.6, 1.5, -3), (1.5, -3, 8, -3), (8, -3, 8, 0.6)]
+    log, track = log_of(walls, [(-6, 0), (7, 0)])
+    first, last = (
+        Visit(scan, np.array([x, 0.0]), scan, scan) for scan, x in ((30, 0.0), (60, 6.0))
+    )
+    found = Passages(log, track).along(np.array([[0.0, 0.0], [6.0, 0.0]]), first, last)
+    assert np.array(found["widths"])[[1, 5]] == pytest.approx(0.6, abs=0.1)
+    assert not [door for door in found["doors"] if door["side"] == "through"]
 
 
 def test_find_visits_at_a_fork_and_at_a_turn_in_a_dead_end() -> None:

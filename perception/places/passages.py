@@ -7,7 +7,7 @@ local maps also show doors and other openings in the walls that the robot passes
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,10 +25,11 @@ STEP, EVERY, REACH, STRETCH = 0.25, 0.3, 3.0, 2.0
 # Walls farther than WIDE metres count as WIDE metres away. A wall is beside a point if it is within
 # ALONG metres of it, measured along the course.
 WIDE, ALONG = 4.0, 0.3
-# A door is at most DOOR metres wide. Within NEAR metres before and behind it, the free space is
-# wider by WIDER metres. A wall is known to half a cell, so two widths of one passage differ by two
-# cells at most.
-DOOR, NEAR, WIDER = 1.45, 2.0, 2.5 * CELL
+# A door is at most DOOR metres wide. The free space before and behind it is wider by WIDER metres.
+# A wall is known to half a cell, so two widths of one passage differ by two cells at most. These
+# wider parts are at most NEAR metres apart: a longer narrow part is a corridor with openings beside
+# it. But if both are longer than NEAR metres, they are rooms, and may be twice as far apart.
+DOOR, NEAR, WIDER = 1.45, 2.0, 2 * CELL
 # Walls go on if GO_ON points on each side of a narrow part are on one line.
 GO_ON = 3
 # A part of a wall is an opening if there the free space reaches DEEP metres farther than beside it,
@@ -36,6 +37,7 @@ GO_ON = 3
 DEEP, LEAST, MOST, BESIDE = 0.6, 0.5, 1.8, 2.5
 # The robot drove over what is less than DRIVEN metres beside its course, so no wall is there.
 DRIVEN = 0.15
+_SIDES = (0, 1), (1, 0)  # left and right, and right and left
 _TURN = 0.5  # A scan is also used if the robot turned by this angle in radians.
 
 
@@ -87,15 +89,18 @@ class Passages:
         # Earlier scans are not needed again, so the local maps may forget them.
         self._recent.drop_before(self._recent.at(self._recent.way(self._near(first.scan)) - REACH))
         walls, free = self._beside(way, first.scan, last.scan)
-        before = self._beyond(way[::-1], first.scan)[::-1]
-        beyond = self._beyond(way, last.scan)
+        back, before = self._beyond(way[::-1], first.scan)
+        on, beyond = self._beyond(way, last.scan)
+        whole = np.concatenate([back[::-1], way, on])
+        # Left of the way back is right of the way on.
+        sides = np.concatenate([before[::-1, ::-1], walls, beyond])
         # Clutter shows at one point of a side, and a jamb at two: a course may cross it aslant.
-        sides = ndimage.median_filter(np.concatenate([before, walls, beyond]), (3, 1))
-        wide = sides.sum(axis=1)
+        sides = ndimage.median_filter(sides, (3, 1))
+        ends = [len(part) < round(NEAR / STEP) for part in (back, on)]
         through = [
             {"at": round(k * STEP, 2), "width": round(float(walls[k].sum()), 2), "side": "through"}
-            for k in (k - len(before) for k in doors_in(wide))
-            if 0 < k < len(way) - 1 and not is_beside_furniture(k, way, walls)
+            for k in (door - len(back) for door in doors_in(sides.sum(axis=1), ends))
+            if 0 < k < len(way) - 1 and not has_straight_walls(k + len(back), whole, sides)
         ]
         aside = [
             {"at": round(at * STEP, 2), "width": round(length, 2), "side": side}
@@ -104,15 +109,19 @@ class Passages:
         ]
         return {"widths": np.round(walls, 2).tolist(), "doors": through + aside}
 
-    def _beyond(self, way: Array, scan: int) -> Array:
-        """Measure the widths straight on beyond the end of a way, up to NEAR metres or a wall."""
+    def _beyond(self, way: Array, scan: int) -> tuple[Array, Array]:
+        """Go straight on beyond the end of a way, up to NEAR metres or a wall.
+
+        Returns:
+            The points, and how far walls are on the left and right of each, both (n, 2) metres.
+        """
         ahead = directions(way)[-1]
         more = way[-1] + np.arange(1, round(NEAR / STEP) + 1)[:, None] * STEP * ahead
         patch = self._maps.around(self._near(scan), way[-1], WIDE + NEAR)
         cells = np.rint((more - patch.corner) / CELL).astype(int)
         open_ = patch.free[cells[:, 0], cells[:, 1]]
         more = more[: len(more) if open_.all() else int(np.argmin(open_))]
-        return self._beside(np.concatenate([way[-1:], more]), scan, scan)[0][1:]
+        return more, self._beside(np.concatenate([way[-1:], more]), scan, scan)[0][1:]
 
     def _near(self, scan: int) -> int:
         """The index of the chosen scan that is next to a scan."""
@@ -158,25 +167,42 @@ def directions(way: Array) -> Array:
     return np.asarray(off / np.maximum(np.hypot(*off.T), 1e-6)[:, None])
 
 
-def doors_in(wide: Array) -> list[int]:
+def doors_in(wide: Array, ends: Sequence[bool] = (False, False)) -> list[int]:
     """Find the points of a course at which it passes a door.
 
-    `wide` has the free space across the course, (n,) metres, every STEP metres.
+    `wide` has the free space across the course, (n,) metres, every STEP metres. `ends` says whether
+    there are walls across its beginning and its end: a narrow part there is a closet.
     """
     from scipy.signal import find_peaks
 
-    window = 2 * round(NEAR / STEP) + 1
-    found, _ = find_peaks(-wide, height=-DOOR, prominence=WIDER, wlen=window)
-    return [int(k) for k in found]
+    peaks, _ = find_peaks(-wide, height=-DOOR, prominence=WIDER)
+    found, near = [], round(NEAR / STEP)
+    for k in map(int, peaks):
+        wider = wide > wide[k] + WIDER - 1e-6  # as find_peaks rounds
+        begin, end = np.flatnonzero(wider[:k])[-1], k + np.flatnonzero(wider[k:])[0]
+        parts = wider[max(begin - near, 0) : begin + 1], wider[end : end + near + 1]
+        is_between_rooms = min(part.sum() for part in parts) > near
+        if end - begin <= (2 * near if is_between_rooms else near):
+            found.append(k)
+    closets = [len(wide) - 1 - k for k in _closet_in(wide[::-1])] * ends[0]
+    closets += _closet_in(wide) * ends[1]
+    return found + [k for k in closets if all(abs(k - door) * STEP > NEAR for door in found)]
 
 
-def is_beside_furniture(k: int, way: Array, sides: Array) -> bool:
-    """Whether only furniture makes a way narrow at its point k.
+def _closet_in(wide: Array) -> list[int]:
+    """The first point of the narrow part at the end of a course, if it is short."""
+    begin = len(wide) - int(np.argmin((wide <= DOOR)[::-1]))
+    return [begin] if 0 < (len(wide) - begin) * STEP <= NEAR else []
 
-    Both walls go straight on before and behind it, and one of them beside it, too. `way` has the
-    points, and `sides` how far walls are on the left and right of each, both (n, 2) metres.
+
+def has_straight_walls(k: int, way: Array, sides: Array) -> bool:
+    """Whether a way is narrow at its point k, but the walls there are no jambs of a door.
+
+    Furniture: both walls go straight on before and behind it, and one of them beside it, too.
+    Openings: one wall goes straight on from before it, and the other to behind it. The way is wide
+    there as the opposite walls have openings. `way` has the points, and `sides` how far walls are
+    on the left and right of each, both (n, 2) metres.
     """
-    sides = ndimage.median_filter(sides, (3, 1))
     wide, left = sides.sum(axis=1), to_the_left(way)
     wider = np.flatnonzero(wide >= wide[k] + WIDER)
     before, behind = wider[wider < k][-GO_ON:], wider[wider > k][:GO_ON]
@@ -184,7 +210,14 @@ def is_beside_furniture(k: int, way: Array, sides: Array) -> bool:
         return False
     walls = way + sides[:, [0]] * left, way - sides[:, [1]] * left
     beside = [_is_straight(wall[before[0] : behind[-1] + 1]) for wall in walls]
-    return all(_is_straight(wall[[*before, *behind]]) for wall in walls) and sum(beside) == 1
+    if all(_is_straight(wall[[*before, *behind]]) for wall in walls) and sum(beside) == 1:
+        return True
+    begin, end = before[-1] + 1, behind[0]
+    parts = (begin - GO_ON, end), (begin, end + GO_ON)
+    go_on = [[_is_straight(wall[slice(*part)]) for wall in walls] for part in parts]
+    beyond = sides[begin - GO_ON : begin], sides[end : end + GO_ON]
+    opens = [np.median(some, axis=0) >= sides[k] + WIDER for some in beyond]
+    return any(go_on[0][x] and opens[0][y] and go_on[1][y] and opens[1][x] for x, y in _SIDES)
 
 
 def _is_straight(points: Array) -> bool:

@@ -175,14 +175,10 @@ def with_doors(plan: FloorPlan, room: dict[int, int], ssh_map: SSHMap) -> tuple[
         for passage in edge.passages:
             if passage.side == "through":
                 x, y = (round(float(v), 2) for v in edge.course[passage.at])
-                new = MapDoor(
-                    len(found),
-                    (x, y),
-                    passage.width,
-                    tuple(sorted(p for p in edge.ends if p >= 0)),
-                    tuple(sorted({room[p] for p in edge.ends})),
-                    tuple(sorted({ssh_map.dstate_at[t] for t in edge.travels})),
-                )
+                places = tuple(sorted(p for p in edge.ends if p >= 0))
+                rooms = tuple(sorted({room[p] for p in edge.ends}))
+                dstates = tuple(sorted({ssh_map.dstate_at[t] for t in edge.travels}))
+                new = MapDoor(len(found), (x, y), passage.width, places, rooms, dstates)
                 halves = (d for d in found if d.rooms == new.rooms)
                 number = next((d.id for d in halves if math.dist(d.at, new.at) < HALF), new.id)
                 found[number : number + 1] = [
@@ -228,43 +224,26 @@ def corridors_of(
         far, stops = way.metres, dict(zip(way.places, way.stops, strict=True))
         for begin, end in long_parts(way):
             order = tuple(p for p in path.order if begin <= stops[p] <= end)
+            metres = [round(float(m), 1) for m in far - far[begin]]
             driven = [
-                WayOut(
-                    side,
-                    round(float(far[stops[p]] - far[begin]), 1),
-                    p,
-                    door,
-                    to if to >= 0 else None,
-                )
+                WayOut(side, metres[stops[p]], p, door, to if to >= 0 else None)
                 for p, side, to, door in beside.get(path.id, ())
                 if p in order
             ]
-            seen = [
-                WayOut(p.side, round(float(far[p.at] - far[begin]), 1))
-                for p in way.passages
-                if p.side != "through" and begin < p.at < end
-            ]
+            inside = [p for p in way.passages if begin < p.at < end]
+            seen = [WayOut(p.side, metres[p.at]) for p in inside if p.side != "through"]
             new = [
                 o
                 for o in seen
                 if all(o.side != d.side or abs(o.metres - d.metres) > BESIDE for d in driven)
             ]
-            across = {p.door for p in way.passages if p.door is not None and begin < p.at < end}
+            across = tuple(sorted({p.door for p in inside if p.door is not None}))
+            openings = tuple(sorted([*driven, *new], key=lambda o: (o.metres, o.side)))
             if len(order) > 1:
-                corridor = Corridor(
-                    0,
-                    path.id,
-                    order,
-                    chain_points(way.line[begin : end + 1]),
-                    round(float(far[end] - far[begin]), 1),
-                    round(float(np.median(way.widths[begin : end + 1])), 2),
-                    tuple(sorted(across)),
-                    tuple(sorted([*driven, *new], key=lambda o: (o.metres, o.side))),
-                    path.left,
-                    path.right,
-                    path.around,
-                )
-                found.append(corridor)
+                line = chain_points(way.line[begin : end + 1])
+                width = round(float(np.median(way.widths[begin : end + 1])), 2)
+                size, sides = (metres[end], width), (path.left, path.right, path.around)
+                found.append(Corridor(0, path.id, order, line, *size, across, openings, *sides))
     found = [c for c in found if not _is_closet(c, {room[p] for p in c.order}, doors)]
     found.sort(key=lambda c: -c.length)
     return tuple(replace(c, id=k) for k, c in enumerate(found))
