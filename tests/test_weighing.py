@@ -806,6 +806,16 @@ def test_joins_across_missing_displacements_need_others(
     assert ((weighed.confidence or 0.0) > 0.95) is confirmed
 
 
+def test_return_over_gaps_costs_the_same_to_each_part() -> None:
+    """Nothing says where the first two steps lie. So a return to either is as probable."""
+    trace = Trace.from_steps("aaaa", ["travel"] * 3, displacements=[None, None, (7.0, -3.0, -0.3)])
+    problem = settle(trace, Theory.causal())
+    courses = [(0, 1, 2, 0), (0, 1, 2, 1)]
+    found = [Misfit(problem).nats_of_course(at, at) for at in courses]
+    checked = [cost_of(trace, problem.theory, at, at, ())[0] for at in courses]
+    assert found + checked == pytest.approx([found[0]] * 4)
+
+
 def test_checker_begins_near_closures_that_connect_parts() -> None:
     """Two drives through a triangle share no place. Closures say how they lie."""
     right, left, behind = (0.0, 0.0, -1.8), (0.0, 0.0, 1.8), (0.0, 0.0, -3.1)

@@ -359,11 +359,7 @@ class _Errors:
                 self._root[t] = np.linalg.cholesky(np.array(trace.covariance(t)))
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
         self._scaled = np.array([step.displacement is not None for step in trace.steps])
-        # If a heading after a gap is too far off, Gauss-Newton fails. So begin near the solution.
         given = aliases or [0] * len(trace.closures)
-        believed = [c for c, alias in zip(trace.closures, given, strict=True) if not alias]
-        for t, likely in _likely_moves(self._moved, missing, dstates, places, believed):
-            self._moved[t] = likely
         self._alias = abs(np.array(given, dtype=int))
         self._aliases = int(self._alias.max(initial=0))
         self._sigma = np.array([odometry.scale, odometry.bend])
@@ -390,6 +386,21 @@ class _Errors:
             last |= dict.fromkeys(here, t)
         self._loops = np.array(ends, dtype=int).reshape(-1, 2).T
         self._counts = np.array(counts, dtype=bool).reshape(-1, 3)
+        # After a gap, dead reckoning begins at the last earlier step of the same piece of the map;
+        # or else of one at a place of this piece; or else at the step before. So the prior of a
+        # missing displacement does not depend on where other pieces lie.
+        pieces, steps = NodeClasses[int](), range(len(trace))
+        for i, j in [*self._connected(), *self._loops.T[self._counts[:, 2]].tolist()]:
+            pieces.merge(i, j)
+        before = self._before = dict[int, int]()
+        for t in missing:
+            there = {places[u] for u in steps if pieces.are_one(t, u)}
+            near = [u for u in range(t) if places[u] in there] or [t - 1]
+            before[t] = ([u for u in range(t) if pieces.are_one(t, u)] or near)[-1]
+        # If a heading after a gap is too far off, Gauss-Newton fails. So begin near the solution.
+        believed = [c for c, alias in zip(trace.closures, given, strict=True) if not alias]
+        for t, likely in _likely_moves(self._moved, missing, before, dstates, places, believed):
+            self._moved[t] = likely
 
     def least(self) -> float:
         """Compute the least sum of squares of the errors, in standard deviations."""
@@ -420,11 +431,15 @@ class _Errors:
     def laid(self, dstates: Sequence[int]) -> dict[int, tuple[int, _Frame]]:
         """Return the piece of the map, which displacements connect, and the pose of each dstate."""
         pose, pieces = self._poses(self._best)[1], NodeClasses[int]()
-        moves = [(t - 1, t) for t in range(1, len(dstates)) if t not in self._missing]
-        for i, j in [*moves, *self._closures.T[self._alias == 0].tolist()]:
+        for i, j in self._connected():
             pieces.merge(dstates[i], dstates[j])
         first = firsts((s, pose[t]) for t, s in enumerate(dstates)).items()
         return {s: (pieces.of(s), (complex(x, y), float(turn))) for s, (x, y, turn) in first}
+
+    def _connected(self) -> list[list[int]]:
+        """List the pairs of steps that a displacement or a believed closure connects."""
+        moves = [[t - 1, t] for t in range(1, len(self._moved)) if t not in self._missing]
+        return [*moves, *self._closures.T[self._alias == 0].tolist()]
 
     def repeats(
         self, dstates: Sequence[int], places: Sequence[int], near: float
@@ -512,16 +527,24 @@ class _Errors:
         scale, bend = (self._sigma[k] * z[..., k - 2, None] for k in (0, 1))
         moved = self._moved + np.einsum("tij,...tj->...ti", self._root, noise)
         turned = moved[..., 2] - bend * self._way
-        heading = np.cumsum(turned, axis=-1)
+        heading = self._summed(turned[..., None])[..., 0]
         middle = heading - turned - bend * self._way / 2
         scale = scale * self._scaled  # a missing displacement is in metres of the world
-        way = np.cumsum(_turned(moved, middle) / (1 + scale[..., None]), axis=-2)
+        way = self._summed(_turned(moved, middle) / (1 + scale[..., None]))
         pose = np.concatenate([way, heading[..., None]], axis=-1)
         if not len(self._off):
             return pose, pose
         off = off * self._off
         aside = np.concatenate([_turned(off, heading - off[..., 2]), off[..., 2:]], axis=-1)
         return pose, pose - aside
+
+    def _summed(self, moved: _Numbers) -> _Numbers:
+        """Add up what steps add, (…, steps, n). After a gap, begin at the step `before` it."""
+        found = np.zeros_like(moved)
+        for a, b in pairwise([0, *self._missing, len(self._moved)]):
+            begin = found[..., [self._before[a]], :] if a else 0.0
+            found[..., a:b, :] = begin + np.cumsum(moved[..., a:b, :], axis=-2)
+        return found
 
     def _parts(self, z: _Numbers) -> list[_Numbers]:
         """Split unknowns, (…, unknowns), into errors, (…, n, 3).
@@ -588,11 +611,12 @@ def _off_dstates(trace: Trace) -> Array:
 def _likely_moves(
     moved: Array,
     missing: Sequence[int],
+    before: Mapping[int, int],
     dstates: Sequence[int],
     places: Sequence[int],
     closures: Sequence[Closure],
 ) -> Iterator[tuple[int, tuple[float, float, float]]]:
-    """Guess the displacements that lead to the `missing` steps.
+    """Guess the displacements that lead to the `missing` steps from those that come `before`.
 
     `moved`, of shape (n, 3), has the displacement that leads to each step, in metres and radians.
     `dstates` and `places` have the dstate and the place of each step.
@@ -615,7 +639,7 @@ def _likely_moves(
         for t in stretch:
             pose[t] = _beyond(frame, pose[t])
     for t in missing:
-        (at, heading), (after, facing) = pose[t - 1], pose[t]
+        (at, heading), (after, facing) = pose[before[t]], pose[t]
         gone = (after - at) * cmath.rect(1, -heading)
         yield t, (gone.real, gone.imag, math.remainder(facing - heading, math.tau))
 

@@ -88,12 +88,7 @@ COUNTED = (
     ),
 )
 WEIGHED = (
-    SourceTurn(
-        "sketch",
-        "all",
-        "There must be a map before any long source begins.",
-        share=0.4,
-    ),
+    SourceTurn("sketch", "all", "There must be a map before any long source begins.", share=0.4),
     SourceTurn(
         "smoothing",
         "displacements, no lifts, no faults within a drive but misread views without stars",

@@ -277,11 +277,9 @@ class Weighing:
                 self.add(known.best)
         finally:
             if not self.proven:
-                first, dstates = self._counts[0], known.bound.dstates or 0
-                tenths = max(known.bound.tenths or 0, 10 * dstates)
-                self._raise_bound(
-                    self._at_least({first: dstates if first == "dstates" else tenths})
-                )
+                dstates, tenths = known.bound.dstates or 0, known.bound.tenths or 0
+                least = {"dstates": dstates, "tenths": max(tenths, 10 * dstates)}
+                self._raise_bound(self._at_least({self._counts[0]: least[self._counts[0]]}))
             if self.candidates:
                 best = self.candidates[0].map
                 known.keep(Found.of(best, self._task.theory), best.dstate_at)

@@ -99,11 +99,17 @@ class Poses:
         # that they connect.
         sure = self._alias == 0
         graph = _graph(self._from[sure], self._to[sure], self._headings)
-        # The poses on both sides of each missing displacement, and the pose of the first step.
+        self._group = connected_components(graph, directed=False)[1]
+        # The prior connects the pose of a step without a displacement to that of the last earlier
+        # step of its group; or else of one at a place of this group; or else of the step before.
         steps = np.arange(self._dstates, self._headings) if said.spreads.any() else labels
         missing = np.setdiff1d(range(1, len(labels)), of_steps.last[of_steps.scaled == 1])
-        self._missing, self._origin = (steps[missing - 1], steps[missing]), int(labels[0])
-        self._group = connected_components(graph, directed=False)[1]
+        group, place, before = self._group[labels], self._place[labels], list[int]()
+        for t in missing.tolist():
+            own = np.flatnonzero(group[:t] == group[t])
+            near = np.flatnonzero(np.isin(place[:t], place[group == group[t]]))
+            before.append([t - 1, *near[-1:].tolist(), *own[-1:].tolist()][-1])
+        self._missing, self._origin = (steps[before], steps[missing]), int(labels[0])
 
     @cached_property
     def best(self) -> tuple[Array, float]:
@@ -401,8 +407,8 @@ class Poses:
     def _factored(self, unknown: Array, wide: Array) -> Any:
         """Factor the information matrix of the unknowns.
 
-        Where a displacement is missing, the prior connects the poses on both sides. So the matrix
-        is regular.
+        Where a displacement is missing, the prior connects a step to an earlier one. So the matrix
+        is regular. Its determinant does not depend on where groups lie that nothing connects.
         """
         whole, missing = copy(self), self._missing
         none = np.zeros(len(missing[0]))
@@ -429,10 +435,8 @@ class Poses:
         """
         factor = self._factored(unknown, wide)
         size = float(np.log(np.abs(factor.U.diagonal())).sum()) / 2
-        places, robots = (
-            len({*self._place[: self._dstates].tolist()}),
-            self._headings - self._dstates,
-        )
+        places = len({*self._place[: self._dstates].tolist()})
+        robots = self._headings - self._dstates
         size += int(self._alias.max(initial=0)) * float(np.log(wide).sum()) / 2
         each = math.log(wide[0]), math.log(wide[2]) / 2, -1.5 * math.log(math.tau)
         return size + places * each[0] + self._dstates * each[1] + robots * each[2]

@@ -76,9 +76,7 @@ class Log:
         return self._pairs is not None
 
     def replay(
-        self,
-        labels: Sequence[int],
-        place_of: Sequence[int | None] | None = None,
+        self, labels: Sequence[int], place_of: Sequence[int | None] | None = None
     ) -> tuple[int, ...]:
         """Replay the trace over the map that `labels` make of its first steps.
 

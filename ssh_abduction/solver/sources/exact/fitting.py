@@ -116,11 +116,7 @@ class Fitting:
             yield from self.maps(labels, "opt", options=("--opt-strategy=usc",))
 
     def maps(
-        self,
-        labels: Sequence[int],
-        mode: str,
-        conflicts: int = -1,
-        options: tuple[str, ...] = (),
+        self, labels: Sequence[int], mode: str, conflicts: int = -1, options: tuple[str, ...] = ()
     ) -> Generator[Found, None, bool]:
         """Yield maps with these dstates. Return whether clingo ended before the limit of conflicts.
 

@@ -23,7 +23,6 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ssh_abduction.data.groups import firsts, gathered, numbered
 from ssh_abduction.data.maps import SSHMap
@@ -138,10 +137,6 @@ class Overlay:
         """Whether a place has only one dstate for each direction of a path."""
         return "one_dstate_per_course" not in self._problem.theory.without
 
-    @property
-    def _has_places(self) -> bool:
-        return self._problem.theory.level == "topological"
-
     def merge(self, old: int, new: int, turn: float | None = None) -> bool:
         """Merge a dstate of the old map with one of the drive, and then all that coincide.
 
@@ -226,29 +221,23 @@ class Overlay:
 
     def _surest(self) -> tuple[int, int] | None:
         """Find the two places that most surely coincide; None if there are none."""
-        places, squares, size = self._differences()
-        unlikely = squares + np.log(size) + 2 * self._changes[np.ix_(places, places)]
-        unlikely[squares > FAR] = math.inf
-        i, j = np.unravel_index(np.argmin(unlikely), unlikely.shape)
-        return None if math.isinf(unlikely[i, j]) else (int(places[i]), int(places[j]))
-
-    def _differences(self) -> tuple[NDArray[np.int_], Array, Array]:
-        """Return the places, and for each two the chi-square and the determinant of their offset.
-
-        The determinant is that of its covariance.
-        """
         state = self._state
         places = np.array(sorted(set(state.place)))
         at = np.stack([self._position[places], self._position[places] + 1], 1)
         c = state.covariance
         across = c[at[:, None, :, None], at[None, :, None, :]]
         own = c[at[:, :, None], at[:, None, :]]
+        # The chi-square of the offset of each two places, and the determinant of its covariance.
         spread = own[:, None] + own - across - across.swapaxes(2, 3) + np.diag(self._spreads[:2])
         off = state.mean[at][:, None] - state.mean[at]
         a, b, d = spread[..., 0, 0], spread[..., 0, 1], spread[..., 1, 1]
         size = np.maximum(a * d - b * b, BLUR**2)
         x, y = off[..., 0], off[..., 1]
-        return places, (d * x * x - 2 * b * x * y + a * y * y) / size, size
+        squares = (d * x * x - 2 * b * x * y + a * y * y) / size
+        unlikely = squares + np.log(size) + 2 * self._changes[np.ix_(places, places)]
+        unlikely[squares > FAR] = math.inf
+        i, j = np.unravel_index(np.argmin(unlikely), unlikely.shape)
+        return None if math.isinf(unlikely[i, j]) else (int(places[i]), int(places[j]))
 
     def _tried(
         self,
@@ -267,7 +256,7 @@ class Overlay:
         self._state = before.copy()
         try:
             touched = set()
-            if places and self._has_places:
+            if places and self._problem.theory.level == "topological":
                 self._merge_places(*places, heading=None)
                 touched = {places[0]}
             elif places:

@@ -144,7 +144,7 @@ class Classes:
             ranked = self._ranked(root, fits)
             if not ranked:
                 self.known[root] = has_changed = True
-            elif _is_ahead(ranked, evidence):
+            elif ranked[0][0] >= evidence + sum(votes for votes, _ in ranked[1:2]):
                 self.merge(ranked[0][1], root, forced=True)
                 has_changed = True
         return has_changed
@@ -209,11 +209,6 @@ class Classes:
             self.known[b] = known
             self.root[self._members[b]] = b
         self._undo = []
-
-
-def _is_ahead(ranked: Sequence[tuple[int, int]], evidence: int) -> bool:
-    """Whether the evidence for the best merge exceeds that for the next best by this much."""
-    return ranked[0][0] >= evidence + (ranked[1][0] if len(ranked) > 1 else 0)
 
 
 @dataclass(frozen=True)
