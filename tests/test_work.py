@@ -18,6 +18,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.runtime.clock import CONFLICT, counting, look_at_clock, now, work_done
 from ssh_abduction.runtime.limits import LimitError, StageTimeError, Watch
+from ssh_abduction.solution import Progress
 from ssh_abduction.solver.asp.control import Asker
 
 ROUTE = Path(__file__).parent.parent / "examples" / "aces3-route.jsonl"
@@ -63,6 +64,13 @@ def test_threads_give_one_answer(seed: int, work: float) -> None:
         first, *others = pool.map(answer, range(4))
     assert others == [first] * 3
     assert first[1] == pytest.approx(work, abs=0.3)
+
+
+def test_progress_of_an_infinite_work_limit_names_no_units() -> None:
+    found: list[Progress] = []
+    solve(Trace.load(ROUTE)[:6], work_limit=math.inf, on_progress=found.append)
+    assert found
+    assert not any(progress.work or "units" in progress.sentence for progress in found)
 
 
 @pytest.mark.parametrize("work", [0, -1, math.nan, "much"])

@@ -227,7 +227,7 @@ class Parts:
         is_read = self._on_progress is not None or PROGRESS.isEnabledFor(logging.INFO)
         if self._is_part or not is_read:
             return
-        known, watch = self.known, self.watch
+        known, watch, left = self.known, self.watch, self.watch.left()
         progress = Progress(
             self.engine.size,
             len(self.task.trace),
@@ -235,7 +235,7 @@ class Parts:
             known.bound,
             known.count,
             watch.seconds(),
-            (watch.elapsed(), watch.left()) if watch.counts_work else None,
+            (watch.elapsed(), left) if watch.counts_work and left < math.inf else None,
         )
         news = (progress.cost, progress.bound)
         log_progress(progress.sentence, logging.DEBUG if news == self._news else logging.INFO)
