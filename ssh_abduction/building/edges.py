@@ -133,27 +133,15 @@ class PlanEdge:
     def turned(self) -> PlanEdge:
         """The edge from its second end to its first."""
         last, other = len(self.course) - 1, {"left": "right", "right": "left"}
-        passages = (
-            replace(p, at=last - p.at, side=other.get(p.side, p.side)) for p in self.passages
-        )
-        return PlanEdge(
-            self.ends[::-1],
-            self.course[::-1],
-            self.travels,
-            self.widths[::-1, ::-1],
-            tuple(sorted(passages, key=lambda p: p.at)),
-        )
+        back = [replace(p, at=last - p.at, side=other.get(p.side, p.side)) for p in self.passages]
+        passages, widths = tuple(sorted(back, key=lambda p: p.at)), self.widths[::-1, ::-1]
+        return PlanEdge(self.ends[::-1], self.course[::-1], self.travels, widths, passages)
 
     def cut(self, begin: int, end: int, ends: tuple[int, int]) -> PlanEdge:
         """The part from one point of the course to another, both included."""
         inside = (p for p in self.passages if begin <= p.at <= end)
-        return PlanEdge(
-            ends,
-            self.course[begin : end + 1],
-            self.travels,
-            self.widths[begin : end + 1],
-            tuple(replace(p, at=p.at - begin) for p in inside),
-        )
+        passages, part = tuple(replace(p, at=p.at - begin) for p in inside), slice(begin, end + 1)
+        return PlanEdge(ends, self.course[part], self.travels, self.widths[part], passages)
 
 
 @dataclass(eq=False)

@@ -171,8 +171,8 @@ def with_doors(plan: FloorPlan, room: dict[int, int], ssh_map: SSHMap) -> tuple[
     found: list[MapDoor] = []
     edges = []
     for edge in plan.edges:
-        passages = []
-        for passage in edge.passages:
+        passages = list(edge.passages)
+        for k, passage in enumerate(edge.passages):
             if passage.side == "through":
                 x, y = (round(float(v), 2) for v in edge.course[passage.at])
                 places = tuple(sorted(p for p in edge.ends if p >= 0))
@@ -184,9 +184,7 @@ def with_doors(plan: FloorPlan, room: dict[int, int], ssh_map: SSHMap) -> tuple[
                 found[number : number + 1] = [
                     _joined(found[number], new) if number < new.id else new
                 ]
-                passages.append(replace(passage, door=number))
-            else:
-                passages.append(passage)
+                passages[k] = replace(passage, door=number)
         edges.append(replace(edge, passages=tuple(passages)))
     plan.edges = edges
     return tuple(found)
@@ -299,16 +297,13 @@ def rooms_of(
     outlines: Mapping[int, tuple[Point, ...]],
 ) -> tuple[MapRoom, ...]:
     """Make the rooms, from the room of each place. A room of corners alone has no places."""
-    return tuple(
-        MapRoom(
-            k,
-            tuple(sorted(p for p, name in plan.name.items() if room[name] == k)),
-            tuple(door.id for door in doors if k in door.rooms),
-            tuple(c.id for c in corridors if any(room[p] == k for p in c.order)),
-            outlines.get(k, ()),
-        )
-        for k in sorted({*room.values()})
-    )
+    found = []
+    for k in sorted({*room.values()}):
+        places = tuple(sorted(p for p, name in plan.name.items() if room[name] == k))
+        own = tuple(door.id for door in doors if k in door.rooms)
+        inside = tuple(c.id for c in corridors if any(room[p] == k for p in c.order))
+        found.append(MapRoom(k, places, own, inside, outlines.get(k, ())))
+    return tuple(found)
 
 
 def spaces_of(plan: FloorPlan, room: dict[int, int]) -> dict[int, RoomSpace]:

@@ -300,20 +300,18 @@ def paths_of(plan: FloorPlan, ways: list[PairedWay]) -> tuple[MapPath, ...]:
     def places(some: Iterable[int]) -> tuple[int, ...]:
         return tuple(sorted(p for p in some if p >= 0))
 
-    return tuple(
-        MapPath(
-            k,
-            tuple(p for p in way.places if p >= 0),
-            chain_points(way.line),
-            round(sum(edge.length for edge in way.edges), 2),
-            None if np.isnan(way.widths).any() else round(float(np.median(way.widths)), 2),
-            round(1 / (1 + math.exp(-way.gap)), 4),
-            places(q for h, side, q in beside if (h, side) == (k, "left")),
-            places(q for h, side, q in beside if (h, side) == (k, "right")),
-            places(q for h, q in around if h == k),
+    found = []
+    for k, way in enumerate(ways):
+        length = round(sum(edge.length for edge in way.edges), 2)
+        width = None if np.isnan(way.widths).any() else round(float(np.median(way.widths)), 2)
+        sure = round(1 / (1 + math.exp(-way.gap)), 4)
+        left, right = (
+            places(q for h, w, q in beside if (h, w) == (k, s)) for s in ("left", "right")
         )
-        for k, way in enumerate(ways)
-    )
+        line, order = chain_points(way.line), tuple(p for p in way.places if p >= 0)
+        loop = places(q for h, q in around if h == k)
+        found.append(MapPath(k, order, line, length, width, sure, left, right, loop))
+    return tuple(found)
 
 
 def branches(plan: FloorPlan, ways: list[PairedWay]) -> Iterator[tuple[int, int, str, PlanEdge]]:
