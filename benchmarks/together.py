@@ -6,9 +6,10 @@
     python benchmarks/together.py --family worlds --folder FOLDER --causal [--stars]
 
 The script prints a table in Markdown with a row for each joint trace, and a summary below, as
-benchmarks/truth.py does. ACES3 is one drive, cut into three that overlap by two places. In mazes
-and plans, three robots start at random. Nothing is known of where a drive starts. The noise is that
-of benchmarks/truth.py. A trace of a world has several drives, which an action "jump…" joins.
+benchmarks/truth.py does. ACES3 is one drive, cut into three that overlap by --overlap places. In
+mazes and plans, three robots start at random. Nothing is known of where a drive starts. The noise
+is NOISE of benchmarks/truth.py, or that of --noise. A trace of a world has several drives, which an
+action "jump…" joins.
 
 With --beam, only the beam searches, with this width and without a time limit. So the load of the
 machine does not matter. Its cheapest map is judged. With --join, the maps of single drives are
@@ -20,17 +21,19 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 from plan_tours import RoomPlan, tour
 from truth import (
     NOISE,
+    NOISES,
     ROOT,
     Known,
     Noise,
     aces3,
     is_true,
+    noise_of,
     random_walk,
     report,
     with_truth,
@@ -163,6 +166,12 @@ def main() -> None:
     )
     parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds for each")
     parser.add_argument("--drives", type=int, default=DRIVES, metavar="N", help="drives of a maze")
+    parser.add_argument(
+        "--overlap", type=int, default=2, metavar="N", help="places that pieces of ACES3 share"
+    )
+    parser.add_argument(
+        "--noise", choices=NOISES, help="errors of odometry, drawn for each seed (default: NOISE)"
+    )
     parser.add_argument("--causal", action="store_true", help="solve by the causal theory")
     parser.add_argument("--beam", type=int, metavar="WIDTH", help="search by a beam alone")
     parser.add_argument("--join", action="store_true", help="join maps of single drives alone")
@@ -172,14 +181,23 @@ def main() -> None:
     )
     parser.add_argument("--boundary", default="strict", help="the theory's field boundary")
     options = parser.parse_args()
-    noise = Noise(Odometry(**NOISE))
+
+    def noise_at(seed: int) -> Noise:
+        if options.noise is None:
+            return Noise(Odometry(**NOISE))
+        return noise_of(NOISES[options.noise], seed)
+
     count = options.seeds or (1 if options.family == "plans" else 10)
     seeds = range(options.first, options.first + count)
+    steps = options.steps or (60 if options.family == "mazes" else 100)
     families = {
-        "aces3": lambda: map(cut, aces3(seeds, noise)),
-        "mazes": lambda: of_mazes(options.cells, options.steps or 60, seeds, noise, options.drives),
-        "plans": lambda: of_plans(options.folder, options.steps or 100, seeds, noise),
-        "worlds": lambda: of_worlds(options.folder),
+        "aces3": lambda seed: (
+            cut(known, overlap=options.overlap) for known in aces3([seed], noise_at(seed))
+        ),
+        "mazes": lambda seed: of_mazes(
+            options.cells, steps, [seed], noise_at(seed), options.drives
+        ),
+        "plans": lambda seed: of_plans(options.folder, steps, [seed], noise_at(seed)),
     }
     theory = Theory(
         displacement=options.displacement,
@@ -189,7 +207,10 @@ def main() -> None:
     if options.causal:
         star = "alike" if options.stars else "none"
         theory = Theory.causal().replace(displacement=options.displacement, star=star)
-    traces = families[options.family]()
+    if options.family == "worlds":
+        traces = of_worlds(options.folder)
+    else:
+        traces = chain.from_iterable(map(families[options.family], seeds))
     if options.beam is None and not options.join:
         print(f"\n{report(traces, theory, options.limit)}")
     else:
