@@ -16,6 +16,7 @@ from instances import maze
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import SolverError
+from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.runtime.clock import CONFLICT, counting, look_at_clock, now, work_done
 from ssh_abduction.runtime.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.solution import Progress
@@ -47,6 +48,14 @@ def test_one_work_limit_gives_one_answer(work: float, theory: Theory) -> None:
     trace = Trace.load(ROUTE)
     first, other = (answer_by_a_random_clock(trace, theory, work, seed) for seed in range(2))
     assert other == first
+
+
+def test_long_search_for_a_proof_ends_by_its_limit() -> None:
+    """No source comes after the forced joins of a long trace with misread views."""
+    trace = maze(5, 5, steps=120, seed=903, odometry=Odometry()).trace
+    solution = solve(trace, COSTS.replace(misread=0.92), work_limit=2.0)
+    assert (solution.complete, solution.stopped) == (False, "work limit")
+    assert solution.effort.work > 2.0
 
 
 @pytest.mark.parametrize(

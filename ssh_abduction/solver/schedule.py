@@ -163,6 +163,12 @@ WEIGHED = (
         most=30.0,
     ),
     SourceTurn(
+        "forced joins, last",
+        "the same, for long traces with faults",
+        "No other source can prove that these maps are the best.",
+        most=30.0,
+    ),
+    SourceTurn(
         "wrong displacements",
         "theories with `jumped`, more than 60 steps",
         "A local search over which displacements are wrong. No source proves such maps.",

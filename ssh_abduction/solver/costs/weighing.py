@@ -174,7 +174,7 @@ class Weighing:
         self._base = self._misfit.of_returns([], may_be_wrong) / 2
         return [
             Source(
-                turn("forced joins"),
+                turn("forced joins, last" if self._is_long else "forced joins"),
                 lambda: bool(self.candidates) and Forcing.holds_for(problem),
                 self._force,
             ),
