@@ -209,8 +209,11 @@ def has_straight_walls(k: int, way: Array, sides: Array) -> bool:
     if min(len(before), len(behind)) < GO_ON:
         return False
     walls = way + sides[:, [0]] * left, way - sides[:, [1]] * left
-    beside = [_is_straight(wall[before[0] : behind[-1] + 1]) for wall in walls]
-    if all(_is_straight(wall[[*before, *behind]]) for wall in walls) and sum(beside) == 1:
+    clear = wider[wide[wider] >= wide[k] + WIDER + CELL / 2]  # not the edge of furniture
+    outer = [*clear[clear < k][-GO_ON:], *clear[clear > k][:GO_ON]]
+    beside = [_is_straight(wall[outer[0] : outer[-1] + 1]) for wall in walls if outer]
+    go_on_both = len(outer) == 2 * GO_ON and all(_is_straight(wall[outer]) for wall in walls)
+    if go_on_both and sum(beside) == 1:
         return True
     begin, end = before[-1] + 1, behind[0]
     parts = (begin - GO_ON, end), (begin, end + GO_ON)
