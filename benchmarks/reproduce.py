@@ -22,6 +22,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import paper_figures
 from arguments import seeds_from
 from joblib import Parallel, delayed
@@ -143,7 +144,8 @@ def _configuration(name: str, seeds: Sequence[int], outcomes: bool) -> dict[str,
 
 
 def _dump(path: Path, value: Any) -> None:
-    path.write_text(f"{json.dumps(value, indent=1, ensure_ascii=False)}\n", encoding="utf-8")
+    text = json.dumps(value, indent=1, ensure_ascii=False, default=np.ndarray.tolist)
+    path.write_text(f"{text}\n", encoding="utf-8")
 
 
 def _page(name: str, runs: Sequence[SeedRun], table: Sequence[dict[str, Any]], folder: Path) -> str:

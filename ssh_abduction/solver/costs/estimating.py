@@ -16,8 +16,6 @@ from dataclasses import replace
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, TypeAlias
 
-import numpy as np
-
 from ssh_abduction.data.drives import Drive, drive_of_steps, drives_of
 from ssh_abduction.data.groups import NodeClasses, gathered, indices_of, numbered
 from ssh_abduction.data.maps import SSHMap
@@ -30,7 +28,6 @@ from ssh_abduction.solver.steps.faults import with_faults
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.fields import FAULT, MISREAD, ONE_WAY
 from ssh_abduction.theory.pairs import pairs_in
-from ssh_abduction.theory.prior import spreads_of
 from ssh_abduction.theory.settle import Problem
 
 if TYPE_CHECKING:
@@ -132,12 +129,19 @@ def crowded(problem: Problem, misfit: Misfit, rivals: Sequence[Rival]) -> tuple[
     they do is learnt from the best map: the sum of its nearness as a share of the sum to expect.
     The places of a log have a size, and floors lie above each other. There, nothing is changed.
     """
+    from ssh_abduction.theory.prior import spreads_of  # loads numpy
+
     theory, best = problem.theory, rivals[0]
     if not best.places or theory.lifts or theory.jumped or spreads_of(problem.trace).any():
         return tuple(rivals)
     near = [misfit.nearness(rival.dstates, rival.places) for rival in rivals]
     less = [(some.sum() + 1) / (expected + 1) - 1 for some, expected in near[0]]
-    nats = [-sum(np.log1p(k * x).sum() for (k, _), x in zip(of, less, strict=True)) for of in near]
+    nats = [
+        -sum(
+            math.log1p(k * x) for (some, _), x in zip(of, less, strict=True) for k in some.tolist()
+        )
+        for of in near
+    ]
     return tuple(replace(r, crowded=float(x - nats[0])) for r, x in zip(rivals, nats, strict=True))
 
 
