@@ -30,7 +30,8 @@ from ssh_abduction.theory.prior import spreads_of
 
 # The numbers of hypotheses of the beams, in their order.
 WIDTHS = (1, 4, 16)
-# A map costs at most TRIED nats more than the best one, if its closures may be explained better.
+# Places are merged, and closures explained better, in maps that cost at most this many nats more
+# than the best one.
 TRIED = 20.0
 # A beam of this width or more nearly always ends with the map of least cost.
 BROAD = 4
@@ -126,7 +127,7 @@ class Beams:
     def _join(self) -> None:
         """Join the maps of single drives."""
         if (joining := self._parts.candidates.joining()) is not None:
-            maps = self._maps_of(joining, None)
+            maps = self._maps_of(joining)
             nats = min(maps, default=math.inf)
             self._take(nats, -math.inf, joining.broken)
             self._has_joined = bool(maps) and len(maps[nats].pieces) == 1
@@ -180,7 +181,7 @@ class Beams:
 
     def _finish(self, beam: Beam, width: int) -> None:
         """Keep the maps that a beam ends with. Raises StageTimeError if it does not end in time."""
-        nats = min(self._maps_of(beam, 1), default=math.inf)
+        nats = min(self._maps_of(beam), default=math.inf)
         self._ended = beam
         if width < BROAD and beam.drops:
             return
@@ -189,15 +190,15 @@ class Beams:
         estimate = beam.hypotheses[0].nats if beam.hypotheses else math.inf
         self._take(nats, estimate, broken)
 
-    def _maps_of(self, guess: Beam | Joining, most: int | None) -> dict[float, SSHMap]:
-        """Keep the maps of a guess, and merge the places of its best `most`. Return all by cost.
+    def _maps_of(self, guess: Beam | Joining) -> dict[float, SSHMap]:
+        """Keep the maps of a guess, and merge the places of the best ones. Return all by cost.
 
         Raises StageTimeError if the guess does not end in time.
         """
         candidates = self._parts.candidates
         found = {self._add(one): one for one in candidates.maps_of(guess)}
         with suppress(StageTimeError):
-            for nats in sorted(found)[:most]:
+            for nats in [nats for nats in sorted(found) if nats < min(found) + TRIED]:
                 merged = candidates.smoothed(self._misfit.beginning(found[nats]))
                 if merged is not None:
                     found[self._add(merged)] = merged
