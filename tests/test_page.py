@@ -753,15 +753,15 @@ def test_page_over_walls_in_the_browser(browser: Any, house: Path) -> None:
     page = Shown(browser, (house / "page.html").as_uri())
     assert browser.find_elements("css selector", ".walls")
     assert browser.find_elements("css selector", ".ground .street")
-    browser.execute_script("""
+    named = browser.execute_script("""
         const line = data.ground.way.slice(0, 40), room = { line, places: [0], bears: true };
         data.indoors = {
           corridors: [{ title: "corridor 0 (hall)", named: true, path: 0, line }],
           rooms: [{ ...room, title: "room 0" }, { ...room, title: "room 1 (shop)", named: true }],
         };
         paint();
+        return [...document.querySelectorAll(".inroom")].map((label) => label.textContent);
     """)
-    named = [e.text for e in browser.find_elements("css selector", ".inroom")]
     assert named == ["corridor 0 (hall)", "room 1 (shop)"]  # not room 0
     assert not browser.find_elements("css selector", "#drawings .dstate")  # off at first
     assert page.drawn(".laser").get_attribute("d") != ""
