@@ -240,8 +240,9 @@ def corridors_of(
             if len(order) > 1:
                 line = chain_points(way.line[begin : end + 1])
                 width = round(float(np.median(way.widths[begin : end + 1])), 2)
-                size, sides = (metres[end], width), (path.left, path.right, path.around)
-                found.append(Corridor(0, path.id, order, line, *size, across, openings, *sides))
+                length, sides = metres[end], (path.left, path.right, path.around)
+                one = Corridor(0, path.id, order, line, length, width, across, openings, *sides)
+                found.append(one)
     found = [c for c in found if not _is_closet(c, {room[p] for p in c.order}, doors)]
     found.sort(key=lambda c: -c.length)
     return tuple(replace(c, id=k) for k, c in enumerate(found))

@@ -374,7 +374,7 @@ class OnlineLogMapper:
             self._relocation, self._way = None, self._station + BEHIND
 
     def on_map(self, pose: Pose) -> Pose | None:
-        """A pose on the track, moved to the last map; None if it is unknown where the map is."""
+        """A pose on the track, moved to the last map; None if the robot is not located on it."""
         if self._names.anchor is None:
             return None
         on_track, on_map = self._names.anchor
