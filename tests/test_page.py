@@ -30,6 +30,7 @@ from ssh_abduction.cli.use import write_frame
 from ssh_abduction.data import Action, DState, MapError, Step, TraceError, together
 from ssh_abduction.data.map_parts import Name
 from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
+from ssh_abduction.output.map_frames import MapFrame
 from ssh_abduction.page import html
 from ssh_abduction.page.content import ALPHABET, DRAWN, LOST, beams_of, content_of, drawn_images
 from ssh_abduction.page.html import Page
@@ -792,10 +793,14 @@ def test_page_over_walls_in_the_browser(browser: Any, house: Path) -> None:
     for row in browser.find_elements("css selector", "#points fieldset"):
         row.find_element("css selector", "button").click()
         drawing = page.drawn("#drawings svg")
-        y = 60 if row.text.startswith("Point 1") else -60
+        y = {"1": 60, "2": -60}.get(row.text[6], 20)
         ActionChains(browser).move_to_element_with_offset(drawing, 0, y).click().perform()
-        browser.switch_to.active_element.send_keys("3\t4" if y == 60 else "3\t14")
-    page.click("frame")
+        browser.switch_to.active_element.send_keys({60: "3\t4", -60: "3\t14"}.get(y, "5\t7"))
+        page.click("frame")
     assert "printf 'map_x,map_y,x,y" in page["framing"].text
-    assert len(browser.find_elements("css selector", ".point")) == 2
+    assert len(browser.find_elements("css selector", ".point")) == 3
+    points = [[0, 0, 1, 1], [4, 0, 1.2, 5], [1, 3, -2, 1.5]]
+    off = browser.execute_script("return residuals(arguments[0])", points)
+    named = {str(k): (complex(*point[:2]), complex(*point[2:])) for k, point in enumerate(points)}
+    assert off == pytest.approx([far for _, far in MapFrame.of_points(named).residuals])
     assert page.complaints == []
