@@ -20,7 +20,7 @@ from test_readers import LASER, SMALL, Messages, bag, drive
 from perception.errors import LogError
 from perception.places.following import follow
 from perception.places.log_checks import refuse_mixed
-from perception.places.odometers import lag_of, with_lag
+from perception.places.odometers import is_missing, lag_of, with_lag
 from perception.readers.bag_frames import RecordedTrack, flat_pose
 from perception.readers.bag_geometry import Mount, believed
 from perception.readers.echoes import LaserOptions, interpret_log
@@ -58,8 +58,13 @@ def angles(first: float, last: float, step: float) -> Callable[[Any, int], None]
 @pytest.mark.parametrize(
     ("given", "step", "said"),
     [
-        ((-90.0, 90.0, 45.0), math.pi / 4, "are in degrees (angle_min, angle_max and"),
-        ((-1.5708, 1.5708, 45.0), math.pi / 4, "are in degrees (angle_increment is"),
+        ((-90.0, 90.0, 45.0), math.pi / 4, "(read so: angle_min, angle_max, angle_increment)"),
+        ((-1.5708, 1.5708, 45.0), math.pi / 4, "(read so: angle_increment)"),
+        ((-90.0, 1.5708, math.pi / 4), math.pi / 4, "(read so: angle_min)"),
+        ((-1.5708, 90.0, math.pi / 4), math.pi / 4, "(read so: angle_max)"),
+        ((-1.0, 1.0, -0.5), 0.5, "leads from angle_min away from angle_max"),
+        ((1.0, -1.0, 0.5), 0.5, "say --set fov=-115"),
+        ((1.0, -1.0, -0.5), -0.5, ""),
         (
             (-math.pi, math.pi, math.pi),
             math.pi / 2,
@@ -73,6 +78,7 @@ def test_angles_that_make_no_sense_are_named(
 ) -> None:
     log = read_log(bag(tmp_path / "bag", lambda m: ahead(m, angles(*given))))
     assert log.scans[0].laser.step == pytest.approx(step, rel=1e-3)
+    assert log.scans[0].laser.first == pytest.approx(-2 * step, rel=1e-3)
     assert said in notes(log)
     assert ("The angles of the scans" in notes(log)) == bool(said)
 
@@ -185,6 +191,17 @@ def test_beams_on_the_robot_itself_are_unknown() -> None:
     assert np.isnan(meant[0].ranges[:11]).all()
 
 
+def test_robot_shows_to_a_cheap_laser_whose_beams_are_lost_now_and_then() -> None:
+    chance = np.random.default_rng(5)
+    scans = [replace(scan, ranges=scan.ranges.copy()) for scan in drive(60, LASER)]
+    for scan in scans:
+        near = chance.normal(0.24, 0.015, 10)
+        scan.ranges[40:50] = np.where(chance.random(10) < 0.3, np.inf, near)
+    meant, said = interpret_log(scans, LaserOptions())
+    assert not any((scan.ranges[40:50] < 0.3).any() for scan in meant)
+    assert "10 beams return one short range" in " ".join(said)
+
+
 @pytest.mark.parametrize("late", [0.0, 0.002])
 def test_repeated_scans_are_left_out(tmp_path: Path, late: float) -> None:
     def twice(m: Messages) -> Listed:
@@ -260,15 +277,17 @@ def test_laser_without_a_transform_is_left_out_if_others_have_one(tmp_path: Path
     assert "to front: 4 scans from there are left out" in notes(log)
 
 
-@pytest.mark.parametrize("beams", [180, 121])
-def test_scans_of_two_lasers_with_one_mount_are_refused(beams: int) -> None:
-    scans = hall(every=0.5)[:60]
+@pytest.mark.parametrize(("beams", "every"), [(180, 1), (121, 1), (180, 4)])
+def test_scans_of_two_lasers_with_one_mount_are_refused(beams: int, every: int) -> None:
+    scans = hall(every=0.5)[:120]
     refuse_mixed(RobotLog(scans))
     back = [
         replace(scan, ranges=scan.ranges[:beams] / 2, laser=replace(scan.laser, beams=beams))
-        for scan in scans
+        for scan in scans[::every]
     ]
-    mixed = [one for pair in zip(scans, back, strict=True) for one in pair]
+    mixed = [
+        one for i, scan in enumerate(scans) for one in (scan, *back[i // every :][: i % every == 0])
+    ]
     with pytest.raises(LogError, match="expected the scans of one laser, got those of several"):
         refuse_mixed(RobotLog(tuple(mixed)))
 
@@ -291,6 +310,14 @@ def test_late_scans_are_found_by_their_turns() -> None:
     late = replace(log, odometer=(times - 0.7, poses))
     assert lag_of(late, follow(log)) == pytest.approx(0.7, abs=0.11)
     assert with_lag(late, 0.7).scans[50].odometry == pytest.approx(scans[50].odometry, abs=1e-6)
+
+
+def test_odometry_is_not_missing_if_two_lasers_scan_at_one_time() -> None:
+    scans = hall()[:20]
+    back = [replace(s, laser=replace(s.laser, mount=(-0.3, 0.0, math.pi))) for s in scans]
+    both = [one for pair in zip(scans, back, strict=True) for one in pair]
+    assert not is_missing(RobotLog(tuple(both)))
+    assert is_missing(RobotLog(tuple(replace(s, odometry=(0.0, 0.0, 0.0)) for s in both)))
 
 
 def test_first_scan_of_a_second_laser_follows_the_odometry() -> None:

@@ -41,9 +41,10 @@ AHEAD, SIDEWAYS, LEAST_WAY = 0.9, 0.5, 10.0
 # their distances differ by at most this factor. In a drive, they grow with the number of steps. If
 # two sources of odometry alternate, the lower quartile is that of one source.
 LAGS, ALIKE = (2, 4, 8), 1.3
-# If several lasers scan in turn, more than the share MIXED of MIXED_TRIED scans resemble the second
-# to fourth scan before them much more than the last one.
-MIXED_TRIED, MIXED, IN_TURN = 100, 0.5, (1, 2, 3, 4)
+# If several lasers scan in turn, more than MIXED of MIXED_TRIED scans resemble the second to fourth
+# scan before them ALIKE_ONE times as much as the last one. Ten logs have at most 1 %, also with
+# only each eighth scan; two lasers have 7 % if one scans eight times as often as the other.
+MIXED_TRIED, MIXED, ALIKE_ONE, IN_TURN = 200, 8, 3, (1, 2, 3, 4)
 # In good logs, matches contradict the odometer in at most 2 % of the steps. A contradiction is a
 # chi-square above CONTRADICTS (three degrees of freedom).
 OVERRIDING, CONTRADICTS = 0.08, 25.0
@@ -108,18 +109,19 @@ def refuse_shuffled(log: RobotLog) -> None:
 
 def refuse_mixed(log: RobotLog) -> None:
     """Raise a LogError if scans of several lasers come in turn, as if they were of one."""
-    if len(log) <= max(IN_TURN):
+    if len(log) <= max(IN_TURN) or odometers.usual_step(log) > SPARSE:
         return
     some = np.unique(np.linspace(max(IN_TURN), len(log) - 1, MIXED_TRIED).astype(int)).tolist()
     mixed = 0
     for k in some:
         last, *earlier = (odometers.change_between(log.scans[k - n], log.scans[k]) for n in IN_TURN)
-        mixed += last > odometers.MOVED and min(earlier) < last / 2
-    if mixed > MIXED * len(some):
+        mixed += last > odometers.MOVED and min(earlier) < last / ALIKE_ONE
+    if mixed > MIXED:
         raise LogError(
             f"{named(log.source)}: expected the scans of one laser, got those of several in turn, "
-            "with one mount: most scans are unlike the one before, and like an earlier one; keep "
-            "the scans of one laser, or give each laser a frame of its own"
+            f"with one mount: {100 * mixed / len(some):.0f} % of the scans are unlike the one "
+            "before, and like an earlier one; keep the scans of one laser, or give each laser a "
+            "frame of its own"
         )
 
 

@@ -169,8 +169,13 @@ def seams_of(log: RobotLog) -> list[tuple[int, str]]:
 
 
 def is_missing(log: RobotLog) -> bool:
-    """Whether the odometry stands still in most steps."""
-    return bool(len(log) > 1 and stands_still(log).mean() > MISSING)
+    """Whether the odometry stands still in most steps from scan to scan of one laser.
+
+    Two lasers may scan at one time.
+    """
+    mount = log.scans[0].laser.mount
+    one = replace(log, scans=tuple(scan for scan in log.scans if scan.laser.mount == mount))
+    return bool(len(one) > 1 and stands_still(one).mean() > MISSING)
 
 
 def goes_back_and_forth(log: RobotLog) -> float:

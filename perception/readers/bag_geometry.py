@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,9 @@ from ssh_abduction.data.odometry import Pose
 
 # A full turn with 1 % for rounding, and the least field of view that is believed in degrees.
 FULL, LEAST_DEGREES = 1.01 * math.tau, 30.0
+# Which angles of a message may be in degrees, in the order in which they are tried.
+ANGLES = ("min", "max", "increment")
+DEGREES = tuple(which for count in range(4) for which in combinations(ANGLES, count))
 # Two statements of a field of view agree if they differ by at most this share, or two steps.
 SAME_SHARE = 0.03
 # Tilts in degrees: up to LEVEL they change nothing; beyond STEEP a laser shows no floor plan.
@@ -55,21 +59,27 @@ def angles_of(message: Any, fov: float | None = None) -> tuple[float, float, str
         raise Damaged(f"expected a first angle and a step in radians, got {first:g} and {step:g}")
     degree, steps = math.pi / 180, max(count - 1, 1)
     by_step, by_ends = abs(step) * steps, abs(last - first)
-    for ends, increment, what in (
-        (1.0, 1.0, ""),
-        (degree, degree, "angle_min, angle_max and angle_increment are"),
-        (degree, 1.0, "angle_min and angle_max are"),
-        (1.0, degree, "angle_increment is"),
-    ):
-        one, other = by_step * increment, by_ends * ends
-        near = max(2 * abs(step) * increment, SAME_SHARE * one)
-        if abs(one - other) > near or not one <= FULL:
+    for which in DEGREES:
+        low, high, increment = (
+            value * degree if name in which else value
+            for name, value in zip(ANGLES, (first, last, step), strict=True)
+        )
+        one, other = abs(increment) * steps, abs(high - low)
+        near = max(2 * abs(increment), SAME_SHARE * one)
+        least = LEAST_DEGREES * degree if which else 0.0
+        if abs(one - other) > near or not least <= one <= FULL:
             continue
-        if not what:
-            return first, step, None
-        if one >= LEAST_DEGREES * degree:
-            note = f"The angles of the scans are in degrees ({what} read so): write radians."
-            return first * ends, step * increment, note
+        listed, note = ", ".join(f"angle_{name}" for name in which), None
+        if which:
+            note = f"The angles of the scans are in degrees (read so: {listed}): write radians."
+        if (high - low) / increment < -2:
+            low, increment = min(low, high), abs(increment)
+            note = (
+                "The angles of the scans contradict each other: angle_increment leads from "
+                "angle_min away from angle_max. The beams are taken to turn counterclockwise. If "
+                f"they turn clockwise, say --set fov=-{math.degrees(one):.0f}."
+            )
+        return low, increment, note
     # They contradict each other: the step is right, unless the beams would cover more than a turn.
     is_known = math.isfinite(last) and last != first
     told = f"{count} ranges with the angle_increment cover {math.degrees(by_step):.0f} degrees" + (

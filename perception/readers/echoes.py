@@ -51,9 +51,10 @@ NOISES = (1e-5, 0.001, 0.004, 0.016)
 # of the ranges that are at least as long, and SPIKE times the ranges in an equally wide band just
 # below.
 NEARLY_ALL, SPIKE = 0.9, 10
-# A beam that returns one range up to ROBOT metres, within SAME_RANGE, in NEARLY_ALL scans sees the
-# robot itself, if it was surveyed at LEAST_POSES poses or more.
-ROBOT, SAME_RANGE, LEAST_POSES = 0.6, 0.03, 30
+# A beam sees the robot itself if it measures anything in half of the scans, and NEARLY_ALL these
+# ranges are one, up to ROBOT metres, within SAME_RANGE: two standard deviations of cheap lasers. It
+# is judged from LEAST_POSES poses on.
+ROBOT, SAME_RANGE, LEAST_POSES = 0.6, 0.06, 30
 # A kind of beam without a measurement is worth a note if it has at least this share of all beams.
 WORTH_A_NOTE = 0.01
 # Beams met nothing if scans from nearby see walls in their directions less often than this share of
@@ -280,8 +281,8 @@ def _robot_in(scans: Sequence[Scan]) -> tuple[Array, list[str]]:
     ranges = np.stack(alike)
     ranges[~(ranges > max(laser.nearest, 0.0))] = np.inf
     usual = np.median(ranges, axis=0)
-    with np.errstate(invalid="ignore"):
-        share = (np.abs(ranges - usual) <= SAME_RANGE).mean(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = (np.abs(ranges - usual) <= SAME_RANGE).sum(axis=0) / np.isfinite(ranges).sum(axis=0)
     blocked = (usual <= ROBOT) & (share >= NEARLY_ALL)
     if not blocked.any():
         return np.zeros(0), []
