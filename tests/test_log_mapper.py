@@ -345,6 +345,11 @@ def test_error_of_a_search_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert search.taken(5.0) is None
     assert search.error == "no such step"
     assert not search.is_busy
+    session = LiveSession(OnlineLogMapper(), None, print)
+    for _ in range(2):  # topics and the page tell it, once
+        session._search.error = search.error
+        session.tick()
+    assert session.events == ["no new map: no such step"]
 
 
 def test_lifted_robot_has_no_position_until_closures_show_it(scans: tuple[Scan, ...]) -> None:

@@ -305,8 +305,7 @@ def near_groups(middles: Array) -> list[list[int]]:
 
     `middles` are (n, 2) metres. Each group lists indices in order.
     """
-    groups: list[list[int]] = []
-    group_of: list[list[int]] = []
+    groups, group_of = list[list[int]](), list[list[int]]()
     for k, middle in enumerate(middles):
         far = np.hypot(*(middles[:k] - middle).T)
         if k and far.min() < NEAR:

@@ -646,9 +646,10 @@ class LiveSession:
     def tick(self, wait: float = 0.0) -> bool:
         """Do what is due: take a map, begin a search, save. Return whether `told` is new."""
         found = self._search.taken(wait)
-        if self._search.error:
-            self._say(f"no new map: {self._search.error}")
-            self._search.error = ""
+        if error := self._search.error:
+            self._search.error, text = "", f"no new map: {error}"
+            if text not in self.events[-1:]:
+                self._tell(text)
         if found is not None:
             for event in self.mapper.accept(found):
                 self.happened(event)
