@@ -192,35 +192,50 @@ def test_relations_of_three_drives_agree() -> None:
 
 
 @pytest.mark.parametrize(
-    ("here", "elsewhere", "told"),
+    ("here", "elsewhere", "apart", "told"),
     [
-        ((0.97, 0.97, 0.97), (), True),
-        ((0.97, 0.97), (), False),  # too few
-        ((0.97, 0.97, 0.97), (0.85, 0.85, 0.85), True),
-        ((0.97, 0.97, 0.97), (0.94, 0.94, 0.94), False),  # it may be there as well
-        ((0.85, 0.85, 0.85, 0.85), (0.97, 0.97), False),  # fewer, but better
+        ((0.97,) * 4, (), 20.0, True),
+        ((0.97,) * 3, (), 20.0, False),  # too few
+        ((0.97,) * 4, (0.85,) * 4, 20.0, True),
+        ((0.97,) * 4, (0.94,) * 4, 20.0, False),  # it may be there as well
+        ((0.97,) * 4, (0.94,) * 4, 0.1, True),  # which is here
+        ((0.97,) * 5, (0.97,) * 4, 20.0, True),  # the fifth tells
+        ((0.97, 0.97, 0.97, 0.97, -0.97), (0.97,) * 4, 20.0, False),  # it is not clear itself
+        ((0.85,) * 5, (0.97,) * 3, 20.0, False),  # fewer, but better
+        ((-0.97, -0.97, 0.97, 0.97, 0.97, 0.97), (), 20.0, True),  # walls agree there, too
+        ((-0.7, -0.7, 0.97, 0.97, 0.97, 0.97), (), 20.0, False),
     ],
 )
 def test_robot_is_located_where_walls_agree_best(
     here: tuple[float, ...],
     elsewhere: tuple[float, ...],
+    apart: float,
     told: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """A station with a negative score has no match of its own."""
+
+    def agreement(score: float, x: float) -> Match:
+        return Match(abs(score), 0.0, np.array([x, 0.0]), 1.0, 0.1)
+
     found = [
-        VisitMatch(k, k, Match(score, 0.0, np.array([x, 0.0]), 1.0, 0.1))
+        VisitMatch(k, k, agreement(score, x))
         for x, scores in ((0.0, here), (20.0, elsewhere))
         for k, score in enumerate(scores)
+        if score > 0
     ]
     poses = np.array([(0.0, 2.0 * k, 0.0) for k in range(len(here))])
     empty = [LocalScene(np.zeros((0, 2)), np.zeros((1, 1), np.uint16), np.zeros(2))] * len(here)
     drive = DriveScenes(empty, poses)
-    by_matches = lambda relation, *_: dict(  # noqa: E731 - as if walls agreed as matches do
-        enumerate(here if relation.here[0, 0] == 0.0 else elsewhere)
-    )
-    monkeypatch.setattr(relations, "_agreements", by_matches)
+
+    def by_scores(relation: Any, *_: object) -> dict[int, Match]:
+        """As if walls agreed as the scores say."""
+        x, scores = (0.0, here) if relation.here[0, 0] == 0.0 else (apart, elsewhere)
+        return {k: agreement(score, x) for k, score in enumerate(scores)}
+
+    monkeypatch.setattr(relations, "_agreements", by_scores)
     agreed = relations._surest(found, drive, drive)
-    assert agreed == (found[: len(here)] if told else [])
+    assert agreed == ([one for one in found if one.match.shift[0] == 0.0] if told else [])
 
 
 def test_relation_that_puts_walls_into_free_space_does_not_count() -> None:

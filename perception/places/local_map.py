@@ -505,10 +505,8 @@ def match(first: LocalScene, second: Turned, mutual: float = 0.0) -> Match | Non
     if scores[best] < HOPELESS or (spread := _spread(scores - scores[best])) >= SPREAD:
         return None
     coarse = np.array([_X[best[1:]], _Y[best[1:]]])
-    score, turn, shift = refined(first, scene, float(second.turns[int(best[0])]), coarse)
-    if math.dist(shift, coarse) > SLID:
-        return None
-    return Match(score, turn, shift, first.mutual(scene, turn, shift), spread)
+    found = refined(first, scene, float(second.turns[int(best[0])]), coarse, spread)
+    return None if math.dist(found.shift, coarse) > SLID else found
 
 
 def _scores(first: _Spectra, second: _Spectra, least: float) -> Array:
@@ -537,9 +535,9 @@ def _spread(less: Array) -> float:
 
 
 def refined(
-    first: LocalScene, second: LocalScene, turn: float, shift: Array
-) -> tuple[float, float, Array]:
-    """Improve a rotation and a shift step by step; return the score and both of them."""
+    first: LocalScene, second: LocalScene, turn: float, shift: Array, spread: float = 0.0
+) -> Match:
+    """Improve a rotation and a shift step by step."""
     least = OVERLAP * (len(first.walls) + len(second.walls))
 
     def scores_of(poses: Array) -> Array:
@@ -559,4 +557,5 @@ def refined(
             if found.max() <= score:
                 break
             score, pose = float(found.max()), tried[found.argmax()]
-    return score, float(pose[2]), pose[:2]
+    turn, shift = float(pose[2]), pose[:2]
+    return Match(score, turn, shift, first.mutual(second, turn, shift), spread)

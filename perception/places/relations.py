@@ -28,7 +28,7 @@ import numpy as np
 
 from perception.places.closures import KEPT, MUTUAL, SCORE, TURN, VisitMatch, is_reliable
 from perception.places.distinctive import Visit, patches_of
-from perception.places.local_map import MOST, LocalScene, Patch, Turned, match, refined
+from perception.places.local_map import MOST, LocalScene, Match, Patch, Turned, match, refined
 from perception.places.track import Array, Track, points_moved, points_turned
 from ssh_abduction.data.groups import gathered
 from ssh_abduction.data.odometry import Pose
@@ -45,8 +45,10 @@ TURNS = [k * TURN for k in range(round(math.tau / TURN))]
 BESIDE, CLASHING = 6.0, 0.1
 # Where is a robot that may be anywhere? Each station shows WALLS pieces of wall that earlier
 # stations did not show. The known map lacks the share HIDDEN of all walls. A position is told to
-# the user if each other one is SURE times less probable.
-WALLS, HIDDEN, SURE = 10, 0.05, 100
+# the user if each other one is SURE times less probable. The robot may also be in a part that is
+# not known, or in another building. Then most stations match nothing that is known to be there. So
+# at least MORE stations more have to match than do not.
+WALLS, HIDDEN, SURE, MORE = 10, 0.05, 100, 4
 # Of a drive with cuts, at most this many visits are matched, as the time grows with the square.
 MATCHED = 200
 
@@ -109,28 +111,25 @@ class Relocation:
     Args:
         visits: The known visits, with their local maps.
         poses: (n, 3) the poses of the visits, as `fitted_poses` returns them.
+
+    Attributes:
+        left: How many visits the last station was not matched with yet.
     """
 
     def __init__(self, visits: Sequence[Visit], poses: Array) -> None:
         some = slice(None, None, 1 + len(visits) // MATCHED)
         self._known = DriveScenes.of(visits[some], poses[some])
         self._scenes, self._poses = list[LocalScene](), list[Array]()  # of the stations
-        self._found: list[VisitMatch] = []
+        self.left, self._found = 0, list[VisitMatch]()
         self._matching: Iterator[VisitMatch | None] = iter(())
-        self._open = 0  # how many visits the last station was not matched with yet
-
-    @property
-    def is_busy(self) -> bool:
-        """Whether the last station was not matched with all visits yet."""
-        return self._open > 0
 
     def begin(self, patch: Patch, middle: Array) -> None:
         """Begin the next station: the local map around `middle`, (x, y) metres on the new track."""
-        self._scenes.append(LocalScene.of(patch, middle))
+        number, scene = len(self._scenes), LocalScene.of(patch, middle)
+        self._scenes.append(scene)
         self._poses.append(np.array([*middle, 0.0]))
-        number = len(self._scenes) - 1
-        self._matching = _matched(self._known.scenes, self._scenes[number], number, MUTUAL)
-        self._open = len(self._known.scenes)
+        self._matching = _matched(self._known.scenes, scene, number, MUTUAL)
+        self.left = len(self._known.scenes)
 
     def go_on(self, share: float) -> tuple[Pose, Pose] | None:
         """Match the last station with a share of the visits.
@@ -140,13 +139,12 @@ class Relocation:
         """
         for one in islice(self._matching, math.ceil(share * len(self._known.scenes))):
             self._found += [] if one is None else [one]
-            self._open -= 1
-        return None if self.is_busy else self._located()
+            self.left -= 1
+        return None if self.left else self._located()
 
     def _located(self) -> tuple[Pose, Pose] | None:
         known, stations = self._known, DriveScenes(self._scenes, np.array(self._poses))
-        kept = without_clashes(self._found, known, stations)
-        agreed = _surest(kept, known, stations)
+        agreed = _surest(without_clashes(self._found, known, stations), known, stations)
         if not agreed:
             return None
         x, y, _ = here = stations.poses[-1].tolist()
@@ -335,44 +333,56 @@ def _surest(
     """Find the relation of the frames that explains best what is seen, and list its matches.
 
     The evidence for a relation is by how much the agreement at each station exceeds SCORE. The list
-    is empty if another relation has more than half of the evidence, and is not shown to be less
-    probable by the factor SURE. The robot may also be elsewhere. Then most stations match nothing
-    that is known to be there. So at least VOTES stations more have to match than do not.
+    is empty if a relation that puts the robot elsewhere is not shown to be less probable by the
+    factor SURE. Where the map does not know what the rival would show, stations with a match count.
+    It is also empty if too few stations match (MORE).
     """
     sets, votes = _support(found, _relations(found, known.poses, stations.poses))
-    if max(votes, default=0) < VOTES:
+    if max(votes, default=0) < MORE:
         return []
-    rest, options = np.ones(len(found), bool), list[tuple[float, int, dict[int, float]]]()
+    rest, options = np.ones(len(found), bool), list[tuple[float, int, dict[int, Match]]]()
     for k in sorted(range(len(found)), key=lambda k: -votes[k]):
         if rest[k]:
             rest &= ~sets[k]
             agreed = [found[i] for i in np.flatnonzero(sets[k]).tolist()]
-            scores = _agreements(_relations(agreed, known.poses, stations.poses), known, stations)
-            options.append((sum(scores.values()) - SCORE * len(scores), k, scores))
-    (most, best, scores), *others = sorted(options, key=lambda option: -option[0])
-    for evidence, _, rival in others:
-        better = sum(scores[j] - rival[j] for j in scores.keys() & rival.keys())
+            there = _agreements(_relations(agreed, known.poses, stations.poses), known, stations)
+            options.append((sum(one.score - SCORE for one in there.values()), k, there))
+    (_, best, there), *others = sorted(options, key=lambda option: -option[0])
+    agreed = [found[k] for k in np.flatnonzero(sets[best]).tolist()]
+    matched = {one.last for one in agreed}
+    for _, _, rival in others:
+        both = there.keys() & rival.keys()
+        better = sum(there[j].score - rival[j].score for j in both)
+        better += sum(there[j].score - SCORE for j in (there.keys() - both) & matched)
         odds = WALLS * better * math.log((1 - HIDDEN) / HIDDEN)
-        if evidence > most / 2 and odds < math.log(SURE):
+        if odds < math.log(SURE) and not (both and _is_one(there[max(both)], rival[max(both)])):
             return []
-    unmatched = len(scores) - votes[best]
-    if votes[best] - unmatched < VOTES:
-        return []
-    return [found[k] for k in np.flatnonzero(sets[best]).tolist()]
+    unmatched = sum(j not in matched and not is_reliable(one) for j, one in there.items())
+    return agreed if len(matched) - unmatched >= MORE else []
+
+
+def _is_one(first: Match, second: Match) -> bool:
+    """Whether a station has nearly the same pose in both matches."""
+    twist = math.remainder(first.turn - second.turn, math.tau)
+    return math.dist(first.shift, second.shift) < NEAR and abs(twist) < TWIST
 
 
 def _agreements(
     relation: _FrameMatches, known: DriveScenes, stations: DriveScenes
-) -> dict[int, float]:
-    """How well each station agrees with the nearest known local map, if one is near."""
+) -> dict[int, Match]:
+    """How each station agrees with the nearest known local map, if one is near.
+
+    Turn and shift are the pose of the station in the frame of the known visits.
+    """
     found = {}
     for j, (scene, (x, y, turned)) in enumerate(zip(stations.scenes, stations.poses, strict=True)):
         at, turn, _ = relation.placed(np.array([x, y]))
         far = np.hypot(*(known.poses[:, :2] - at).T)
         if far.min() < MOST:
-            *middle, bent = known.poses[far.argmin()]
-            shift = points_turned(-bent, (at - middle)[None])[0]
-            found[j] = refined(known.scenes[far.argmin()], scene, turn + turned - bent, shift)[0]
+            pose, other = known.poses[far.argmin()], known.scenes[far.argmin()]
+            shift = points_turned(-pose[2], (at - pose[:2])[None])[0]
+            one = refined(other, scene, turn + turned - pose[2], shift)
+            found[j] = replace(one, turn=one.turn + pose[2], shift=points_moved(pose, one.shift))
     return found
 
 

@@ -365,7 +365,7 @@ class OnlineLogMapper:
         self._relocation = self._relocation or self.live.relocation()
         if self._relocation is None:
             return
-        if self._relocation.is_busy:
+        if self._relocation.left:
             self._names.anchor = self._relocation.go_on(far / STATION)
         elif self._station > STATION and (seen := self.live.around(BEHIND)):
             self._station = 0.0
