@@ -15,9 +15,9 @@ from ssh_abduction.cli import import_log, jobs, main
 from ssh_abduction.cli.import_log import (
     FILES,
     UnwrittenError,
+    code_of_done,
     digest,
     folders_of,
-    is_done,
     named_after,
     write_run,
 )
@@ -165,10 +165,10 @@ def test_bags_with_equal_names_and_sizes_are_two_logs(tmp_path: Path) -> None:
 
 def test_interrupted_run_is_not_done(tmp_path: Path) -> None:
     log = log_at(tmp_path / "run.log", "x")
-    map_in(tmp_path / "whole", log, interrupted=False)
+    map_in(tmp_path / "whole", log, interrupted=False, status="feasible")
     map_in(tmp_path / "part", log, interrupted=True)
-    assert is_done(tmp_path / "whole", [log], QUESTION.settings)
-    assert not is_done(tmp_path / "part", [log], QUESTION.settings)
+    assert code_of_done(tmp_path / "whole", [log], QUESTION.settings) == 10
+    assert code_of_done(tmp_path / "part", [log], QUESTION.settings) is None
 
 
 @pytest.mark.parametrize("at", range(1, 5))

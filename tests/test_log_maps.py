@@ -311,7 +311,7 @@ def test_finished_run_is_skipped_and_bad_logs_do_not_stop_others(
     told = capsys.readouterr()
     assert f"{hall}: done already, in {runs / 'hall'}" in told.out
     assert f"{bad}: expected a robot's log" in told.out
-    assert "errors in 1 of 1 log" in told.err
+    assert "errors in 1 of 2 logs" in told.err
 
 
 @pytest.mark.parametrize(

@@ -362,8 +362,7 @@ def watched(scans: Iterable[Scan], tell: Teller, source: str = "") -> Iterator[S
 
 def _first_of(coming: Iterator[Scan]) -> list[Scan]:
     """Take the first scans of a drive, until they show the units of the odometry."""
-    first: list[Scan] = []
-    moves, way = 0, 0.0
+    first, moves, way = list[Scan](), 0, 0.0
     for scan in coming:
         if first:
             far = math.dist(first[-1].odometry[:2], scan.odometry[:2])

@@ -21,7 +21,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ssh_abduction.cli.outcome import StopFlag, on_ctrl_c, unwritten, warn
+from ssh_abduction.cli.outcome import EXIT_CODES, StopFlag, on_ctrl_c, unwritten, warn
 from ssh_abduction.cli.parsing import MAPS, RUN, TRACE, rows_of, verb
 from ssh_abduction.cli.shared import check_ending, check_output, write_trace
 from ssh_abduction.cli.text import counted
@@ -344,12 +344,17 @@ def distinct(logs: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
     return [*first.values()], copies
 
 
-def is_done(folder: Path, logs: Sequence[str], settings: dict[str, Any]) -> bool:
-    """Whether a folder holds a finished run of these logs with the same `MapQuestion.settings`."""
+def code_of_done(folder: Path, logs: Sequence[str], settings: dict[str, Any]) -> int | None:
+    """The exit code of the finished run of these logs with the same `MapQuestion.settings`.
+
+    None if the folder holds no such run.
+    """
     run = _run_in(folder)
     content = run.get("digest")
     is_same = run.get("settings") == json.loads(json.dumps(settings)) and content is not None
-    return is_same and not run.get("interrupted") and bool(content == _content(logs))
+    if not is_same or run.get("interrupted") or content != _content(logs):
+        return None
+    return next((n for of, n in EXIT_CODES.items() if of.value == run.get("status")), 0)
 
 
 def logs_in(folder: Path) -> list[str]:

@@ -309,24 +309,25 @@ def run_map(options: argparse.Namespace) -> int:
     for path, other in same.items():
         print(f"{named(path)}: the same log as {named(other)}, in {named(folders[other])}")
     # Skip the logs that are done, and those with a folder that cannot be written.
-    left = [
-        path
-        for path in folders
-        if options.again
-        or not import_log.is_done(folders[path], [path], question.obeying(folders[path]).settings)
-    ]
-    for path in folders:
-        if path not in left:
-            print(f"{named(path)}: done already, in {named(folders[path])}")
+    left, codes = dict(folders), list[int]()
+    for path, folder in () if options.again else folders.items():
+        code = import_log.code_of_done(folder, [path], question.obeying(folder).settings)
+        if code is not None:
+            print(f"{named(path)}: done already, in {named(left.pop(path))}")
+            codes.append(code)
     if len(options.logs) == 1 and options.jobs is None and options.scheduler is None:
-        return max([0, *(_here(question, [path], folders[path]) for path in left)])
-    return _many(question, options, {path: folders[path] for path in left})
+        return max([*codes, *(_here(question, [path], folder) for path, folder in left.items())])
+    return _many(question, options, left, codes)
 
 
-def _many(question: MapQuestion, options: argparse.Namespace, folders: dict[str, Path]) -> int:
-    """Map each of many logs into its folder, and return the exit code."""
-    codes: list[int] = []
-    left = [*folders]
+def _many(
+    question: MapQuestion, options: argparse.Namespace, folders: dict[str, Path], codes: list[int]
+) -> int:
+    """Map each of many logs into its folder, and return the exit code.
+
+    `codes` has those of the logs that are done already.
+    """
+    asked, left = len(codes) + len(folders), [*folders]
     for path, folder in folders.items():
         try:
             import_log.check_run_folder(folder)
@@ -338,7 +339,7 @@ def _many(question: MapQuestion, options: argparse.Namespace, folders: dict[str,
     stop = StopFlag()
     if left:
         codes += _kept(jobs.answers_of(question, left, options, stop), left, folders)
-    return jobs.final_code(codes, len(folders), stop, "logs")
+    return jobs.final_code(codes, asked, stop, "logs")
 
 
 def _together(question: MapQuestion, options: argparse.Namespace) -> int:
@@ -354,9 +355,10 @@ def _together(question: MapQuestion, options: argparse.Namespace) -> int:
                 "the name of its log; rename one of them"
             )
     folder = Path(options.output)
-    if not options.again and import_log.is_done(folder, logs, question.obeying(folder).settings):
+    code = import_log.code_of_done(folder, logs, question.obeying(folder).settings)
+    if code is not None and not options.again:
         print(f"{counted(len(logs), 'logs')}: done already, in {named(folder)}")
-        return 0
+        return code
     return _here(question, logs, folder)
 
 
