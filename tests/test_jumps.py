@@ -18,8 +18,7 @@ from coarse import every_second_beam, hall
 from perception.errors import LogError
 from perception.places import importing
 from perception.places.distinctive import Visit
-from perception.places.following import turned_wrongly
-from perception.places.importing import import_log, in_frame_of, tracked
+from perception.places.importing import import_log, in_frame_of, tracked, turned_wrongly
 from perception.places.odometers import Doubt, describe_cuts, doubts_of, keep_one_source
 from perception.places.tracing import starts_of_drives
 from perception.places.track import Track

@@ -31,13 +31,7 @@ from scipy.sparse.linalg import splu
 
 from perception.places.distinctive import Visit, patches_of
 from perception.places.local_map import MOST, LocalScene, Match, Turned, match
-from perception.places.track import (
-    Array,
-    Track,
-    at_end,
-    errors_of,
-    seen_from,
-)
+from perception.places.track import Array, Track, at_end, errors_of, seen_from
 from ssh_abduction.data.odometry import Pose, moved
 from ssh_abduction.runtime.threads import one_thread
 

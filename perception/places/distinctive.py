@@ -541,11 +541,10 @@ class Stays:
         """
         recent, way = self._recent, self._recent.way(scan)
         before, after = recent.at(way - stride), recent.at(way + stride)
-        first, here, last = (recent.poses(i, i + 1)[0, :2] for i in (before, scan, after))
-        there, back = here - first, last - here
-        if min(math.hypot(*there), math.hypot(*back)) <= stride / 3:
+        (x, y, _), (x0, y0, _), (x1, y1, _) = (recent.pose(i) for i in (scan, before, after))
+        if min(math.hypot(x - x0, y - y0), math.hypot(x1 - x, y1 - y)) <= stride / 3:
             return 0.0
-        return radians_between(math.atan2(there[1], there[0]), math.atan2(back[1], back[0]))
+        return radians_between(math.atan2(y - y0, x - x0), math.atan2(y1 - y, x1 - x))
 
     def _limit(self, horizon: int | None) -> int:
         """Find the scan before which all visits and turns can be completed now."""

@@ -24,12 +24,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from perception.places.odometers import Doubt, doubts_of, is_missing, seconds_between, shows_motion
+from perception.places.odometers import Doubt, doubts_of, seconds_between, shows_motion
 from perception.places.track import (
     Array,
     Track,
@@ -109,6 +110,7 @@ GUESSES = [(x, math.radians(turn)) for x in (0.0, 1.0, 2.0, 3.0) for turn in ran
 LIKELIEST = 8
 # Numbers that a growing track keeps for each scan: pose, covariance and share.
 ROW = 3 + 9 + 1
+_Posed = tuple[Scan, Pose]
 
 
 def follow(log: RobotLog, known: tuple[Mapping[int, Doubt], Track] | None = None) -> Track:
@@ -288,9 +290,9 @@ class Follower:
         if doubt is Doubt.NONE and scan.laser.mount not in self._mounts:
             # The first scan of another laser may show none of the known walls.
             return Followed(scan, guess, odometer_covariance(onward)), True
-        seen, recent = surfaces_in(scan), self._walls.recent
+        seen = surfaces_in(scan)
         keys = [*self._walls.keys][-BESIDE:]
-        step = ScanMotion(scan, seen, recent, start.pose, onward, self._before, keys)
+        step = ScanMotion(scan, seen, self._walls.recent, start.pose, onward, self._before, keys)
         return step.judged(doubt), True
 
 
@@ -302,18 +304,20 @@ class LocalWalls:
         self.recent: deque[Surfaces] = deque(maxlen=RECENT)
 
     def add(self, key: Followed) -> None:
-        """Add a keyframe, and the surfaces in it.
-
-        What stands in space that earlier keyframes saw to be free has moved. It is no wall.
-        """
-        known = [self.keys[-n] for n in EARLIER if n <= len(self.keys)]
-        near = [old for old in known if math.dist(old.pose[:2], key.pose[:2]) < NEARBY]
-        gone = [_in_free_space(key.scan, key.pose, old.scan, old.pose)[0] for old in near]
-        seen = surfaces_in(key.scan, np.any(gone, axis=0) if gone else None)
+        """Add a keyframe, and the surfaces in it. What moved is no wall."""
+        seen = surfaces_in(key.scan, self._moved_in(key.scan, key.pose))
         # Walls are remembered while the laser sees none.
         if len(seen) or not self.recent:
             self.recent.append(seen.moved(key.pose))
         self.keys.append(key)
+
+    def _moved_in(self, scan: Scan, pose: Pose) -> NDArray[np.bool_]:
+        """Mask of the beams of a scan, (beams,), that end where keyframes saw free space."""
+        gone = np.zeros(len(scan.ranges), bool)
+        for old in (self.keys[-n] for n in EARLIER if n <= len(self.keys)):
+            if math.dist(old.pose[:2], pose[:2]) < NEARBY:
+                gone |= _in_free_space(scan, pose, old.scan, old.pose)[0]
+        return gone
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,11 +401,7 @@ class ScanMotion:
     def _intruding(self, pose: Array) -> float:
         """The share of points of the scan, at a pose, and of the last keyframes in free space."""
         at: Pose = (float(pose[0]), float(pose[1]), float(pose[2]))
-        inside = seen = 0
-        for key in self.keys:
-            one, other = (self.scan, at), (key.scan, key.pose)
-            for masks in (_in_free_space(*one, *other), _in_free_space(*other, *one)):
-                inside, seen = inside + int(masks[0].sum()), seen + int(masks[1].sum())
+        inside, seen = _clashes([(self.scan, at)], [(key.scan, key.pose) for key in self.keys])
         return inside / max(seen, 1)
 
     def _searched(self) -> Followed:
@@ -438,10 +438,7 @@ class ScanMotion:
         return Followed(self.scan, (x, y, wrapped(heading)), covariance, share)
 
     def _without_odometry(self) -> Followed | None:
-        """Match the scan without odometry; None if it does not match.
-
-        Two guesses are tried: the robot moved as it did before, or it stood still.
-        """
+        """Match the scan as if the robot moved as before, or stood; None if neither matches."""
         wide = np.diag(UNKNOWN) ** 2
         onward, stayed = (self.matched(guess, wide) for guess in (self.before, (0.0, 0.0, 0.0)))
         best = stayed if stayed[2] > onward[2] + ALIKE else onward
@@ -451,20 +448,6 @@ class ScanMotion:
 def share_failing(track: Track) -> float:
     """Compute the share of the scans that show walls, but hardly match what was seen before."""
     return float((track.shares < POOR).mean())
-
-
-def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
-    """List scans that match well but turned differently from the odometry, by how many radians.
-
-    Without odometry, there is none.
-    """
-    found: list[tuple[int, float]] = []
-    for i in range(1, len(log)) if not is_missing(log) else ():
-        measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
-        off = wrapped(float(track.poses[i, 2] - track.poses[i - 1, 2]) - measured)
-        if abs(off) > TURNED and track.shares[i] >= POOR and i not in track.cuts:
-            found.append((i, off))
-    return found
 
 
 def _square(pose: Array, guess: Array, information: Array) -> float:
@@ -675,21 +658,20 @@ def _intruding_shares(log: RobotLog, track: Track) -> dict[int, float]:
     return found
 
 
-def _intruding_share(
-    log: RobotLog, track: Track, before: Sequence[int], after: Sequence[int]
-) -> float:
+def _intruding_share(log: RobotLog, track: Track, before: list[int], after: list[int]) -> float:
     """The share of the points of either scans that intrude on the others; 0 for few points."""
-    pairs = [pair for k in before for n in after for pair in ((k, n), (n, k))]
-    inside, seen = np.sum([_intruding(log, track, *pair) for pair in pairs], axis=0)
-    return float(inside / seen) if seen >= FEW_POINTS * len(pairs) else 0.0
+    sides = ([(log.scans[k], track.pose(k)) for k in some] for some in (before, after))
+    inside, seen = _clashes(*sides)
+    return inside / seen if seen >= FEW_POINTS * 2 * len(before) * len(after) else 0.0
 
 
-def _intruding(log: RobotLog, track: Track, one: int, other: int) -> tuple[int, int]:
-    """Count the points of scan `one` in the free space of `other`, and those in its view."""
-    inside, in_view = _in_free_space(
-        log.scans[one], track.pose(one), log.scans[other], track.pose(other)
-    )
-    return int(inside.sum()), int(in_view.sum())
+def _clashes(some: Sequence[_Posed], others: Sequence[_Posed]) -> tuple[int, int]:
+    """Count the points of either scans in the free space of the others, and those in their view."""
+    inside = seen = 0
+    for one, other in product(some, others):
+        for masks in (_in_free_space(*one, *other), _in_free_space(*other, *one)):
+            inside, seen = inside + int(masks[0].sum()), seen + int(masks[1].sum())
+    return inside, seen
 
 
 def _in_free_space(
@@ -709,7 +691,8 @@ def _in_free_space(
     beam = beam.astype(int)
     seen = (beam >= 1) & (beam < len(other.ranges) - 1)
     beam, far = beam[seen], np.abs(points[seen])
-    ranges = np.nan_to_num(other.ranges, nan=0.0, posinf=laser.reach)
+    ranges = np.where(np.isposinf(other.ranges), laser.reach, other.ranges)
+    ranges[np.isnan(ranges)] = 0.0
     # The nearest and the farthest range of each beam and its two neighbours.
     around = ranges[[beam - 1, beam, beam + 1]]
     free, wall = around.min(axis=0), around.max(axis=0)

@@ -32,11 +32,12 @@ from perception.places import closures, following, log_checks, odometers, relati
 from perception.places.distinctive import WIDTH, WINDOW, Visit, find_visits
 from perception.places.partings import with_partings
 from perception.places.tracing import closure_of, starts_of_drives, to_trace
-from perception.places.track import Array, Track, points_turned
+from perception.places.track import Array, Track, points_turned, wrapped
 from perception.readers.scans import RobotLog
 from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.drives import together
 from ssh_abduction.data.errors import named
+from ssh_abduction.data.odometry import displacement_between
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.loggers import begin_stage, log_of
 
@@ -242,7 +243,7 @@ def tracked(log: RobotLog, tell: Tell = tell_nobody, known: Grown | None = None)
         log, *_ = log_checks.checked(odometers.with_lag(logged, lag))
         track = following.follow(log)
         say([odometers.describe_lag(lag)])
-    say(odometers.describe_cuts(log, track, following.turned_wrongly(log, track)))
+    say(odometers.describe_cuts(log, track, turned_wrongly(log, track)))
     # If the odometry is wrong throughout, that explains all differences between the trajectories.
     doubt = None if whole else odometers.disagreement(log, track)
     say([doubt] if doubt else [])
@@ -250,6 +251,21 @@ def tracked(log: RobotLog, tell: Tell = tell_nobody, known: Grown | None = None)
     track, doubts = log_checks.judged(log, track, explained)
     say(doubts)
     return log, replace(track, is_reliable=track.is_reliable and not doubt), tuple(notes)
+
+
+def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
+    """List scans that match well but turned differently from the odometry, by how many radians.
+
+    Without odometry, there is none.
+    """
+    found: list[tuple[int, float]] = []
+    for i in range(1, len(log)) if not odometers.is_missing(log) else ():
+        measured = displacement_between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
+        off = wrapped(float(track.poses[i, 2] - track.poses[i - 1, 2]) - measured)
+        is_matched = track.shares[i] >= following.POOR and i not in track.cuts
+        if abs(off) > following.TURNED and is_matched:
+            found.append((i, off))
+    return found
 
 
 def with_views(trace: Trace) -> Trace:

@@ -135,6 +135,7 @@ class LocalMaps:
         # The torus covers all that the scans of one window can see, and a patch around any of them.
         self._side = int(2 * (reach + SIGHT + 2) / CELL)
         self._known: dict[int, tuple[Cells, Cells]] = {}  # the cells of each scan
+        self._sums: dict[frozenset[int], Cells] = {}  # what `_counted` returned last
 
     def around(self, scan: int, middle: Array | Sequence[float], half: float) -> Patch:
         """Make the square patch around a position near a scan.
@@ -146,11 +147,7 @@ class LocalMaps:
         first = np.rint(np.asarray(middle) / CELL).astype(int) - round(half / CELL)
         rows, columns = (np.arange(n, n + 2 * round(half / CELL) + 1) % self._side for n in first)
         cells = rows[:, None] * self._side + columns
-        seen = [(NO_CELLS, NO_CELLS), *map(self._cells_of, self._recent.keyframes(begin, end))]
-        passed, met = (
-            np.bincount(np.concatenate(some), minlength=self._side**2)[cells]
-            for some in zip(*seen, strict=True)
-        )
+        passed, met = (count[cells] for count in self._counted(self._recent.keyframes(begin, end)))
         occupied = (met > 0) & (met >= OCCUPIED * (met + passed))
         trail = self._trail(begin, end, first, passed.shape)
         free = ((passed > 0) & ~occupied) | any_beside(any_beside(np.pad(trail, 2)))
@@ -173,6 +170,26 @@ class LocalMaps:
         trail = np.zeros(shape, bool)
         trail[cells[:, 0], cells[:, 1]] = True
         return trail
+
+    def _counted(self, keys: Sequence[int]) -> Cells:
+        """For each cell of the torus, in how many scans it was seen through, and hit: (2, cells).
+
+        A window has most scans in common with the last one.
+        """
+        window = frozenset(keys)
+        last, counts = self._sums.popitem() if self._sums else (frozenset[int](), NO_CELLS)
+        lost = not last - window <= self._known.keys()
+        if not last or lost or 4 * len(window ^ last) > len(window):
+            seen = [(NO_CELLS, NO_CELLS), *map(self._cells_of, keys)]
+            joined = (np.concatenate(some) for some in zip(*seen, strict=True))
+            sums = [np.bincount(some, minlength=self._side**2) for some in joined]
+            counts = np.array(sums, np.int32)
+        else:
+            for one, i in [(-1, i) for i in last - window] + [(1, i) for i in window - last]:
+                for count, cells in zip(counts, self._cells_of(i), strict=True):
+                    count[cells] += one
+        self._sums[window] = counts
+        return counts
 
     def _cells_of(self, i: int) -> tuple[Cells, Cells]:
         """Find the cells that scan i looked through, and the cells in which it hit something.
@@ -265,6 +282,10 @@ class Recent:
     def poses(self, begin: int, end: int) -> Array:
         """Return the poses of scans begin … end - 1: (n, 3) metres and radians."""
         return np.array(self._poses[begin - self.begin : end - self.begin]).reshape(-1, 3)
+
+    def pose(self, index: int) -> Pose:
+        """Return the pose of a scan."""
+        return self._poses[index - self.begin]
 
     def way(self, index: int) -> float:
         """Return the metres driven up to a scan, or up to the first one that is kept; 0 if none."""

@@ -439,10 +439,8 @@ def change_between(first: Scan, last: Scan) -> float:
     """
     if first.laser.mount != last.laser.mount:
         return 0.0
-    before, after = (
-        np.minimum(np.nan_to_num(scan.ranges, nan=0.0, posinf=NO_RANGE), NO_RANGE)
-        for scan in (first, last)
-    )
+    # Unknown ranges stay NaN.
+    before, after = (np.clip(scan.ranges, 0.0, NO_RANGE) for scan in (first, last))
     if first.laser != last.laser:  # Compare the nearest beams.
         at = (last.laser.bearings - first.laser.first) / first.laser.step
         beams = np.rint(at).astype(int)

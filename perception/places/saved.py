@@ -51,7 +51,10 @@ CLASSES = {
     if isinstance(kind, type) and kind.__module__.startswith("perception.")
 }
 # Attributes with what can be computed again are saved empty.
-CACHES = {("LocalMaps", "_known"), ("ClosureFinder", "_scenes"), ("ClosureFinder", "_matches")}
+CACHES = {
+    *(("LocalMaps", "_known"), ("LocalMaps", "_sums")),
+    *(("ClosureFinder", "_scenes"), ("ClosureFinder", "_matches")),
+}
 # Numbers of a row of `drive.scans` before the ranges: the numbers of the laser and of the ranges,
 # the line, the time, two poses, whether the track is cut and broken, and a row of the track.
 HEAD = 4 + 3 + 3 + 2 + following.ROW

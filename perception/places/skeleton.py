@@ -419,12 +419,13 @@ def _in_order(cells: Sequence[int], ends: Set[int], steps: Sequence[int]) -> lis
     `steps` has the differences between the numbers of neighbouring cells, those to try first first.
     """
     left = set(cells)
-    cell: int | None = next((cell for cell in cells if cell in ends), cells[0])
-    line = []
-    while cell is not None:
-        line.append(cell)
+    line = [next((cell for cell in cells if cell in ends), cells[0])]
+    for cell in line:  # The line grows.
         left.discard(cell)
-        cell = next((cell + step for step in steps if cell + step in left), None)
+        for step in steps:
+            if cell + step in left:
+                line.append(cell + step)
+                break
     return line
 
 

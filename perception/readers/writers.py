@@ -85,9 +85,7 @@ def write_carmen(
 
 
 def write_bag(
-    path: str | os.PathLike[str],
-    scans: Iterable[Scan],
-    covariances: Array | None = None,
+    path: str | os.PathLike[str], scans: Iterable[Scan], covariances: Array | None = None
 ) -> None:
     """Write scans as a ROS bag, completely or not at all.
 

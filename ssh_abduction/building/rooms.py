@@ -365,9 +365,7 @@ class Box:
 
 
 def straightened(
-    plan: FloorPlan,
-    room: Mapping[int, int],
-    spaces: Mapping[int, RoomSpace],
+    plan: FloorPlan, room: Mapping[int, int], spaces: Mapping[int, RoomSpace]
 ) -> FloorPlan:
     """Return the plan with one straight way through each room that is long and slim."""
     spots, edges, corners = dict(plan.spots), list(plan.edges), plan.corners
@@ -427,11 +425,7 @@ def _onward(edges: Sequence[PlanEdge], place: int, ahead: Array) -> bool:
 
 
 def _chain(
-    box: Box,
-    space: RoomSpace,
-    ends: Sequence[int],
-    at: Sequence[float],
-    inner: Sequence[PlanEdge],
+    box: Box, space: RoomSpace, ends: Sequence[int], at: Sequence[float], inner: Sequence[PlanEdge]
 ) -> Iterator[PlanEdge]:
     """Yield the edges of a straight way along a box, with the widths and openings of its room."""
     seen: list[tuple[float, Gap]] = []

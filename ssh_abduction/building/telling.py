@@ -36,9 +36,7 @@ def told(ssh_map: SSHMap) -> Iterator[str]:
 def corridor_in_words(ssh_map: SSHMap, corridor: Corridor) -> str:
     """Describe a corridor: its size, its places, and the ways beside it."""
     order = " – ".join(ssh_map.numbered("place", p) for p in corridor.order)
-    parts = [
-        f"{corridor.length:.0f} m, {corridor.width:.1f} m wide, places {order}",
-    ]
+    parts = [f"{corridor.length:.0f} m, {corridor.width:.1f} m wide, places {order}"]
     for side in ("left", "right"):
         ways = dict.fromkeys(_way(ssh_map, o) for o in corridor.openings if o.side == side)
         parts.append(f"{side}: {', '.join(ways) or 'nothing known'}")

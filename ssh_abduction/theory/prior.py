@@ -328,10 +328,7 @@ class Prior:
         return LeastMoves(float(nats[counts].sum()), (saved[0], saved[1, : len(apart[1])]), pulls)
 
     def _links(
-        self,
-        dstates: Sequence[int],
-        places: Sequence[Hashable],
-        laid: Laid,
+        self, dstates: Sequence[int], places: Sequence[Hashable], laid: Laid
     ) -> tuple[_FirstMoves, tuple[Ints, Array, Ints, Laid, Flags]]:
         """Collect the first move along each link, and what `choices` asks of it."""
         labels, (poses, frame) = np.array(numbered(dstates)), laid

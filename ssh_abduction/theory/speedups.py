@@ -207,10 +207,7 @@ TABLE = (
     ),
     # Begin with few names for paths, and add names when they are too few.
     Speedup(
-        "path_names",
-        "path_names",
-        lambda theory: theory.level == "topological",
-        TRAVELS_AND_TURNS,
+        "path_names", "path_names", lambda theory: theory.level == "topological", TRAVELS_AND_TURNS
     ),
     # Causal theory: make some names. Clingo chooses one of them for each node.
     Speedup(
@@ -296,35 +293,18 @@ TABLE = (
     ),
     # Find steps that are pairwise distinct, or such segments of paths. Give each its own name.
     Speedup(
-        "clique",
-        "clique",
-        lambda theory: not theory.unknown_views and not theory.changed,
-        CAUSAL,
+        "clique", "clique", lambda theory: not theory.unknown_views and not theory.changed, CAUSAL
     ),
     # Places with frames: while dstates are sought, add what the order and the sides of paths
     # forbid, path by path.
-    Speedup(
-        "sides",
-        "sides",
-        _has_frames,
-        FRAMES,
-    ),
+    Speedup("sides", "sides", _has_frames, FRAMES),
     # Give clingo only some links, or visits, at first. Add others when an answer breaks them.
-    Speedup(
-        "lazy",
-        "lazy",
-    ),
+    Speedup("lazy", "lazy"),
     # Raise the lower bound by unsat cores, instead of improving a map step by step.
-    Speedup(
-        "core_guided",
-        "core_guided",
-    ),
+    Speedup("core_guided", "core_guided"),
     # Make a map without clingo, by sketches or by a beam of hypotheses about the displacements. The
     # checker judges this map. Without it, the confidence of a map ignores maps that break axioms.
-    Speedup(
-        "greedy",
-        "greedy",
-    ),
+    Speedup("greedy", "greedy"),
     # To add a drive to an existing map, give the solver each link of the map once, instead of all
     # old steps.
     Speedup(
