@@ -468,6 +468,8 @@ def test_doors_are_narrow_with_wider_space_on_both_sides() -> None:
     wide[18:20] = 0.9
     assert doors_in(wide) == [18]
     assert doors_in(np.full(40, 1.2)) == []  # a narrow corridor is no door
+    wedge = [*np.linspace(2.0, 1.3, 18), *np.full(12, 4.0)]  # nor is one that narrows steadily
+    assert doors_in(np.array(wedge)) == []
     wide[12:24] = 0.9  # but a short one between two rooms is
     assert doors_in(wide) == [17]
     wide[:8], wide[26:] = 1.0, 1.0  # and a part of a corridor between two openings is none

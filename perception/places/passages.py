@@ -28,8 +28,9 @@ WIDE, ALONG = 4.0, 0.3
 # A door is at most DOOR metres wide. The free space before and behind it is wider by WIDER metres.
 # A wall is known to half a cell, so two widths of one passage differ by two cells at most. These
 # wider parts are at most NEAR metres apart: a longer narrow part is a corridor with openings beside
-# it. But if both are longer than NEAR metres, they are rooms, and may be twice as far apart.
-DOOR, NEAR, WIDER = 1.45, 2.0, 2 * CELL
+# it. But if both are longer than NEAR metres, they are rooms, and may be twice as far apart. A door
+# has jambs: before and behind it, the way widens by WIDER within JAMB points. A wedge has none.
+DOOR, NEAR, WIDER, JAMB = 1.45, 2.0, 2 * CELL, 4
 # Walls go on if GO_ON points on each side of a narrow part are on one line.
 GO_ON = 3
 # A part of a wall is an opening if there the free space reaches DEEP metres farther than beside it,
@@ -182,11 +183,17 @@ def doors_in(wide: Array, ends: Sequence[bool] = (False, False)) -> list[int]:
         begin, end = np.flatnonzero(wider[:k])[-1], k + np.flatnonzero(wider[k:])[0]
         parts = wider[max(begin - near, 0) : begin + 1], wider[end : end + near + 1]
         is_between_rooms = min(part.sum() for part in parts) > near
-        if end - begin <= (2 * near if is_between_rooms else near):
+        short = end - begin <= (2 * near if is_between_rooms else near)
+        if short and _has_jamb(wide[max(begin - 1, 0) : k + 1]) and _has_jamb(wide[k : end + 2]):
             found.append(k)
     closets = [len(wide) - 1 - k for k in _closet_in(wide[::-1])] * ends[0]
     closets += _closet_in(wide) * ends[1]
     return found + [k for k in closets if all(abs(k - door) * STEP > NEAR for door in found)]
+
+
+def _has_jamb(wide: Array) -> bool:
+    """Whether a part of a course widens by WIDER within JAMB points, or is no longer than that."""
+    return len(wide) <= JAMB or float(np.abs(wide[JAMB:] - wide[:-JAMB]).max()) >= WIDER - 1e-6
 
 
 def _closet_in(wide: Array) -> list[int]:

@@ -181,9 +181,8 @@ def with_doors(plan: FloorPlan, room: dict[int, int], ssh_map: SSHMap) -> tuple[
                 new = MapDoor(len(found), (x, y), passage.width, places, rooms, dstates)
                 halves = (d for d in found if d.rooms == new.rooms)
                 number = next((d.id for d in halves if math.dist(d.at, new.at) < HALF), new.id)
-                found[number : number + 1] = [
-                    _joined(found[number], new) if number < new.id else new
-                ]
+                one = _joined(found[number], new) if number < new.id else new
+                found[number : number + 1] = [one]
                 passages[k] = replace(passage, door=number)
         edges.append(replace(edge, passages=tuple(passages)))
     plan.edges = edges
@@ -192,12 +191,9 @@ def with_doors(plan: FloorPlan, room: dict[int, int], ssh_map: SSHMap) -> tuple[
 
 def _joined(one: MapDoor, other: MapDoor) -> MapDoor:
     """Join the halves of a double door."""
-    return replace(
-        one,
-        width=max(one.width, other.width),
-        places=tuple(sorted({*one.places, *other.places})),
-        dstates=tuple(sorted({*one.dstates, *other.dstates})),
-    )
+    places = tuple(sorted({*one.places, *other.places}))
+    dstates = tuple(sorted({*one.dstates, *other.dstates}))
+    return replace(one, width=max(one.width, other.width), places=places, dstates=dstates)
 
 
 def corridors_of(
