@@ -24,7 +24,7 @@ from perception.places.passages import (
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.building.derive import buildings_of, with_building
 from ssh_abduction.building.directions import RouteCourse, directions_to
-from ssh_abduction.building.edges import PlanEdge
+from ssh_abduction.building.edges import LEG, PlanEdge, _corners
 from ssh_abduction.building.straight_paths import PRICE, best_pairings, chains_of, sides_of
 from ssh_abduction.building.telling import told
 from ssh_abduction.checker.buildings import faults_of_corridors, faults_of_paths
@@ -154,6 +154,14 @@ def test_sides_and_mirror_images() -> None:
     (image,) = (path for path in mirrored.paths if len(path.order) == 4)
     assert image.order == street.order
     assert (image.left, image.right) == (street.right, street.left)
+
+
+def test_a_turned_course_has_the_same_corners() -> None:
+    """Its shorter leg is exactly as long as the longest leg without a corner."""
+    legs = np.concatenate([np.arange(0, LEG, STEP), LEG + 1j * np.arange(0, 4.1, STEP)])
+    for degrees in range(0, 360, 7):
+        way = legs * np.exp(1j * math.radians(degrees))
+        assert not [*_corners(np.stack([way.real, way.imag], axis=1))]
 
 
 def test_turned_and_backward_drives_give_the_same_paths() -> None:

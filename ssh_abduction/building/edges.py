@@ -385,6 +385,6 @@ def _corners(way: Array) -> Iterator[int]:
     legs = np.diff(chain, axis=0)
     bearing, length = np.arctan2(legs[:, 1], legs[:, 0]), np.hypot(*legs.T)
     bend = np.abs((np.diff(bearing) + math.pi) % math.tau - math.pi)
-    sharp = (bend > CORNER) & (np.minimum(length[1:], length[:-1]) > LEG)
+    sharp = (bend > CORNER) & (np.minimum(length[1:], length[:-1]) > LEG + 1e-6)
     for point in chain[1:-1][sharp]:
         yield int(np.hypot(*(way - point).T).argmin())
