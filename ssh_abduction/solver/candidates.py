@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -31,8 +31,6 @@ from ssh_abduction.solver.sources.symbolic.sketch import (
     sketch_beyond,
     sketches_of,
 )
-from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
-from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
@@ -109,25 +107,6 @@ class Candidates:
     def accepts(self, ssh_map: SSHMap) -> bool:
         """Whether the checker accepts a map."""
         return self._judging.accepts(projected(ssh_map, self._task.theory))
-
-    def map_without(self, wrong: Collection[int], most: float = math.inf) -> SSHMap | None:
-        """Find a map by a narrow beam if only the displacements to `wrong` steps are wrong.
-
-        Return the first map that the checker accepts; None if there is none, or if it costs more
-        than about `most` nats.
-        """
-        from ssh_abduction.solver.sources.metric.beam import Beam  # loads numpy
-
-        trace, theory = self._task.trace, self._task.theory
-        mended = trace.without_displacements_at(wrong)
-        problem = self._task.problem.changed(mended, theory.replace(jumped=0.0))
-        jumps = faults_of(((t, "jumped") for t in wrong), {}, {}, trace, theory)
-        most -= FAULT * sum(fault.cost for fault in jumps)
-        for ssh_map in Beam(problem, self._task.log, 1).maps(most):
-            whole = with_more_faults(ssh_map, jumps)
-            if self._judging.accepts(whole):
-                return whole
-        return None
 
     def joining(self) -> Joining | None:
         """Return a search that joins the maps of single drives.

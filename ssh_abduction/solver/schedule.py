@@ -135,13 +135,19 @@ WEIGHED = (
         "beams with wrong displacements",
         "theories with `jumped`: all beams",
         "They often drop the best map. The search for wrong displacements finds it.",
-        until=0.4,
+        until=0.2,
     ),
     SourceTurn(
         "beam without axioms",
         "a broad beam ended",
         "It says how much cheaper a map that breaks axioms would be.",
         until=0.8,
+    ),
+    SourceTurn(
+        "wrong displacements",
+        "theories with `jumped`, more than 60 steps",
+        "A search over which displacements are wrong. No source proves such maps.",
+        until=0.9,
     ),
     SourceTurn(
         "fewest dstates, map known",
@@ -167,11 +173,6 @@ WEIGHED = (
         "the same, for long traces with faults",
         "No other source can prove that these maps are the best.",
         most=30.0,
-    ),
-    SourceTurn(
-        "wrong displacements",
-        "theories with `jumped`, more than 60 steps",
-        "A local search over which displacements are wrong. No source proves such maps.",
     ),
     SourceTurn(
         "Benders cuts",

@@ -11,7 +11,7 @@ Closures may be false. Places are merged under several explanations of the closu
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Set
+from collections.abc import Callable, Collection, Iterator, Set
 from contextlib import suppress
 from dataclasses import replace
 
@@ -26,6 +26,8 @@ from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.schedule import Source, turn
 from ssh_abduction.solver.sources.metric.beam import Beam
 from ssh_abduction.solver.sources.metric.joint_drives import Joining
+from ssh_abduction.solver.sources.metric.overlay import smoothed_map
+from ssh_abduction.solver.steps.faults import faults_of, with_more_faults
 from ssh_abduction.theory.prior import spreads_of
 
 # The numbers of hypotheses of the beams, in their order.
@@ -118,6 +120,23 @@ class Beams:
                 self._break_axioms,
             ),
         ]
+
+    def maps_without(self, wrong: Collection[int]) -> Iterator[SSHMap]:
+        """Find maps by a narrow beam if only the displacements to `wrong` steps are wrong.
+
+        Yield the first map that the checker accepts, and this map with its places merged further.
+        """
+        task, accepts = self._parts.task, self._parts.candidates.accepts
+        mended = task.trace.without_displacements_at(wrong)
+        problem = task.problem.changed(mended, task.theory.replace(jumped=0.0))
+        jumps = faults_of(((t, "jumped") for t in wrong), {}, {}, task.trace, task.theory)
+        for ssh_map in Beam(problem, task.log, 1).maps():
+            if accepts(whole := with_more_faults(ssh_map, jumps)):
+                yield whole
+                merged = smoothed_map(problem, task.log, Misfit(problem).beginning(ssh_map))
+                if merged and accepts(whole := with_more_faults(merged, jumps)):
+                    yield whole
+                return
 
     def _smooth(self) -> None:
         """Merge places at poses that fit all closures."""

@@ -66,6 +66,7 @@ from ssh_abduction.solver.sources.metric.wrong_displacements import search_jumps
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
+from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.prior import spreads_of
 from ssh_abduction.theory.settle import Problem, displacement_of
 from ssh_abduction.theory.speedups import row
@@ -178,11 +179,6 @@ class Weighing:
                 lambda: bool(self.candidates) and Forcing.holds_for(problem),
                 self._force,
             ),
-            Source(
-                turn("wrong displacements"),
-                lambda: self._is_long and bool(self.candidates and theory.jumped),
-                self._search_jumps,
-            ),
             Source(turn("Benders cuts"), lambda: not self.proven, self._cut),
         ]
 
@@ -233,12 +229,21 @@ class Weighing:
         too_few = by_places and all(len(one.places) > len({*course[1]}) for one in maps)
         return proven and (too_few or len(costs) == len(maps))
 
-    def _search_jumps(self) -> None:
+    def may_jump(self) -> bool:
+        """Whether to search for wrong displacements: the trace is too long for a proof of them."""
+        return self._is_long and bool(self.candidates and self._task.theory.jumped)
+
+    def search_jumps(self) -> None:
         """Look for cheaper maps with other wrong displacements."""
-        parts = self._parts
-        if parts.candidates.beam(1):
-            best, map_without = self.candidates[0].map, parts.candidates.map_without
-            search_jumps(parts.task.trace, map_without, best, self.add)
+        task, maps_without = self._parts.task, self.beams.maps_without
+        price = [FAULT * task.theory.fault_tenths("jumped", step) / 10 for step in task.trace.steps]
+
+        def refit(ssh_map: SSHMap, wrong: Collection[int]) -> float:
+            nats = self._misfit.nats_of_course(*dstates_and_places(ssh_map), wrong)
+            return nats + sum(price[t] for t in wrong)
+
+        if self._parts.candidates.beam(1):
+            search_jumps(task.trace, maps_without, refit, self.candidates[0].map, self.add)
 
     def _cut(self) -> None:
         """List maps by their counts, and exclude those whose misfit is too expensive."""

@@ -366,10 +366,8 @@ class Beam:
         self.refuses = self.drops = False
         self._kept: list[list[Hypothesis]] = []  # the beam after each check
 
-    def maps(self, most: float = math.inf) -> Iterator[SSHMap]:
+    def maps(self) -> Iterator[SSHMap]:
         """Yield the maps of the hypotheses of the whole trace that satisfy the axioms, by cost.
-
-        Give up as soon as all hypotheses cost more than `most` nats.
 
         If a time limit or another exception ended an earlier call, go on from there. If no
         hypothesis is left after some steps, go back to an earlier beam and check each hypothesis at
@@ -388,7 +386,7 @@ class Beam:
                 if back == len(kept):
                     break
                 back = min(2 * back, len(kept))
-            if not beam or beam[0].nats > most:
+            if not beam:
                 return
             kept[-1] = kept[-1][:SPARE]  # saves memory
             kept.append(beam)
