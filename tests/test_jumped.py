@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Collection
 from dataclasses import replace
 from functools import cache
 from itertools import chain, combinations
@@ -25,7 +24,6 @@ from ssh_abduction.data.odometry import in_words
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.solver import Misfit, Search
 from ssh_abduction.solver.costs import weighing
-from ssh_abduction.solver.costs.estimating import dstates_and_places
 from ssh_abduction.solver.sources.metric.wrong_displacements import search_jumps
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.evidence.displacement import jumped
@@ -190,13 +188,9 @@ def test_search_for_a_jump_costs_at_most_the_true_cost() -> None:
         assert not check(search.trace, ssh_map, search.theory)
         return found.setdefault(jumped(ssh_map), misfit.nats_of(ssh_map))
 
-    def refit(ssh_map: SSHMap, wrong: Collection[int]) -> float:
-        course = dstates_and_places(ssh_map)
-        return misfit.nats_of_course(*course, wrong) + FAULT * search.theory.jumped * len(wrong)
-
-    maps_without = weighing.Weighing(parts).beams.maps_without
-    believing, *_ = maps_without(())
-    search_jumps(search.trace, maps_without, refit, believing, add)
+    beams = weighing.Weighing(parts).beams
+    believing, *_ = beams.maps_without(())
+    search_jumps(search.trace, beams.maps_without, beams.refitted, believing, add)
     dstates, places = walk.truth, [state[:2] for state in walk.truth]
     number = [[*dict.fromkeys(names)].index for names in (dstates, places)]
     course = [*map(number[0], dstates)], [*map(number[1], places)]

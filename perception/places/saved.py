@@ -52,8 +52,10 @@ CLASSES = {
 }
 # Attributes with what can be computed again are saved empty.
 CACHES = {
-    *(("LocalMaps", "_known"), ("LocalMaps", "_sums")),
-    *(("ClosureFinder", "_scenes"), ("ClosureFinder", "_matches")),
+    ("LocalMaps", "_known"),
+    ("LocalMaps", "_sums"),
+    ("ClosureFinder", "_scenes"),
+    ("ClosureFinder", "_matches"),
 }
 # Numbers of a row of `drive.scans` before the ranges: the numbers of the laser and of the ranges,
 # the line, the time, two poses, whether the track is cut and broken, and a row of the track.

@@ -63,7 +63,7 @@ function paintPoints(figure) {
 // How far each point is off after the rotation and the shift that fit best.
 function residuals(points) {
   const mean = (i) => points.reduce((sum, point) => sum + point[i], 0) / points.length,
-    middle = TRIPLE.concat(3).map(mean),
+    middle = POINTS.map((_, i) => mean(i)),
     off = points.map((point) => point.map((number, i) => number - middle[i])),
     along = off.reduce((sum, [a, b, x, y]) => sum + a * x + b * y, 0),
     across = off.reduce((sum, [a, b, x, y]) => sum + a * y - b * x, 0),

@@ -129,14 +129,24 @@ class Beams:
         task, accepts = self._parts.task, self._parts.candidates.accepts
         mended = task.trace.without_displacements_at(wrong)
         problem = task.problem.changed(mended, task.theory.replace(jumped=0.0))
-        jumps = faults_of(((t, "jumped") for t in wrong), {}, {}, task.trace, task.theory)
         for ssh_map in Beam(problem, task.log, 1).maps():
-            if accepts(whole := with_more_faults(ssh_map, jumps)):
+            if accepts(whole := self._with_jumps(ssh_map, wrong)):
                 yield whole
                 merged = smoothed_map(problem, task.log, Misfit(problem).beginning(ssh_map))
-                if merged and accepts(whole := with_more_faults(merged, jumps)):
+                if merged and accepts(whole := self._with_jumps(merged, wrong)):
                     yield whole
                 return
+
+    def refitted(self, ssh_map: SSHMap, wrong: Collection[int]) -> float:
+        """Compute the cost of a map in nats if the displacements to `wrong` steps are wrong."""
+        return self._misfit.nats_of(self._with_jumps(ssh_map, wrong))
+
+    def _with_jumps(self, ssh_map: SSHMap, wrong: Collection[int]) -> SSHMap:
+        """Return a map in which only the displacements to `wrong` steps are wrong."""
+        task = self._parts.task
+        jumps = faults_of(((t, "jumped") for t in wrong), {}, {}, task.trace, task.theory)
+        others = tuple(fault for fault in ssh_map.faults if fault.kind != "jumped")
+        return with_more_faults(replace(ssh_map, faults=others), jumps)
 
     def _smooth(self) -> None:
         """Merge places at poses that fit all closures."""

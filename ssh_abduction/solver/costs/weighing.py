@@ -66,7 +66,6 @@ from ssh_abduction.solver.sources.metric.wrong_displacements import search_jumps
 from ssh_abduction.solver.steps.faults import with_more_faults
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
-from ssh_abduction.theory.fields import FAULT
 from ssh_abduction.theory.prior import spreads_of
 from ssh_abduction.theory.settle import Problem, displacement_of
 from ssh_abduction.theory.speedups import row
@@ -235,15 +234,9 @@ class Weighing:
 
     def search_jumps(self) -> None:
         """Look for cheaper maps with other wrong displacements."""
-        task, maps_without = self._parts.task, self.beams.maps_without
-        price = [FAULT * task.theory.fault_tenths("jumped", step) / 10 for step in task.trace.steps]
-
-        def refit(ssh_map: SSHMap, wrong: Collection[int]) -> float:
-            nats = self._misfit.nats_of_course(*dstates_and_places(ssh_map), wrong)
-            return nats + sum(price[t] for t in wrong)
-
         if self._parts.candidates.beam(1):
-            search_jumps(task.trace, maps_without, refit, self.candidates[0].map, self.add)
+            beams, best = self.beams, self.candidates[0].map
+            search_jumps(self._task.trace, beams.maps_without, beams.refitted, best, self.add)
 
     def _cut(self) -> None:
         """List maps by their counts, and exclude those whose misfit is too expensive."""

@@ -33,8 +33,8 @@ def search_jumps(
     cost. Raises LimitError if the time is over.
     """
     steps = [t for t, step in enumerate(trace.steps) if step.displacement is not None]
-    wrong = frozenset(jumped(best))
-    seen, coming = {wrong}, list[tuple[float, list[int], float]]()
+    first = frozenset(jumped(best))
+    seen, coming = {first}, list[tuple[float, list[int], float]]()
 
     def expand(wrong: frozenset[int], known: SSHMap, nats: float) -> None:
         """Let the neighbours of a set follow, with the cost of its map."""
@@ -42,7 +42,7 @@ def search_jumps(
             heapq.heappush(coming, (refit(known, near), sorted(near), nats))
             seen.add(near)
 
-    expand(wrong, best, add(best))
+    expand(first, best, add(best))
     while coming:
         _, chosen, nats = heapq.heappop(coming)
         found = {add(one): one for one in maps_without(chosen)}
