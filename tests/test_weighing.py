@@ -34,7 +34,14 @@ from ssh_abduction.solution.values import Found
 from ssh_abduction.solution.weighed import Rival, Weighed
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.costs import beams, weighing
-from ssh_abduction.solver.costs.estimating import crowded, estimated, rivals_of
+from ssh_abduction.solver.costs.estimating import (
+    course_completed,
+    crowded,
+    dstates_and_places,
+    estimated,
+    moved_visits,
+    rivals_of,
+)
 from ssh_abduction.solver.costs.misfit import Misfit
 from ssh_abduction.solver.geometry.fit import fit
 from ssh_abduction.solver.geometry.poses import Poses, framed
@@ -719,6 +726,32 @@ def test_estimated_rivals_obey_the_user(kind: str, of: Literal["dstate", "place"
     joint = together([drive, replace(drive, odometry=Odometry(along=0.1))])
     solution = solve(joint, Theory().replace(**{kind: [(0, 3)]}), work_limit=0.3)
     assert solution.probability(0, 3, of=of) == pytest.approx(1.0)
+
+
+def test_visit_at_the_wrong_one_of_two_near_places_is_moved() -> None:
+    """From a hub two ways fork, which end at places 2 m apart. The robot goes each way twice."""
+    way = [("travel", (10.0, 0.0, 0.0)), ("around", (0.0, 0.0, math.pi)), ("travel", (10.0, 0, 0))]
+    loop = [*way, ("left", (0.0, 0.0, math.pi + 0.2)), *way, ("right", (0.0, 0.0, math.pi - 0.2))]
+    actions, displacements = zip(*loop * 2, strict=True)
+    trace = Trace.from_steps(
+        "axxybxxz" * 2 + "a", actions, displacements=displacements, odometry=Odometry(across=0.01)
+    )
+    problem = settle(trace, Theory.topological().replace(star="none", boundary="none"))
+    misfit = Misfit(problem)
+    true = [*range(8), *range(8), 0], [0, 1, 1, 0, 0, 2, 2, 0, 0, 1, 1, 0, 0, 2, 2, 0, 0]
+    best = course_completed(problem, misfit, *true)
+    assert best
+    assert sorted(misfit.near_places(*true)) == [(1, 2), (2, 1)]
+    courses = [*moved_visits(problem, misfit, best)]
+    assert len(courses) == 4
+    for course in courses:
+        false = course_completed(problem, misfit, *course)
+        assert false  # so no action leads from one dstate to two
+        search = weighing.Weighing(Search(trace, problem.theory).parts)
+        assert search.add(false) > misfit.nats_of(best) + 1.0
+        search.move_visits()
+        assert search.best
+        assert dstates_and_places(search.best.map) == tuple(map(tuple, true))
 
 
 @pytest.mark.slow

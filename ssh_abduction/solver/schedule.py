@@ -144,6 +144,12 @@ WEIGHED = (
         until=0.8,
     ),
     SourceTurn(
+        "moved visits",
+        "topological theories, no wrong displacements",
+        "A visit near two places may be joined to the wrong one, and merging does not move it.",
+        share=0.3,
+    ),
+    SourceTurn(
         "wrong displacements",
         "theories with `jumped`, more than 60 steps",
         "A search over which displacements are wrong. No source proves such maps.",

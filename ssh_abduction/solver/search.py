@@ -325,6 +325,7 @@ class Search:
             weighing.keep_best()
         # 2. Maps of little cost, by guesses.
         yield from weighing.beams.sources(clashes)
+        yield Source(turn("moved visits"), weighing.may_move, weighing.move_visits)
         yield Source(turn("wrong displacements"), weighing.may_jump, weighing.search_jumps)
         # 3. The least number of dstates.
         is_enough = weighing.best is not None and not self.theory.has_faults

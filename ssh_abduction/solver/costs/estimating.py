@@ -238,6 +238,30 @@ def _moves(best: Rival, begins: Sequence[int], drives: Sequence[Drive]) -> Itera
             yield [begin in moved for begin in begins]
 
 
+def moved_visits(problem: Problem, misfit: Misfit, best: SSHMap) -> Iterator[Course]:
+    """Yield courses like that of a map, but with one visit at another place near its own.
+
+    The steps of this visit are at new dstates. So are the steps before it at which an action would
+    lead from one dstate to two.
+    """
+    dstates, places = dstates_and_places(best)
+    steps = gathered((begin, t) for t, begin in enumerate(misfit.visit))
+    visits = gathered((places[begin], begin) for begin in steps)
+    actions = [action.name for action in problem.trace.actions]
+    for here, there in misfit.near_places(dstates, places):
+        for begin in visits[here]:
+            at, names, waiting = [*places], [*dstates], [*steps[begin]]
+            for t in steps[begin]:
+                at[t] = there
+            while waiting:
+                t = waiting.pop()
+                names[t] = len(names) + t
+                links = [*zip(names, actions, strict=False)]
+                if t and (names[t - 1], actions[t - 1]) in (*links[: t - 1], *links[t:]):
+                    waiting.append(t - 1)
+            yield tuple(numbered(names)), tuple(numbered(at))
+
+
 def dstates_and_places(ssh_map: SSHMap) -> Course:
     """Return the dstate and the place of each step, numbered by first visit."""
     places = [ssh_map.dstates[label].place for label in ssh_map.dstate_at]

@@ -38,7 +38,7 @@ from ssh_abduction.solver.geometry.poses import Poses, framed
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.evidence.displacement import jumped
 from ssh_abduction.theory.fields import FAULT
-from ssh_abduction.theory.prior import AIM, UNKNOWN, Array
+from ssh_abduction.theory.prior import AIM, UNKNOWN, Array, Flags, Ints
 from ssh_abduction.theory.settle import Problem
 
 # The heading of each step and the position of each step, numbered in the order of first steps, such
@@ -153,20 +153,42 @@ class Misfit:
         That is the Gaussian of `Prior.chosen`. With it comes the sum over all pairs to expect if
         poses were independent, and the square of a usual travel belonged to each place.
         """
-        of = np.array(_of_headings(numbered(dstates), numbered(places)))
-        first = np.isin(range(len(of)), [*first_index_of(of.tolist()).values()])
-        poses, frame = framed(self.poses(dstates, places))
-        i, j = np.nonzero(np.triu(np.equal.outer(frame, frame), 1))
-        off, both, same = poses[i] - poses[j], first[i] & first[j], of[i] == of[j]
+        of, first, (i, j), off = self._between(dstates, places)
+        both, same = first[i] & first[j], of[i] == of[j]
         turn = (off[same, 2] + math.pi) % math.tau - math.pi
         far = (off[both, :2] ** 2).sum(axis=1) / self._prior.near**2
         of_places, of_dstates = np.exp(-far / 2), np.exp(-(turn**2) / AIM**2 / 2)
         expected = len(far) * math.pi / 2 / first.sum(), len(turn) * float(UNKNOWN[1])
         return (of_places, expected[0]), (of_dstates, expected[1])
 
+    def near_places(self, dstates: Sequence[int], places: Sequence[int]) -> list[tuple[int, int]]:
+        """List the places that are near each other, as `Prior.near` says: each pair both ways."""
+        of, first, (i, j), off = self._between(dstates, places)
+        near = first[i] & first[j] & (np.hypot(*off[:, :2].T) < self._prior.near)
+        pairs = [(p, q) for p, q in np.stack([of[i], of[j]], 1)[near].tolist()]
+        return [*pairs, *((q, p) for p, q in pairs)]
+
+    def _between(
+        self, dstates: Sequence[int], places: Sequence[int]
+    ) -> tuple[Ints, Flags, tuple[Ints, Ints], Array]:
+        """Return how each two dstates in one frame lie to each other, (pairs, 3).
+
+        The place of each dstate, whether it is the first one there, and the pairs come first.
+        """
+        of = np.array(_of_headings(numbered(dstates), numbered(places)))
+        first = np.isin(range(len(of)), [*first_index_of(of.tolist()).values()])
+        poses, frame = framed(self.poses(dstates, places))
+        i, j = np.nonzero(np.triu(np.equal.outer(frame, frame), 1))
+        return of, first, (i, j), poses[i] - poses[j]
+
     def beginning(self, ssh_map: SSHMap) -> tuple[list[int], list[int], Poses]:
         """Return the dstates and places of a map for `smoothed`, and their equations."""
-        dstates, places, wrong = _course_of(ssh_map)
+        return self.beginning_at(*_course_of(ssh_map))
+
+    def beginning_at(
+        self, dstates: Sequence[int], places: Sequence[Hashable], wrong: Collection[int] = ()
+    ) -> tuple[list[int], list[int], Poses]:
+        """Return what `beginning` does if steps are at these dstates and places."""
         of_dstate = _of_headings(numbered(dstates), numbered(places))
         return numbered(dstates), of_dstate, self.poses(dstates, places, wrong)
 

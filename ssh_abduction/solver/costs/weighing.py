@@ -42,7 +42,7 @@ from ssh_abduction.runtime.loggers import log_of
 from ssh_abduction.solution.values import Cost, Found, Status
 from ssh_abduction.solution.weighed import EQUAL, IMPROBABLE, MOST, Rival, Weighed
 from ssh_abduction.solver.board import Judging, Known, projected
-from ssh_abduction.solver.costs.beams import Beams
+from ssh_abduction.solver.costs.beams import TRIED, Beams
 from ssh_abduction.solver.costs.estimating import (
     CERTAIN,
     Course,
@@ -51,6 +51,7 @@ from ssh_abduction.solver.costs.estimating import (
     dstates_and_places,
     least_places,
     may_join_more,
+    moved_visits,
     rival_of,
     rivals_of,
     rivals_with_misread_views,
@@ -227,6 +228,25 @@ class Weighing:
         by_places = task.theory.priorities[:2] == ("dstates", "places")
         too_few = by_places and all(len(one.places) > len({*course[1]}) for one in maps)
         return proven and (too_few or len(costs) == len(maps))
+
+    def may_move(self) -> bool:
+        """Whether to move visits: beams suit the trace, and no displacement may be wrong."""
+        beam = self._parts.candidates.beam(1)
+        return bool(self.candidates and beam) and not self._task.theory.jumped
+
+    def move_visits(self) -> None:
+        """Move single visits of the best map to places near them, as long as that costs less."""
+        problem, candidates, before = self._task.problem, self._parts.candidates, math.inf
+        while self._nats < before - EQUAL:
+            before = self._nats
+            for course in moved_visits(problem, self._misfit, self.candidates[0].map):
+                look_at_clock()
+                if self._misfit.nats_of_course(*course) < before + TRIED:
+                    bare = course_completed(problem, self._misfit, *course)
+                    merged = candidates.smoothed(self._misfit.beginning_at(*course))
+                    for found in (bare, merged):
+                        if found is not None and candidates.accepts(found):
+                            self.add(found)
 
     def may_jump(self) -> bool:
         """Whether to search for wrong displacements: the trace is too long for a proof of them."""
