@@ -122,8 +122,8 @@ def test_reprs_are_short() -> None:
     assert repr(Speedups.without("sides")) == "Speedups(sides=False)"
     assert repr(RECTANGLE[0]) == "Step(view='v0', action='right')"
     assert (
-        repr(solve(misread()[0], Theory.causal(), time_limit=1e-9))
-        == "<Solution feasible (time limit): 13 dstates, not proven minimal; "
+        repr(solve(misread()[0], Theory.causal(), work_limit=1e-9))
+        == "<Solution feasible (work limit): 13 dstates, not proven minimal; "
         "any map has at least 13 dstates>"
     )
 
