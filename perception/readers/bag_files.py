@@ -29,6 +29,7 @@ from perception.readers.lines import (
     copied,
     damages,
     is_full,
+    needed_zstd,
     no_room,
     packer,
     unpacked,
@@ -240,7 +241,7 @@ def _unpacked(packed: str, data: bytes) -> bytes:
 MAGICS = {
     b"#ROSBAG V": ("ros1", ".bag"),
     b"\x89MCAP0\r\n": ("mcap", ".mcap"),
-    b"SQLite format 3\0": ("ros2", ".db3"),
+    b"SQLite format 3": ("ros2", ".db3"),
 }
 HEAD = max(map(len, MAGICS))
 # Endings of the files of bags, also of packed ones.
@@ -373,11 +374,7 @@ class Bag:
         """Note that the messages of a file alone are packed, which its metadata.yaml would say."""
         _, _, raw = next(iter(self.readers[-1].messages()), (None, 0, b""))
         if self.format == "ros2" and bytes(raw[: len(ZSTD)]) == ZSTD:
-            if zstd_module() is None:
-                raise LogError(
-                    f"{source}: expected the package backports.zstd to unpack its messages with "
-                    "(zstd), got none; pip install '.[ros]' in your clone"
-                )
+            needed_zstd(source)
             self.notes.append(f"The messages of {source} are packed with zstd: they are unpacked.")
 
     def _by_rosbags(self, path: Path) -> Any:
@@ -427,7 +424,7 @@ class Bag:
                     number = numbers[connection.topic]
                     try:
                         is_packed = self.format == "ros2" and bytes(raw[: len(ZSTD)]) == ZSTD
-                        whole = zstd_module().decompress(raw) if is_packed else raw
+                        whole = needed_zstd(self.source).decompress(raw) if is_packed else raw
                         message = deserialize(whole, connection.msgtype)
                     except damages(SerdeError, ValueError, IndexError) as error:
                         what = (

@@ -12,10 +12,10 @@ import gzip
 import importlib
 import io
 import lzma
+import re
 import shutil
 import tempfile
 import zlib
-from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import IO, Any, cast
@@ -28,6 +28,8 @@ from ssh_abduction.data.files import opened_file
 LONGEST_LINE = 2**20
 # Number of first bytes that show the encoding of a log and its line ends.
 HEAD = 2**16
+# The mark that may begin a text in UTF-8 or UTF-16.
+MARK = re.compile(rb"^(\xef\xbb\xbf|\xff\xfe|\xfe\xff)")
 # First bytes of packed files, with the packer and the command that unpacks them.
 PACKERS = {
     b"\x1f\x8b": ("gzip", "zcat"),
@@ -128,14 +130,8 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
         "bzip2": bz2.BZ2File,
         "xz": lzma.LZMAFile,
     }
-    # Python has no zstd before 3.14.
     if found == "zstd":
-        if (zstd := zstd_module()) is None:
-            raise LogError(
-                f"{source}: expected the package backports.zstd to unpack it with (zstd), got "
-                "none; pip install '.[ros]' in your clone, or unpack it with zstd -d"
-            )
-        openers["zstd"] = zstd.ZstdFile
+        openers["zstd"] = needed_zstd(source).ZstdFile
     return cast(IO[bytes], openers[found](file))
 
 
@@ -144,6 +140,16 @@ def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
     zstd = zstd_module()
     more = (zstd.ZstdError,) if zstd else ()
     return (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, *more, *others)
+
+
+def needed_zstd(source: str) -> Any:
+    """Return the module zstd. Python has none before 3.14. Raises LogError without its backport."""
+    if (zstd := zstd_module()) is None:
+        raise LogError(
+            f"{source}: expected the package backports.zstd to unpack it with (zstd), got none; "
+            "pip install '.[ros]' in your clone, or unpack it with zstd -d"
+        )
+    return zstd
 
 
 def zstd_module() -> Any:
@@ -157,14 +163,14 @@ def zstd_module() -> Any:
 
 
 class _Decoded:
-    """The lines of a text in another encoding or with other line ends, as in UTF-8 with LF."""
+    """The lines of a log whose line ends are CR, as on old Macs."""
 
-    def __init__(self, stream: IO[bytes], encoding: str) -> None:
-        self._text = io.TextIOWrapper(stream, encoding, errors="replace")
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._text = io.TextIOWrapper(stream, "latin-1")
 
     def readline(self, size: int = -1) -> bytes:
         """Read a line, at most `size` characters."""
-        return self._text.readline(size).encode()
+        return self._text.readline(size).encode("latin-1")
 
     def __del__(self) -> None:
         """Leave the stream open: it may be read again."""
@@ -172,17 +178,11 @@ class _Decoded:
 
 
 def _decoded(stream: IO[bytes]) -> IO[bytes]:
-    """Recode a log in UTF-16, as some shells write it, or with line ends CR as on old Macs."""
-    head = stream.read(HEAD)
+    """Read a log line by line if its line ends are CR."""
+    head = stream.read(HEAD).replace(b"\0", b"")
     stream.seek(0)
-    encoding = None
-    if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
-        encoding = "utf-16"
-    elif head[:2].count(0) == 1:
-        encoding = "utf-16-le" if head[1] == 0 else "utf-16-be"
-    elif b"\r" in head and b"\n" not in head and b"\0" not in head:
-        encoding = "latin-1"
-    return stream if encoding is None else cast(IO[bytes], _Decoded(stream, encoding))
+    has_returns = re.search(rb"\r[^\r\n]", head) and not re.search(rb"[\x01-\x08]", head)
+    return cast(IO[bytes], _Decoded(stream)) if has_returns else stream
 
 
 def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
@@ -198,7 +198,8 @@ def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
         while line := stream.readline(LONGEST_LINE + 1):
             number += 1
             if len(line) <= LONGEST_LINE:
-                yield number, line if number > 1 else line.removeprefix(BOM_UTF8)
+                # In UTF-16, as some shells write it, each other byte is 0.
+                yield number, MARK.sub(b"", line).replace(b"\0", b"")
                 continue
             # Skip the rest of a line that is too long.
             while line and not line.endswith(b"\n"):
