@@ -65,6 +65,10 @@ def angles(first: float, last: float, step: float) -> Callable[[Any, int], None]
         ((-1.0, 1.0, -0.5), 0.5, "leads from angle_min away from angle_max"),
         ((1.0, -1.0, 0.5), 0.5, "say --set fov=-115"),
         ((1.0, -1.0, -0.5), -0.5, ""),
+        ((-1.0, 3.0, 0.5), 0.5, "By the angle_increment, the beams are taken to cover 115"),
+        ((-2.0, 2.0, 0.4), 1.0, "By angle_max, the beams are taken to cover 229"),
+        ((-1.0, 1.0, 0.0), 0.5, "lack angle_increment"),
+        ((math.nan, 1.0, 0.5), 0.5, "lack angle_min"),
         (
             (-math.pi, math.pi, math.pi),
             math.pi / 2,
@@ -86,6 +90,12 @@ def test_angles_that_make_no_sense_are_named(
 def test_beams_over_more_than_a_turn_are_refused_unless_told(tmp_path: Path) -> None:
     path = bag(tmp_path / "bag", lambda m: ahead(m, angles(-6.5, 6.5, 3.25)))
     with pytest.raises(LogError, match=r"at most 360 degrees, got 5 ranges .* cover 745 degrees"):
+        read_log(path)
+    assert read_log(path, fov=180).scans[0].laser.step == pytest.approx(math.pi / 4)
+    path = bag(tmp_path / "none", lambda m: ahead(m, angles(0.0, 0.0, 0.0)))
+    with pytest.raises(
+        LogError, match=r"the angle_increment cover nan .*; say what the beams cover: --set"
+    ):
         read_log(path)
     assert read_log(path, fov=180).scans[0].laser.step == pytest.approx(math.pi / 4)
 

@@ -583,7 +583,7 @@ def test_damaged_message_is_skipped_and_reported(tmp_path: Path) -> None:
             m.scan(1.0),
             m.odometry(1.5, (math.nan, 0.0, 0.0)),
         )
-        no_step.angle_increment = math.nan
+        no_step.angle_min = no_step.angle_increment = math.nan
         no_ranges.ranges = np.zeros(0, dtype=np.float32)
         cut = b"\0\1\0\0" + bytes(9)
         odometry = [

@@ -120,8 +120,8 @@ def test_scan_of_a_laser_that_hangs_upside_down() -> None:
     assert scan.time == 2.0
     assert np.isnan(scan.ranges).tolist() == [False, True, True, False, False]
     assert scan.ranges[[0, 3, 4]].tolist() == [1.0, math.inf, math.inf]
-    with pytest.raises(Damaged, match="first angle and a step in radians"):
-        scan_of(replace(message, angle_increment=0.0), Mount(), (0.0, 0.0, 0.0), 0)
+    with pytest.raises(Damaged, match="expected beams over at most 360 degrees"):
+        scan_of(replace(message, angle_increment=7.0, angle_max=7.0), Mount(), (0.0, 0.0, 0.0), 0)
 
 
 def test_scans_wait_until_the_first_one_may_go() -> None:

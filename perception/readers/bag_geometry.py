@@ -21,6 +21,7 @@ FULL, LEAST_DEGREES = 1.01 * math.tau, 30.0
 # Which angles of a message may be in degrees, in the order in which they are tried.
 ANGLES = ("min", "max", "increment")
 DEGREES = tuple(which for count in range(4) for which in combinations(ANGLES, count))
+SAY_FOV = "say what the beams cover: --set fov=DEGREES"
 # Two statements of a field of view agree if they differ by at most this share, or two steps.
 SAME_SHARE = 0.03
 # Tilts in degrees: up to LEVEL they change nothing; beyond STEEP a laser shows no floor plan.
@@ -54,10 +55,13 @@ def angles_of(message: Any, fov: float | None = None) -> tuple[float, float, str
     Raises Damaged if they make no sense.
     """
     first, last, step = map(float, (message.angle_min, message.angle_max, message.angle_increment))
-    count = len(message.ranges)
-    if not math.isfinite(first) or not math.isfinite(step) or step == 0:
-        raise Damaged(f"expected a first angle and a step in radians, got {first:g} and {step:g}")
-    degree, steps = math.pi / 180, max(count - 1, 1)
+    count, degree, lost = len(message.ranges), math.pi / 180, ""
+    steps = max(count - 1, 1)
+    # The other two angles show one that is missing.
+    if not math.isfinite(first):
+        first, lost = last - step * steps, "angle_min"
+    elif not step or not math.isfinite(step):
+        step, lost = (last - first) / steps or math.nan, "angle_increment"
     by_step, by_ends = abs(step) * steps, abs(last - first)
     for which in DEGREES:
         low, high, increment = (
@@ -67,10 +71,18 @@ def angles_of(message: Any, fov: float | None = None) -> tuple[float, float, str
         one, other = abs(increment) * steps, abs(high - low)
         near = max(2 * abs(increment), SAME_SHARE * one)
         least = LEAST_DEGREES * degree if which else 0.0
-        if abs(one - other) > near or not least <= one <= FULL:
+        # An end that makes sense in radians is not in degrees.
+        ends = ("min", first), ("max", last)
+        is_sensible = any(name in which and 0 < abs(end) <= FULL for name, end in ends)
+        if is_sensible or abs(one - other) > near or not least <= one <= FULL:
             continue
         listed, note = ", ".join(f"angle_{name}" for name in which), None
-        if which:
+        if lost:
+            note = (
+                f"The angles of the scans lack {lost}. By the others, the beams are taken to cover "
+                f"{math.degrees(one):.0f} degrees. If that is wrong, {SAY_FOV}."
+            )
+        elif which:
             note = f"The angles of the scans are in degrees (read so: {listed}): write radians."
         if (high - low) / increment < -2:
             low, increment = min(low, high), abs(increment)
@@ -80,32 +92,27 @@ def angles_of(message: Any, fov: float | None = None) -> tuple[float, float, str
                 f"they turn clockwise, say --set fov=-{math.degrees(one):.0f}."
             )
         return low, increment, note
-    # They contradict each other: the step is right, unless the beams would cover more than a turn.
+    # They contradict each other. Lasers look as far to the left as to the right.
     is_known = math.isfinite(last) and last != first
     told = f"{count} ranges with the angle_increment cover {math.degrees(by_step):.0f} degrees" + (
         f", but angle_min to angle_max are {math.degrees(by_ends):.0f}" if is_known else ""
     )
-    wished = None if fov is None else math.radians(abs(fov))
-    ends_fit = is_known and by_ends <= FULL
+    askew = abs(first + last) - abs(2 * first + step * steps)
+    if fov is not None:
+        askew = abs(math.degrees(by_ends) - abs(fov)) - abs(math.degrees(by_step) - abs(fov))
     if by_step <= FULL and not is_known:
         return first, step, None
-    if ends_fit and (
-        by_step > FULL or (wished is not None and abs(by_ends - wished) < abs(by_step - wished))
-    ):
+    if is_known and by_ends <= FULL and (by_step > FULL or askew < 0):
         step, used = math.copysign(by_ends / steps, step), "angle_max"
     elif by_step <= FULL:
         used = "the angle_increment"
-    elif wished is not None:
-        return -wished / 2, wished / steps, None
+    elif fov is not None:
+        return -abs(fov) * degree / 2, abs(fov) * degree / steps, None
     else:
-        raise Damaged(
-            f"expected beams over at most 360 degrees, got {told}; say what they cover (--set "
-            "fov=DEGREES)"
-        )
-    covers = f"{math.degrees(abs(step)) * steps:.0f} degrees"
+        raise Damaged(f"expected beams over at most 360 degrees, got {told}; {SAY_FOV}")
     note = (
-        f"The angles of the scans contradict each other: {told}. By {used}, the beams are taken "
-        f"to cover {covers}. If that is wrong, say so: --set fov=DEGREES."
+        f"The angles of the scans contradict each other: {told}. By {used}, the beams are taken to "
+        f"cover {math.degrees(abs(step)) * steps:.0f} degrees. If that is wrong, {SAY_FOV}."
     )
     return first, step, note
 
@@ -200,7 +207,7 @@ def believed(
     level = Mount(mount.pose, mount.is_flipped)
     if tilt <= LEVEL or is_told:
         return level
-    said = f"{tilt:.0f} degrees by the transforms to its frame {frame}"
+    said = f"{tilt:.3g} degrees by the transforms to its frame {frame}"
     if tilt > STEEP:
         raise LogError(
             f"{source}: expected a laser that is tilted by at most {STEEP:.0f} degrees, got "
