@@ -220,18 +220,36 @@ def test_repeated_scans_are_left_out(tmp_path: Path, late: float) -> None:
             scan.header.stamp = m.scan(t).header.stamp
         return [*ahead(m), *again]
 
-    log = read_log(bag(tmp_path / "bag", twice))
+    def repeated(m: Messages) -> Listed:
+        found = ahead(m, many)
+        for by in late:
+            again = [(topic, t + by, one) for topic, t, one in ahead(m, many)]
+            for _, t, one in again:
+                one.header.stamp = m.scan(t).header.stamp
+            found += again if by > 1 else again[1::2]
+        return found
+
+    log = read_log(bag(tmp_path / "bag", repeated))
     assert len(log) == 60
-    assert "60 of 120 scans repeat an earlier one" in notes(log)
+    assert f"of {60 + 60 * len(late)} scans repeat the ranges of an earlier one" in notes(log)
 
 
-def test_prefixed_frames_are_found(tmp_path: Path) -> None:
+@pytest.mark.parametrize("robots", ["r", "rs"])
+def test_prefixed_frames_are_found(tmp_path: Path, robots: str) -> None:
     mount = (0.1, 0.0, math.pi)
-    path = bag(
-        tmp_path / "bag",
-        lambda m: [("/tf_static", 0.5, m.transform("r/base_link", "r/laser", mount)), *ahead(m)],
-    )
-    log = read_log(path)
+
+    def messages(m: Messages) -> Listed:
+        names = [(f"{name}/base_link", f"{name}/laser") for name in robots]
+        # The first of two robots is the one that the odometry names.
+        found = [("/tf_static", 0.5, m.transform(*pair, mount)) for pair in names[:1]]
+        found += [("/tf_static", 0.5, m.transform(*pair, (0.0, 0.0, 0.0))) for pair in names[1:]]
+        for topic, t, one in ahead(m):
+            if topic == "/odom" and robots == "rs":
+                one.child_frame_id = "r/base_link"
+            found.append((topic, t, one))
+        return found
+
+    log = read_log(bag(tmp_path / "bag", messages))
     assert log.scans[0].laser.mount == pytest.approx(mount, abs=1e-5)
     assert "laser is r/laser" in notes(log)
 
@@ -241,7 +259,7 @@ def bend(i: int) -> tuple[float, float, float, float]:
     return 1.0 + i, 0.5 * i, 2 * math.sin(i / 5), math.atan(0.8 * math.cos(i / 5))
 
 
-@pytest.mark.parametrize("kind", ["inverted", "exchanged", "about x"])
+@pytest.mark.parametrize("kind", ["inverted", "exchanged", "about x", "about -x", "w first"])
 def test_odometry_with_swapped_frames_or_axes_is_read(tmp_path: Path, kind: str) -> None:
     def messages(m: Messages) -> Listed:
         found: Listed = []
@@ -249,8 +267,11 @@ def test_odometry_with_swapped_frames_or_axes_is_read(tmp_path: Path, kind: str)
             t, x, y, turn = bend(i)
             one = m.odometry(t, (x, y, turn), base="laser")
             pose = one.pose.pose
-            if kind == "about x":
-                pose.orientation.x, pose.orientation.z = pose.orientation.z, 0.0
+            turned = pose.orientation
+            if "about" in kind:
+                turned.x, turned.z = turned.z * (-1 if "-" in kind else 1), 0.0
+            elif kind == "w first":
+                turned.x, turned.w, turned.z = turned.w, turned.z, 0.0
             else:
                 one.header.frame_id, one.child_frame_id = "laser", "odom"
             if kind == "inverted":
@@ -262,9 +283,7 @@ def test_odometry_with_swapped_frames_or_axes_is_read(tmp_path: Path, kind: str)
 
     log = read_log(bag(tmp_path / "bag", messages))
     assert log.scans[20].odometry == pytest.approx(bend(20)[1:])
-    assert {"inverted": "inverted", "exchanged": "exchanged", "about x": "turn about x"}[
-        kind
-    ] in notes(log)
+    assert (kind if kind in ("inverted", "exchanged") else "turn about x") in notes(log)
 
 
 def test_turns_about_y_by_more_than_a_quarter_are_read() -> None:
@@ -272,7 +291,7 @@ def test_turns_about_y_by_more_than_a_quarter_are_read() -> None:
     for i in range(60):
         half = 0.05 * i
         turn = SimpleNamespace(x=0.0, y=math.sin(half), z=0.0, w=math.cos(half))
-        place = SimpleNamespace(x=0.1 * i, y=0.0, z=0.0)
+        place = SimpleNamespace(x=math.sin(0.1 * i), y=1 - math.cos(0.1 * i), z=0.0)
         track.add(i, i, flat_pose(place, turn), turn)
     assert track.upright("/odom", said).table()[:, 4] == pytest.approx(0.1 * np.arange(60))
     assert "turn about y" in said[0]

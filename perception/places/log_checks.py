@@ -121,7 +121,7 @@ def refuse_mixed(log: RobotLog) -> None:
             f"{named(log.source)}: expected the scans of one laser, got those of several in turn, "
             f"with one mount: {100 * mixed / len(some):.0f} % of the scans are unlike the one "
             "before, and like an earlier one; keep the scans of one laser, or give each laser a "
-            "frame of its own"
+            "frame of its own, with a transform"
         )
 
 

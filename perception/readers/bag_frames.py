@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,9 +15,10 @@ from perception.readers.bag_files import NANO, TRANSFORMS, Bag
 from perception.readers.bag_geometry import Mount
 from perception.readers.scans import Array, Damage, Damaged
 from ssh_abduction.data.odometry import Pose, displacement_between
+from ssh_abduction.data.words import first_few
 
-# Largest difference of the messages of a fixed transform, from rounding: metres and radians.
-FIXED = (0.01, 0.01)
+# Largest difference of the messages of a fixed transform, from rounding: metres or radians.
+FIXED = 0.01
 # Poses turn about a wrong axis if headings differ by at most STRAIGHT radians, and the turns about
 # that axis by at least TURNS.
 STRAIGHT, TURNS = 0.1, 1.0
@@ -42,7 +45,7 @@ class RecordedTrack:
 
     def upright(self, called: str, notes: list[str]) -> RecordedTrack:
         """If the poses turn about x or y and not about z, read headings about that, with a note."""
-        table, tilts = self.table().copy(), np.unwrap(np.array(self.tilts).reshape(-1, 2), axis=0)
+        table, tilts = self.table(), np.unwrap(np.array(self.tilts).reshape(-1, 2), axis=0)
         axis = int(np.ptp(tilts, axis=0).argmax())
         # A turn about y by more than a quarter looks like one by half a circle about z.
         turned = np.abs(np.sin(table[:, 4] - table[0, 4])).max()
@@ -50,10 +53,16 @@ class RecordedTrack:
             return self
         notes.append(
             f"The quaternions of {called} turn about {'xy'[axis]}, and not about z: headings are "
-            "read about that axis. Write x ahead, y to the left, and turns about z."
+            "read about that axis. Write x, y, z and w in this order, x ahead, y to the left, and "
+            "turns about z."
         )
-        table[:, 4] = tilts[:, axis]
-        return RecordedTrack(array("d", table.ravel()))
+        # The axis may point down. If w is written first, headings are mirrored, too.
+        ways = (
+            np.column_stack([table[:, :4], sign * tilts[:, axis] + turn])
+            for sign, turn in product((1, -1), (0.0, math.pi))
+        )
+        best = max(ways, key=lambda way: _onward(way[:, 2:]))
+        return RecordedTrack(array("d", best.ravel()))
 
     def righted(self, parent: str, child: str, notes: list[str]) -> tuple[RecordedTrack, str, str]:
         """Return the track from a frame odom to the robot, and both names, with a note on changes.
@@ -67,7 +76,7 @@ class RecordedTrack:
         x, y, heading = table[:, 2:].T
         cos, sin = np.cos(heading), np.sin(heading)
         back = np.stack([-cos * x - sin * y, sin * x - cos * y, -heading], axis=1)
-        is_inverted = _onward(back) >= _onward(table[:, 2:])
+        is_inverted = abs(_onward(back)) >= abs(_onward(table[:, 2:]))
         notes.append(
             f"The odometry leads from {parent} to {child}, so {child} is the child: "
             f"{'the poses are read inverted' if is_inverted else 'the names are exchanged'}. "
@@ -79,12 +88,10 @@ class RecordedTrack:
 
 
 def _onward(poses: Array) -> float:
-    """How far a robot with these poses, (n, 3), drives ahead or back along its headings."""
+    """The share of its way, with these poses, (n, 3), that a robot drives ahead; -1 for back."""
     x, y = np.diff(poses[:, :2], axis=0).T
     middle = (np.unwrap(poses[:, 2])[1:] + np.unwrap(poses[:, 2])[:-1]) / 2
-    return float(
-        abs((x * np.cos(middle) + y * np.sin(middle)).sum()) / max(np.hypot(x, y).sum(), 1e-9)
-    )
+    return float((x * np.cos(middle) + y * np.sin(middle)).sum() / max(np.hypot(x, y).sum(), 1e-9))
 
 
 @dataclass
@@ -99,10 +106,6 @@ class FrameTransform:
     count: int = 0  # number of messages
     # Largest difference of a pose from `first`, in metres and radians.
     off: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def is_fixed(self) -> bool:
-        return self.off[0] <= FIXED[0] and self.off[1] <= FIXED[1]
 
 
 # The transforms to each frame, by parent. A frame should have one parent, but some have several.
@@ -167,19 +170,22 @@ def record_transform(
     return edge
 
 
-def same_frame(frames: Frames, name: str) -> str:
+def same_frame(frames: Frames, name: str, beside: str = "") -> str:
     """Return the name that transforms use for a frame, such as tb1/laser for laser, or the name.
 
     A prefix is added, removed or changed if the transforms do not know the name, and only one of
-    their frames has this name without its prefix.
+    their frames has this name without its prefix, or with the prefix of the frame `beside` it.
     """
-    if name in frames:
-        return name
-    known = {*frames, *(parent for parents in frames.values() for parent in parents)}
-    if name in known:
-        return name
+    known = _known(frames)
     same = [one for one in known if one.rpartition("/")[2] == name.rpartition("/")[2]]
-    return same[0] if len(same) == 1 else name
+    if len(same) > 1:
+        same = [one for one in same if one.rpartition("/")[0] == beside.rpartition("/")[0]]
+    return same[0] if len(same) == 1 and name not in known else name
+
+
+def _known(frames: Frames) -> set[str]:
+    """The names of all frames that the transforms know."""
+    return {*frames, *(parent for parents in frames.values() for parent in parents)}
 
 
 def parent_of(frames: Frames, child: str) -> FrameTransform:
@@ -207,7 +213,7 @@ def mount_of(frames: Frames, odom: str, base: str, frame: str, notes: list[str])
     """
     if base == frame:
         return Mount()
-    names = {name: same_frame(frames, name) for name in (odom, base, frame)}
+    names = {name: same_frame(frames, name, base) for name in (odom, base, frame)}
     if renamed := [f"{name} is {same}" for name, same in names.items() if name != same]:
         notes.append(
             "The names of frames differ by a prefix (tf_prefix). In the transforms, "
@@ -226,7 +232,7 @@ def mount_of(frames: Frames, odom: str, base: str, frame: str, notes: list[str])
         edge = parent_of(frames, child)
         translation = translation + rotation @ edge.translation
         rotation = rotation @ edge.rotation
-        if not edge.is_fixed:
+        if max(edge.off) > FIXED:
             off, angle = edge.off[0], math.degrees(edge.off[1])
             notes.append(
                 f"The {edge.count} transforms from {edge.parent} to {child}, by which the "
@@ -247,12 +253,15 @@ def mount_of(frames: Frames, odom: str, base: str, frame: str, notes: list[str])
     return Mount((x, y, angle), bool(rotation[2, 2] < 0), rows, float(translation[2]))
 
 
-def describe_unmounted(base: str, frame: str) -> str:
-    """Say in a note that the place of a laser on the robot is assumed."""
+def describe_unmounted(frames: Frames, base: str, unknown: Sequence[str]) -> str:
+    """Say in a note that the place of lasers with some frames on the robot is assumed."""
+    tails = tuple(frame.rpartition("/")[2] for frame in unknown)
+    like = sorted(name for name in _known(frames) if name.endswith(tails) and name not in unknown)
     return (
         f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser "
-        f"({frame}): the laser is taken to sit in the robot's middle and to look ahead. If it does "
-        "not, say where it sits: --set mount=X,Y,DEGREES."
+        f"({first_few(unknown, 3)}): the laser is taken to sit in the robot's middle and to look "
+        "ahead. If it does not, say where it sits: --set mount=X,Y,DEGREES."
+        + (f" The transforms know {first_few(like, 3)}." if like else "")
     )
 
 

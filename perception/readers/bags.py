@@ -275,16 +275,15 @@ def read(
     assumed = {"fov": text} if (text := survey.doubt) else {}
     found = {frame: bag_frames.mount_of(frames, odom, base, frame, notes) for frame in seen}
     unknown = [frame for frame, mount in found.items() if mount is None]
-    listed = first_few(unknown, 3)
     if unknown and len(unknown) < len(seen) and told.mount is None:
         lost = counted(sum(seen[frame] for frame in unknown), "scans")
         notes.append(
-            f"No transform leads from the robot ({base}) to {listed}: {lost} from there are left "
-            "out. Record the transforms of all lasers."
+            f"No transform leads from the robot ({base}) to {first_few(unknown, 3)}: {lost} from "
+            "there are left out. Record the transforms of all lasers."
         )
         found = {frame: found[frame] for frame in seen if frame not in unknown}
     elif unknown:
-        assumed["mount"] = bag_frames.describe_unmounted(base, listed)
+        assumed["mount"] = bag_frames.describe_unmounted(frames, base, unknown)
     is_told = told.mount is not None
     mounts = {
         frame: believed(mount or Mount(), survey.some[frame], frame, bag.source, is_told, notes)
@@ -472,7 +471,8 @@ def _odometer(
     if not tracks:
         raise LogError(
             f"{bag.source}: expected odometry in {topic}, got none that can be read"
-            "; record it again, or name another topic (--set odom_topic)"
+            f"{f' ({damaged[-1].what})' if damaged else ''}; record it again, or name another "
+            "topic (--set odom_topic)"
         )
     # Several programs may publish one topic: take the longest track, preferably from a frame odom.
     best = max(tracks, key=lambda source: (len(tracks[source].numbers), "odom" in source[0]))

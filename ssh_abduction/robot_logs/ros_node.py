@@ -170,7 +170,7 @@ class LaserFrames:
         if mount is None:
             if may_wait:
                 return None
-            say(f"/tf_static: {describe_unmounted(self.base, frame)}")
+            say(f"/tf_static: {describe_unmounted(self.known, self.base, [frame])}")
             return Mount()
         try:
             mount = believed(mount, [message], frame, "/tf_static", False, notes)
