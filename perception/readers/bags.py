@@ -234,10 +234,10 @@ SCANS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan")
 ODOMETRY = ("nav_msgs/msg/Odometry",)
 # Each EACH-th scan of a frame is kept to judge the tilt of its laser, at most SAMPLES.
 EACH, SAMPLES = 10, 100
-# Scans that repeat earlier ones are left out if they are this many, and this share of all. Scans
-# without times in front of a still robot come more often than LOOPS times. Times within AT_ONCE
-# seconds are one.
-LEAST_REPEATED, REPEATED, LOOPS, AT_ONCE = 20, 0.2, 5, 0.01
+# Scans that repeat earlier ones are left out if they are this many, and this share of all. A laser
+# without noise repeats its scan while the robot stands, but its times differ by more than AT_ONCE
+# seconds: by the stamps, or of recording. A scan of at most FEW different ranges may come again.
+LEAST_REPEATED, REPEATED, AT_ONCE, FEW = 20, 0.2, (0.01, 0.1), 20
 # The odometry has a gap if the robot moved by more than UNSEEN metres or radians in a pause of more
 # than GAP seconds, and LONGER times the usual interval.
 GAP, LONGER, UNSEEN = 1.0, 10.0, 0.1
@@ -393,25 +393,21 @@ def _survey(bag: Bag, topics: Sequence[str], told: LaserOptions, notes: list[str
     times: dict[str, list[tuple[float, float]]] = {}
     found = _FirstPass({}, Counter(), {}, set(), None)
     doubts: Counter[str] = Counter()
-    known: Counter[int] = Counter()
-    last: dict[str, tuple[float, int]] = {}  # of each frame
+    known = set[int]()
+    last: dict[str, tuple[int, float, float]] = {}  # of each frame
     for connection, number, recorded, message in bag.messages(set(topics)):
         if isinstance(message, Damage):
             continue
-        frame, stamp = (
-            bag_frames.frame_name(message.header.frame_id),
-            bag_frames.stamp_of(message.header),
-        )
-        ranges = hash(ranges_of(message).tobytes())
-        # The second message of two may have a time of its own.
-        before, same = last.get(frame, (-math.inf, 0))
-        content = hash(
-            (frame, before if ranges == same and stamp - before < AT_ONCE else stamp, ranges)
-        )
-        last[frame] = stamp, ranges
-        if content in known:
+        frame = bag_frames.frame_name(message.header.frame_id)
+        stamp = bag_frames.stamp_of(message.header)
+        ranges = ranges_of(message)
+        content = hash((frame, ranges.tobytes()))
+        same, *before = last.get(frame, (0, -math.inf, -math.inf))
+        last[frame] = content, stamp, recorded
+        is_other = content != same or (np.subtract((stamp, recorded), before) < AT_ONCE).all()
+        if content in known and is_other and len(set(ranges)) > FEW:
             found.repeated.add((connection.topic, number))
-        known[content] += 1
+        known.add(content)
         times.setdefault(connection.topic, []).append((stamp, recorded))
         found.frames[frame] += 1
         try:
@@ -433,13 +429,12 @@ def _survey(bag: Bag, topics: Sequence[str], told: LaserOptions, notes: list[str
             raise LogError(f"{bag.source}: {doubt[1:]}")
         found.doubt = doubt or None
     count, scans = len(found.repeated), found.frames.total()
-    if count < max(LEAST_REPEATED, REPEATED * scans) or known.most_common(1)[0][1] > LOOPS:
+    if count < max(LEAST_REPEATED, REPEATED * scans):
         found.repeated.clear()
     else:
         notes.append(
-            f"{count} of {scans} scans repeat an earlier one, with its time "
-            "and ranges: they are left out. The bag was recorded twice, or while another was "
-            "played in a loop."
+            f"{count} of {scans} scans repeat the ranges of an earlier one: they are left out. The "
+            "bag was recorded twice, or while another was played in a loop."
         )
     found.times = {topic: np.array(both) for topic, both in times.items()}
     return found
